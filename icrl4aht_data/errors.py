@@ -142,9 +142,10 @@ _LISTED, _COMPARED = 50, 1000  # names that an error lists, and names compared t
 
 
 def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
-    """Return the error for a name that does not exist; it lists the valid names and the nearest one."""
+    """Return the error for a name that does not exist; it lists the valid names, and the nearest if one is close."""
     names = list(dict.fromkeys(valid))
-    nearest = get_close_matches(str(found), names[:_COMPARED], n=1, cutoff=0.4)
-    hint = f" Did you mean {nearest[0]!r}?" if nearest else ""
+    by_small_letters = {name.casefold(): name for name in reversed(names[:_COMPARED])}
+    nearest = get_close_matches(str(found).casefold(), by_small_letters, n=1)
+    hint = f" Did you mean {by_small_letters[nearest[0]]!r}?" if nearest else ""
     more = f", and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return UnknownNameError(f"unknown {what} {found!r}; valid: {', '.join(names[:_LISTED])}{more}.{hint}")

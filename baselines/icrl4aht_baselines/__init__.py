@@ -1,5 +1,40 @@
-"""Reference agents and the one evaluator of the benchmark."""
+"""Reference agents and the one evaluator of the benchmark.
+
+One line imports what an evaluation needs:
+
+    from icrl4aht_baselines import evaluate, find_agent, from_host, report, test_tasks
+
+`evaluate` and `report` are packages as well: calling one of them calls its function of the same name. Everything is
+imported when it is first used, because JAX takes seconds to import.
+"""
+
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from icrl4aht_data.utils.without_jax import explain_missing_jax
 
+if TYPE_CHECKING:
+    from icrl4aht_baselines.agents.egos import find_agent
+    from icrl4aht_baselines.agents.host import from_host
+    from icrl4aht_baselines.evaluate.evaluator import evaluate
+    from icrl4aht_baselines.evaluate.protocols import test_tasks
+
+__all__ = ["evaluate", "find_agent", "from_host", "test_tasks"]
+
+_MODULES = {"find_agent": "agents.egos", "from_host": "agents.host", "test_tasks": "evaluate.protocols"}
+
 explain_missing_jax(__name__)
+
+
+class CallablePackage(ModuleType):
+    """Package that can be called like its function of the same name."""
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        return getattr(self, self.__name__.rpartition(".")[2])(*args, **options)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

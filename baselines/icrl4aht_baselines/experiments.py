@@ -18,7 +18,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from icrl4aht_baselines.agents.egos import Acting, PlayMode, find_agent
+from icrl4aht_baselines.agents.egos import Acting, find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
 from icrl4aht_baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
@@ -428,7 +428,7 @@ def _evaluate_entry(
     folder: Path,
     progress: ExperimentProgress,
 ) -> None:
-    agent = find_agent(str(run), PlayMode(plan.acting or experiment.acting, greedy=not entry.sampled))
+    agent = find_agent(run, acting=plan.acting or experiment.acting, greedy=not entry.sampled)
     details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
     names = list(dict.fromkeys(task.layout.name for task in tasks))
     what = f"{agent.name} {entry.name} on {names[0] if len(names) == 1 else f'{len(names)} layouts'}: episodes"

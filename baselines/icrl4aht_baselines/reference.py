@@ -373,7 +373,7 @@ class _Making:
         """Returns the release with histories of RL^2 of a kind, one of `RL2_HISTORIES`."""
         folder = self.out / f"{kind}-{self.track}"
         if not folder.is_dir():
-            agent = find_agent(self.rl2(), PlayMode(greedy=False))
+            agent = find_agent(self.rl2(), greedy=False)
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
             teammates = release_teammates(dataset, tasks=self.diverse())
             with self.timed(folder.name):
@@ -410,7 +410,7 @@ class _Making:
             dataset = load_icrl4aht(self.noise_release(), layout=list(self.layouts))
             labeller = find_agent(self.rl2())
             teammates = release_teammates(dataset, number, self.diverse())
-            agent = find_agent(str(before), PlayMode(greedy=False))
+            agent = find_agent(before, greedy=False)
             if not own.is_dir():
                 with self.timed(own.name):
                     collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
@@ -442,7 +442,7 @@ class _Making:
         kinds += [("test-seeded-forgets", "seeded", 1, True)] if recipe.forgets else []
         for kind, protocol, seeds, forgets in kinds:
             tasks, folder = self._tasks(kind), self.out / "results" / f"{name}-{self.track}" / kind
-            agent = find_agent(str(run), recipe.mode._replace(forget=forgets))
+            agent = find_agent(run, **recipe.mode._replace(forget=forgets)._asdict())
             played = get_protocol(protocol)
             was_done = len(list((folder / "tasks").glob("*.json"))) >= len(tasks)
             with self.timed(f"results/{name}-{self.track}/{kind}", was_done=was_done):

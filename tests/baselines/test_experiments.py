@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines import experiments
-from icrl4aht_baselines.agents.egos import NamedEgo, PlayMode, stay
+from icrl4aht_baselines.agents.egos import NamedEgo, stay
 from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate import protocols
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
@@ -137,7 +137,7 @@ def test_an_ablation_trains_one_method_and_shares_runs(release, tmp_path, monkey
     fake = TrainingTask(None, None, None, {"histories": {"channels": "own"}})  # type: ignore[arg-type]
     monkeypatch.setattr(experiments, "prepare", lambda *arguments: fake)
     monkeypatch.setattr(experiments, "_train_entry", lambda *arguments: None)
-    monkeypatch.setattr(experiments, "find_agent", lambda run, mode: modes.append(mode) or NamedEgo("AD", stay, {}))
+    monkeypatch.setattr(experiments, "find_agent", lambda run, **mode: modes.append(mode) or NamedEgo("AD", stay, {}))
     monkeypatch.setattr(experiments, "evaluate", lambda *arguments, out, **options: played.append(out))
     monkeypatch.setattr(experiments, "note_results", lambda folder, run, tasks: played.append(run))
     monkeypatch.setattr(experiments, "read_run", lambda folder: 1 / 0)
@@ -146,7 +146,7 @@ def test_an_ablation_trains_one_method_and_shares_runs(release, tmp_path, monkey
     names = [str(path.relative_to(tmp_path)) for path in played]
     run = "ad-plain/demo_wide/run"
     assert names == ["ad-plain/demo_wide/results", run, "ad-sampled/demo_wide/results", run]
-    assert [mode.greedy for mode in modes] == [True, False]
+    assert [mode["greedy"] for mode in modes] == [True, False]
 
 
 def test_entries_keep_their_batch_sizes(release, tmp_path, monkeypatch):
@@ -166,8 +166,8 @@ def test_a_sweep_over_contexts_acts_exactly_unless_told_otherwise(release, tmp_p
     chosen = []
     monkeypatch.setattr(experiments, "train", lambda *arguments, **options: None)
 
-    def find_agent(folder: str, mode: PlayMode) -> None:
-        chosen.append(mode.acting)
+    def find_agent(folder: Path, *, acting: str, greedy: bool) -> None:
+        chosen.append(acting)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(experiments, "find_agent", find_agent)

@@ -79,7 +79,7 @@ def test_a_teacher_takes_the_place_of_rl2(tmp_path, monkeypatch):
     monkeypatch.setattr(reference._Making, "play", lambda made: tmp_path / "rl2")
     assert reference._Making(tmp_path, "teammate", print).rl2() == str(tmp_path / "rl2")
     found = []
-    monkeypatch.setattr(reference, "find_agent", lambda name, mode: found.append(name))
+    monkeypatch.setattr(reference, "find_agent", lambda name, **mode: found.append(name))
     for name in ("load_icrl4aht", "release_teammates", "collect_release"):
         monkeypatch.setattr(reference, name, lambda *given, **options: None)
     monkeypatch.setattr(reference._Making, "noise_release", lambda made: tmp_path)

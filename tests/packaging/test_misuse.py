@@ -99,7 +99,7 @@ baselines: tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid:
 baselines: evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 baselines: evaluate --agent randm --out e | unknown agent 'randm'; valid: stay, random, oracle, ad-reference,
 baselines: evaluate --agent none --out e | A trained model is named by its folder
-baselines: evaluate --agent empty --out e | empty: no run: config.json is missing
+baselines: evaluate --agent empty --out e | empty: not a run: config.json is missing
 baselines: evaluate --agent stay --out e --acting cach | unknown acting 'cach'; valid: cached, exact.
 baselines: evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
 baselines: evaluate --agent stay --out e --manifest empty | 'empty' is a directory

@@ -1,8 +1,7 @@
-"""The models that this package bundles, in `baselines/icrl4aht_baselines/models`: NAME/TRACK is the run folder of a model of one track.
+"""The models that this package bundles, in the folder `models`: NAME/TRACK is the run folder of a model of one track.
 
-A bundled run has its settings, its last parameters, without the optimizer's state, and the curves of its training. Next
-to the runs of a model are its card and `bundle.json`, which states the way in which it plays unless another one is
-chosen.
+A bundled run has its settings, its last parameters without the optimizer's state, and the curves of its training. NAME
+also has the model's card, and `bundle.json`, which states how the model plays by default.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class BundledModel(NamedTuple):
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
-    """Returns the bundled models by name."""
+    """Return the bundled models by name."""
     found = {}
     for path in sorted(folder.glob("*/")):
         runs = {track: path / track for track in TRACKS if (path / track / CONFIG).is_file()}
@@ -61,7 +60,7 @@ def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
 
 
 def describe_model(model: BundledModel) -> list[str]:
-    """Returns a line for each track of a bundled model."""
+    """Return a line for each track of a bundled model."""
     lines = []
     for track, folder in model.runs.items():
         trained = read_trained(folder)
@@ -87,7 +86,7 @@ def check_bundle_name(name: str) -> None:
 
 
 def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampled: bool = False) -> Path:
-    """Copy a finished run into the bundled models, with its parameters and curves; one that is there is replaced.
+    """Copy a finished run into the bundled models and return its folder there; the track's earlier run is replaced.
 
     Args:
         run: folder of the run.

@@ -1,4 +1,4 @@
-"""Adapter for egos outside JAX: NumPy, PyTorch, or anything else that maps a batch of percepts to actions."""
+"""Adapter for egos outside JAX: NumPy, PyTorch, or anything else that maps a batch of observations to actions."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ class HostAgent(Protocol):
         ...
 
     def act(self, percept: Percept) -> np.ndarray:
-        """Returns actions, integers (B,) in 0..5, for a `Percept` of arrays (B, ...): obs is uint8 (B, 5, 5, C)."""
+        """Return actions, integers (B,) in 0..5, for a `Percept` of arrays (B, ...): obs is uint8 (B, 5, 5, C)."""
         ...
 
 
 def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout], HostPolicy]:
-    """Returns the `make_ego` argument of `icrl4aht_baselines.evaluate.evaluate` for a `HostAgent`.
+    """Return the `make_ego` argument of `icrl4aht_baselines.evaluate.evaluate` for a `HostAgent`.
 
     For each layout and teammate family `reset` is called once, then `act` once per step with all their tasks.
 

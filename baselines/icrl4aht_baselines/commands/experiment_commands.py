@@ -173,7 +173,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     RUN is a folder that `train` made. Prints one line per episode: the share of equal actions, and the total variation
     between both policies. Writes nothing.
     """
-    from icrl4aht_baselines.agents.egos import check_fits
+    from icrl4aht_baselines.agents.egos import find_agent
     from icrl4aht_baselines.evaluate.drift import measure_drift
     from icrl4aht_baselines.evaluate.protocols import get_protocol
     from icrl4aht_baselines.training.histories import read_trained
@@ -182,7 +182,7 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
     fill_window = -(-trained.context // get_protocol(protocol).steps)
     played = get_protocol(protocol, episodes or 3 * fill_window)
     name = get_layout(layout or trained.layouts[0]).name
-    check_fits(trained, get_layout(name), run)
+    find_agent(run).make(get_layout(name))  # a model that does not fit fails before any work
     tasks = [published_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
     with progress_bars(unit="episodes") as show:
         found = []

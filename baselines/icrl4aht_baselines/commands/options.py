@@ -25,7 +25,7 @@ from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
 from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, Folder, Names, Root
-from icrl4aht_data.errors import unknown
+from icrl4aht_data.errors import UnknownNameError
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
@@ -46,23 +46,17 @@ def find_ego(option: str, value: str, **mode: Any) -> Any:
     Args:
         option: name of the option, for messages.
         value: the ego's name or folder.
-        mode: values of `icrl4aht_baselines.agents.egos.PlayMode`; for None and those left out the agent's own default.
+        mode: further arguments of `icrl4aht_baselines.agents.egos.find_agent`.
 
     Raises:
         click.UsageError: if the value is neither a reference ego, nor a bundled model, nor a run folder.
     """
-    from icrl4aht_baselines.agents.bundled import bundled_models
-    from icrl4aht_baselines.agents.egos import AGENTS, default_mode, find_agent
-    from icrl4aht_baselines.training.run_folder import CONFIG
+    from icrl4aht_baselines.agents.egos import find_agent
 
-    names = [*AGENTS, *bundled_models()]
-    if value not in names and not Path(value).is_dir():
-        hint = "A trained model is named by its folder, which `icrl4aht-data train` makes."
-        raise click.UsageError(f"{option}: {unknown('agent', value, names)} {hint}")
-    if value not in names and not (Path(value) / CONFIG).is_file():
-        raise click.UsageError(f"{option}: {value}: no run: {CONFIG} is missing; `icrl4aht-data train` makes one")
-    given = {name: chosen for name, chosen in mode.items() if chosen is not None}
-    return find_agent(value, default_mode(value)._replace(**given))
+    try:
+        return find_agent(value, **mode)
+    except UnknownNameError as error:
+        raise click.UsageError(f"{option}: {error}") from error
 
 
 class HostPort(click.ParamType):
@@ -77,14 +71,7 @@ class HostPort(click.ParamType):
         return value
 
 
-def _ego_names() -> list[str]:
-    from icrl4aht_baselines.agents.bundled import bundled_models
-    from icrl4aht_baselines.agents.egos import AGENTS
-
-    return [*AGENTS, *bundled_models()]
-
-
-EGO_NAME = EgoName("agent", _ego_names)
+EGO_NAME = EgoName("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names())
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], lambda: [ALL_LAYOUTS, *LAYOUT.offered()])
 _EVALUATION_SPLIT = Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS"))
 METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())

@@ -80,7 +80,7 @@ ControlProgress = Callable[[str, int, int, float | None], None]
 def run_control(
     folder: Path, size: ControlSize | None = None, done: ControlProgress = lambda name, of, step, loss: None
 ) -> list[ControlCheck]:
-    """Train and play all three parts, or resume a stopped run of the same size. Returns the checks."""
+    """Train and play all three parts, or resume a stopped run of the same size. Return the checks."""
     size = size or ControlSize()
     parts = (dpt_on_bandits, ad_on_bandits, ad_in_dark_room)
     return [
@@ -91,7 +91,7 @@ def run_control(
 
 
 def format_checks(checks: list[ControlCheck]) -> str:
-    """Returns text with one line per check."""
+    """Return text with one line per check."""
     lines = [f"{'':4}  {'world':9}  {'method':20}  {'quantity':24}  {'value':>6}  {'limit':>6}"]
     for world, method, quantity, value, limit, passed, note in checks:
         verdict = "pass" if passed else "FAIL"
@@ -169,7 +169,7 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
     steps = size.room_episodes * small.episode
 
     def share_of_best(context: int) -> np.ndarray:
-        """Returns the mean share of the best return in each episode, (episodes,)."""
+        """Return the mean share of the best return in each episode, (episodes,)."""
         policy = learned(method, state.params, context, PlayMode(greedy=False))
         _, rewards = worlds.play_world(small, policy, jnp.asarray(tasks, jnp.int32), 0, steps)
         returns = np.asarray(rewards).reshape(len(tasks), -1, small.episode).sum(axis=-1)

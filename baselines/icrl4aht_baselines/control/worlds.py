@@ -49,7 +49,7 @@ ARMS = 5
 
 
 def bandit() -> SmallWorld:
-    """Returns Bernoulli bandits: a task is the arms' means, float32 (5,); a reward is 1 or 0."""
+    """Return Bernoulli bandits: a task is the arms' means, float32 (5,); a reward is 1 or 0."""
 
     def step(means: Array, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
         return state, 1.0 * (jax.random.uniform(key) < means[action])
@@ -72,13 +72,13 @@ CELL_OBS = np.concatenate([np.tri(SIDE, SIDE - 1, -1, dtype=np.uint8)[line] for 
 
 
 def _next_cells() -> np.ndarray:
-    """Returns the cell after each move, int32 (cells, moves)."""
+    """Return the cell after each move, int32 (cells, moves)."""
     to = np.clip(np.stack([_ROWS, _COLUMNS], axis=-1)[:, None] + MOVES, 0, SIDE - 1)
     return (to[..., 0] * SIDE + to[..., 1]).astype(np.int32)
 
 
 def dark_room() -> SmallWorld:
-    """Returns Dark Room: a task is the goal's cell, int32 (); the reward is 1 after a step that ends on it."""
+    """Return Dark Room: a task is the goal's cell, int32 (); the reward is 1 after a step that ends on it."""
     next_cells = jnp.asarray(_next_cells())
 
     def step(goal: Array, cell: Array, action: Array, key: Array) -> tuple[Array, Array]:
@@ -90,14 +90,14 @@ def dark_room() -> SmallWorld:
 
 
 def best_return(goal: np.ndarray) -> np.ndarray:
-    """Returns the return of an episode that walks straight to the goal, float (N,)."""
+    """Return the return of an episode that walks straight to the goal, float (N,)."""
     return ROOM_STEPS + 1.0 - np.maximum(_distance(goal, np.asarray(MIDDLE)), 1)
 
 
 def play_world(
     small: SmallWorld, policy: Policy, tasks: Array, seed: int, steps: int
 ) -> tuple[Int[Array, "N T"], Float[Array, "N T"]]:
-    """Returns an ego's actions and rewards in every task; its memory lasts for the task."""
+    """Return an ego's actions and rewards in every task; its memory lasts for the task."""
 
     def play_task(task: Array, key: Array) -> tuple[Array, Array]:
         def step(carry: Any, t: Array) -> tuple[Any, Any]:
@@ -124,12 +124,12 @@ class RowSampler:
         self.rows, self.batch_size, self.seed = rows, batch_size, seed
 
     def batch(self, i: int, out: Any = None) -> Any:
-        """Returns batch i."""
+        """Return batch i."""
         chosen = scale_to_range(random_uint32(self.seed, i, 1, self.batch_size)[0], len(self.rows[0]))
         return jax.tree.map(lambda array: array[chosen], self.rows)
 
     def empty(self) -> Any:
-        """Returns a batch with the shapes and dtypes of all batches."""
+        """Return a batch with the shapes and dtypes of all batches."""
         return self.batch(0)
 
 
@@ -138,12 +138,12 @@ BanditAlgorithm = Callable[[np.ndarray, np.ndarray, int, np.random.Generator], n
 
 
 def thompson(wins: np.ndarray, losses: np.ndarray, t: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns arms by Thompson sampling under the prior that the tasks are drawn from."""
+    """Return arms by Thompson sampling under the prior that the tasks are drawn from."""
     return rng.beta(1 + wins, 1 + losses).argmax(axis=1)
 
 
 def ucb(wins: np.ndarray, losses: np.ndarray, t: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns arms by upper confidence bounds, half as wide as UCB1's; ties are broken at random."""
+    """Return arms by upper confidence bounds, half as wide as UCB1's; ties are broken at random."""
     pulls = wins + losses
     bound = wins / np.maximum(pulls, 1) + np.sqrt(0.5 * np.log(t + 1) / np.maximum(pulls, 1))
     return (np.where(pulls > 0, bound, 9.0) + 1e-6 * rng.random(bound.shape)).argmax(axis=1)
@@ -152,7 +152,7 @@ def ucb(wins: np.ndarray, losses: np.ndarray, t: int, rng: np.random.Generator) 
 def play_bandits(
     choose: BanditAlgorithm, means: np.ndarray, steps: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns actions int32 (N, T) and rewards float32 (N, T) of an algorithm on bandits with means (N, arms)."""
+    """Return actions int32 (N, T) and rewards float32 (N, T) of an algorithm on bandits with means (N, arms)."""
     wins, losses = np.zeros_like(means), np.zeros_like(means)
     row, actions, rewards = np.arange(len(means)), [], []
     for t in range(steps):
@@ -166,7 +166,7 @@ def play_bandits(
 
 
 def search(goals: np.ndarray, episodes: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns histories of a model-based learner in Dark Rooms: cells and actions int32, rewards float32 (N, T).
+    """Return histories of a model-based learner in Dark Rooms: cells and actions int32, rewards float32 (N, T).
 
     The learner knows how it moves but not where the goal is. It walks from one random cell to the next until it is
     rewarded, and from then on straight to the cell of that reward. Half of its moves are random at first, linearly
@@ -195,12 +195,12 @@ def search(goals: np.ndarray, episodes: int, rng: np.random.Generator) -> tuple[
 
 
 def _distance(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Returns the number of moves between cells."""
+    """Return the number of moves between cells."""
     return np.abs(_ROWS[one] - _ROWS[two]) + np.abs(_COLUMNS[one] - _COLUMNS[two])
 
 
 def ad_rows(obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, episode: int) -> ADBatch:
-    """Returns complete histories (N, T, ..) as an AD batch of windows."""
+    """Return complete histories (N, T, ..) as an AD batch of windows."""
     t = np.arange(actions.shape[1])
     dones = np.broadcast_to((t + 1) % episode == 0 if episode else t < 0, actions.shape)
     before = [np.pad(array[:, :-1], ((0, 0), (1, 0))) for array in (actions, rewards)]
@@ -208,7 +208,7 @@ def ad_rows(obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, episode: 
 
 
 def dpt_rows(tasks: int, context: int, rng: np.random.Generator) -> DPTBatch:
-    """Returns bandits with contexts by diverse players, as DPT is trained on (Lee et al. 2023), and the best arm.
+    """Return bandits with contexts by diverse players, as DPT is trained on (Lee et al. 2023), and the best arm.
 
     A player draws from a mixture of a random policy and one fixed arm; the arm's share is drawn from 0, 0.1, .., 1.
     """

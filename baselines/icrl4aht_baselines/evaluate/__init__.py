@@ -1,7 +1,12 @@
 """Evaluation of egos on the benchmark's tasks, under named protocols."""
 
+import sys
+
+from icrl4aht_baselines import CallablePackage
 from icrl4aht_baselines.evaluate.evaluator import evaluate
-from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, Protocol, get_protocol
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, Protocol, get_protocol, test_tasks
 from icrl4aht_baselines.evaluate.results import Result
 
-__all__ = ["PROTOCOLS", "Protocol", "Result", "evaluate", "get_protocol"]
+__all__ = ["PROTOCOLS", "Protocol", "Result", "evaluate", "get_protocol", "test_tasks"]
+
+sys.modules[__name__].__class__ = CallablePackage

@@ -11,7 +11,7 @@ import numpy as np
 from icrl4aht_generation.policy import Policy
 from jaxtyping import Bool, Float, Int
 
-from icrl4aht_baselines.agents.egos import with_channels
+from icrl4aht_baselines.agents.egos import with_view
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import Protocol
 from icrl4aht_baselines.methods.method import Method
@@ -77,7 +77,7 @@ def measure_drift(
         return one.argmax().astype(jnp.int32), _BothMemories(cached, exact, both.steps + 1, *compared)
 
     ego = Policy(params, init, act, "percept")
-    rollout, state, episode = prepare_rollout(lambda layout: with_channels(ego, channels, layout), tasks, protocol)
+    rollout, state, episode = prepare_rollout(lambda layout: with_view(ego, layout, channels), tasks, protocol)
     for _ in range(protocol.episodes):
         state, _ = episode(params, rollout.teammate_params, state)
         yield Drift(np.asarray(state.ego.distance), np.asarray(state.ego.same))

@@ -130,7 +130,7 @@ def _evaluate_group(
     stopped: Event,
     done: Callable[[int], None],
 ) -> list[Result]:
-    """Returns the results of tasks of one layout and teammate family; none if it was stopped."""
+    """Return the results of tasks of one layout and teammate family; none if it was stopped."""
     returns = []
     for episode in play_episodes(prepared, prepared.rollout.protocol.episodes):
         if stopped.is_set():
@@ -186,7 +186,7 @@ def prepare_rollout(
 
 
 def _check_actions(rollout: EvaluationRollout, state: RolloutState) -> None:
-    """Traces one step of the egos, which yields shape and dtype of their actions without computing any."""
+    """Trace one step of the egos, which yields shape and dtype of their actions without computing any."""
     keys = state.env.key
     ego = rollout.batched_ego
     actions, _ = jax.eval_shape(ego.act, ego.params, state.ego, rollout.ego_view(state), keys)

@@ -10,7 +10,8 @@ from icrl4aht_generation.policy import Noise
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import EmptySelectionError, OptionError, unknown
+from icrl4aht_data.overcooked.layouts import get_layout
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,8 @@ class Protocol:
 
     Attributes:
         name: name of the protocol, "published" or "seeded".
-        noise: source of the randomness of heuristic teammates: "fixed" or "seeded", see `icrl4aht_generation.policy.Noise`.
+        noise: source of the randomness of heuristic teammates, "fixed" or "seeded", see
+            `icrl4aht_generation.policy.Noise`.
         four_recipes: whether the layouts of the layout track draw from four recipes, as for the published numbers, and
             not from their own two.
         episodes: number of episodes of each task.
@@ -41,8 +43,32 @@ EVALUATION_SPLITS = ("test", "validation", "diverse")
 teammates are of the published training ranges, or diverse, see `icrl4aht_generation.teammates.draws`."""
 
 
+def test_tasks(track: str, layout: str | None = None, family: str | None = None) -> list[Task]:
+    """Return the benchmark's test tasks of a track, perhaps only those on a layout or with a teammate family.
+
+    Args:
+        track: "teammate" or "layout".
+        layout: name of a layout, such as "demo_wide".
+        family: family of the teammates, "H1" to "H4".
+
+    Raises:
+        UnknownNameError: for an unknown track or layout.
+        EmptySelectionError: if the track has no such test task.
+    """
+    name = None if layout is None else get_layout(layout).name
+    every = bundled_tasks(track, "test")
+    found = [task for task in every if name in (None, task.layout.name) and family in (None, task.teammate_family)]
+    if not found:
+        layouts, families = ({getattr(task, of) for task in every} for of in ("layout_name", "teammate_family"))
+        raise EmptySelectionError(
+            f"layout = {layout}, family = {family}: no test task of track {track}; it has layouts "
+            f"{', '.join(sorted(layouts))} and families {', '.join(sorted(families))}"
+        )
+    return found
+
+
 def bundled_tasks(track: str, split: str) -> list[Task]:
-    """Returns the tasks of a track that are in the package.
+    """Return the tasks of a track that are in the package.
 
     Args:
         track: the track.
@@ -65,7 +91,7 @@ PROTOCOLS = {
 
 
 def get_protocol(name: str, episodes: int | None = None) -> Protocol:
-    """Returns the protocol with a name, with another number of episodes per task if one is given.
+    """Return the protocol with a name, with another number of episodes per task if one is given.
 
     Raises:
         UnknownNameError: if there is no such protocol; lists the valid names and the nearest.
@@ -81,7 +107,7 @@ def get_protocol(name: str, episodes: int | None = None) -> Protocol:
 
 
 def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
-    """Returns the first `count` tasks of each layout and teammate kind, in order; all tasks for None.
+    """Return the first `count` tasks of each layout and teammate kind, in order; all tasks for None.
 
     Raises:
         OptionError: if `count` is not positive.

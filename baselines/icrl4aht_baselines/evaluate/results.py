@@ -28,17 +28,17 @@ class Result:
     returns: list[list[float]]
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the content of the result's JSON file."""
+        """Return the content of the result's JSON file."""
         return {"settings_hash": json_hash(self.settings), **asdict(self)}
 
 
 def result_path(out: Path, task_id: str) -> Path:
-    """Returns the path of a task's result in a folder of results."""
+    """Return the path of a task's result in a folder of results."""
     return out / "tasks" / f"{task_id}.json"
 
 
 def find_result(out: Path, task_id: str, settings: dict[str, Any]) -> Result | None:
-    """Returns a task's result from a folder of results, or None if there is none yet.
+    """Return a task's result from a folder of results, or None if there is none yet.
 
     Raises:
         OptionError: if the result was made under other settings, or its file is damaged.
@@ -55,7 +55,7 @@ def find_result(out: Path, task_id: str, settings: dict[str, Any]) -> Result | N
 
 
 def read_result(path: Path) -> Result:
-    """Returns the result in a file.
+    """Return the result in a file.
 
     Raises:
         OptionError: if the file is not a result, or its settings do not match their hash.

@@ -94,13 +94,13 @@ class EvaluationRollout:
         return HostPolicy(self.ego.params, init, act, self.ego.sees)
 
     def start(self, keys: jax.Array) -> RolloutState:
-        """Returns the state before the first episode from task keys (B,)."""
+        """Return the state before the first episode from task keys (B,)."""
         batch = keys.shape[0]
         egos = self.batched_ego.init(self.ego.params, _fold_all(keys, EGO))
         return RolloutState(self.env.init(keys), egos, no_outcome(batch))
 
     def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, EpisodeBatch]:
-        """Returns the state after one episode of every task, and the episode. To be jitted by the caller."""
+        """Return the state after one episode of every task, and the episode. To be jitted by the caller."""
         mate = self.teammates[0]
         # Teammates start each episode afresh from its key; egos keep their memory, and only their keys are new.
         keys = self.env.episode_key(state.env)
@@ -127,7 +127,7 @@ class EvaluationRollout:
         return state, EpisodeBatch(record, actions, reward, end)
 
     def ego_view(self, state: RolloutState) -> Any:
-        """Returns the input of the egos, with a leading axis (B,): state records, observations or percepts."""
+        """Return the input of the egos, with a leading axis (B,): state records, observations or percepts."""
         if self.ego.sees == "percept":
             return state.before._replace(obs=self._view("observation", state.env, EGO))
         return self._view(self.ego.sees, state.env, EGO)
@@ -137,7 +137,7 @@ class EvaluationRollout:
 
 
 def no_outcome(batch: int) -> Percept:
-    """Returns the outcome of the previous step before the first step of B tasks."""
+    """Return the outcome of the previous step before the first step of B tasks."""
     zero = jnp.zeros(batch, jnp.int32)
     return Percept(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
 
@@ -147,6 +147,6 @@ def _fold_all(keys: jax.Array, data: Any) -> jax.Array:
 
 
 def task_key(seed: int, task_id: str) -> jax.Array:
-    """Returns the key from which all randomness of a task's episodes is derived."""
+    """Return the key from which all randomness of a task's episodes is derived."""
     digest = hashlib.sha256(task_id.encode()).digest()
     return jax.random.fold_in(jax.random.key(seed), int.from_bytes(digest[:4], "big"))

@@ -83,7 +83,7 @@ class StepModel(nn.Module):
         actions: Int[Array, "B L"] | None = None,
         deterministic: bool = True,
     ) -> StepOutput:
-        """Returns the output for windows of steps, with the auxiliary predictions if actions are given."""
+        """Return the output for windows of steps, with the auxiliary predictions if actions are given."""
         trunk: Any = self.trunk
         tokens_BxLxD = self.tokens(steps, deterministic)
         features_BxLxD = trunk(tokens_BxLxD, deterministic=deterministic)
@@ -93,14 +93,14 @@ class StepModel(nn.Module):
         return StepOutput(self.head(features_BxLxD), predicted, mate, family)
 
     def start(self, context: int, cached: bool) -> Any:
-        """Returns the memory of an ego before its first step."""
+        """Return the memory of an ego before its first step."""
         if not cached:
             return RingBuffer.empty(context, self.tokens.width)
         trunk: Any = self.trunk
         return WindowMemory(jnp.zeros((context, self.tokens.width)), jnp.int32(0), trunk.start(context))
 
     def act(self, step: StepInput, done: Bool[Array, ""], memory: Any) -> tuple[Any, Any]:
-        """Returns the head's output for one step of an ego, and the memory with the step."""
+        """Return the head's output for one step of an ego, and the memory with the step."""
         trunk: Any = self.trunk
         token = self.tokens(step)
         if isinstance(memory, RingBuffer):
@@ -112,7 +112,7 @@ class StepModel(nn.Module):
         return self.head(feature), WindowMemory(tokens.at[steps].set(token), steps + 1, states)
 
     def _with_room(self, memory: WindowMemory) -> WindowMemory:
-        """Returns the memory, in which a full window has lost its oldest steps and their part in what was computed.
+        """Return the memory, in which a full window has lost its oldest steps and their part in what was computed.
 
         A kept step's keys and values were computed when it could still see the steps that go, so all are computed
         again, as if the kept steps were all that ever happened.
@@ -132,7 +132,7 @@ class StepModel(nn.Module):
 
 
 def dropped_steps(context: int) -> int:
-    """Returns how many steps a full window of `context` steps loses at once in cached acting: a fifth.
+    """Return how many steps a full window of `context` steps loses at once in cached acting: a fifth.
 
     So the window has 4/5 of the context or more, and 4 tokens are computed again for every step.
     """
@@ -140,7 +140,7 @@ def dropped_steps(context: int) -> int:
 
 
 def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
-    """Returns a model of steps with the given trunk and head."""
+    """Return a model of steps with the given trunk and head."""
     teammate = nn.Dense(world.actions) if options.teammate_loss else None
     family = nn.Dense(len(all_families())) if options.family_loss else None
     next_obs = make_next_obs_head(options, world)
@@ -148,26 +148,26 @@ def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head:
 
 
 def example_step(world: World) -> StepInput:
-    """Returns a step of zeros, (1, 1)."""
+    """Return a step of zeros, (1, 1)."""
     zero = jnp.zeros((1, 1), jnp.int32)
     return StepInput(jnp.zeros((1, 1, *world.obs_shape)), zero, jnp.zeros((1, 1)), zero)
 
 
 def next_obs_loss(predicted: Float[Array, "B L N"], obs: Num[Array, "B L ..."], batch: ADBatch) -> Float[Array, ""]:
-    """Returns the auxiliary loss over steps whose successor is in the window and in the same episode."""
+    """Return the auxiliary loss over steps whose successor is in the window and in the same episode."""
     errors = squared_error(predicted[:, :-1], obs[:, 1:])
     return mean_of_rows(errors, jnp.asarray(batch.attention_mask)[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1])
 
 
 def teammate_loss(predicted: Float[Array, "B L A"], batch: ADBatch) -> Float[Array, ""]:
-    """Returns the auxiliary loss over steps whose successor, which shows the teammate's action, is in the window."""
+    """Return the auxiliary loss over steps whose successor, which shows the teammate's action, is in the window."""
     assert batch.prev_teammate_actions is not None
     errors = cross_entropy(predicted[:, :-1], jnp.asarray(batch.prev_teammate_actions)[:, 1:], 0.0)
     return mean_of_rows(errors, jnp.asarray(batch.attention_mask)[:, 1:])
 
 
 def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
-    """Returns AD's loss: cross-entropy of the target actions, over valid positions (paper, App. E.2).
+    """Return AD's loss: cross-entropy of the target actions, over valid positions (paper, App. E.2).
 
     The targets are the actions taken, or labels.
     """
@@ -198,7 +198,7 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
 def action_method(
     name: str, label: str, make_trunk: Callable[[ModelOptions], nn.Module]
 ) -> Callable[[ModelOptions, World], Method]:
-    """Returns the maker of Algorithm Distillation on a trunk."""
+    """Return the maker of Algorithm Distillation on a trunk."""
 
     def make(options: ModelOptions, world: World) -> Method:
         model = make_step_model(options, world, make_trunk(options), nn.Dense(world.actions))

@@ -73,7 +73,7 @@ class ActorCriticHead(nn.Module):
 
 
 def amago_offline(options: ModelOptions, world: World) -> Method:
-    """Returns an offline actor-critic on AD's tokens and transformer."""
+    """Return an offline actor-critic on AD's tokens and transformer."""
     check_no_teammate_loss("amago_offline", options)
     head = ActorCriticHead(options.width, len(options.discounts), world.actions)
     model = make_step_model(options, world, make_transformer(options), head)

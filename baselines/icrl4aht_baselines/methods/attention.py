@@ -22,7 +22,7 @@ SHORT_ROWS, LONG_ROWS = 64, 512
 def causal_attention(
     q_BxNxHxDh: Float[Array, "B N H Dh"], k_BxNxHxDh: Float[Array, "B N H Dh"], v_BxNxHxDh: Float[Array, "B N H Dh"]
 ) -> Float[Array, "B N H Dh"]:
-    """Returns attention in which each token sees those up to itself."""
+    """Return attention in which each token sees those up to itself."""
     return _attention(q_BxNxHxDh, k_BxNxHxDh, v_BxNxHxDh, 1)
 
 
@@ -33,12 +33,12 @@ def query_attention(
     k_BxKxHxDh: Float[Array, "B K H Dh"],
     v_BxKxHxDh: Float[Array, "B K H Dh"],
 ) -> Float[Array, "B K+1 H Dh"]:
-    """Returns attention in which query j sees the first j tokens of a context, and itself."""
+    """Return attention in which query j sees the first j tokens of a context, and itself."""
     return _attention(q_BxQxHxDh, k_BxKxHxDh, v_BxKxHxDh, 0, own_k_BxQxHxDh, own_v_BxQxHxDh)
 
 
 def _attention(q: Array, k: Array, v: Array, seen_by_first: int, *own: Array) -> Array:
-    """Returns attention of rows of queries, of which row i sees `seen_by_first` + i keys, and its own if there are any.
+    """Return attention of rows of queries, of which row i sees `seen_by_first` + i keys, and its own if there are any.
 
     Args:
         q: queries (B, N, H, Dh).
@@ -59,7 +59,7 @@ def _attention(q: Array, k: Array, v: Array, seen_by_first: int, *own: Array) ->
 
 
 def _map_long_blocks(seen_by_first: int, k: Array, v: Array, *rows: Array) -> Array:
-    """Attends with `LONG_ROWS` rows at a time, arrays (B, H, N, Dh)."""
+    """Attend with `LONG_ROWS` rows at a time, arrays (B, H, N, Dh)."""
     batch, heads, length, width = rows[0].shape
     blocks = -(-length // LONG_ROWS)
     padding = ((0, 0), (0, 0), (0, blocks * LONG_ROWS - length), (0, 0))
@@ -77,7 +77,7 @@ def _attend(
     q_BxHxRxDh: Float[Array, "B H R Dh"],
     *own_BxHxRxDh: Float[Array, "B H R Dh"],
 ) -> Float[Array, "B H R Dh"]:
-    """Returns the attention of a block of rows, of which row i sees `seen` + i keys.
+    """Return the attention of a block of rows, of which row i sees `seen` + i keys.
 
     Weights are divided by their sum after they were applied, to (R, Dh) instead of (R, N) numbers.
     """

@@ -16,7 +16,7 @@ Changed = TypeVar("Changed")
 def change_if(
     condition: Bool[Array, ""], change: Callable[[Any, Changed], Changed], params: Any, memory: Changed
 ) -> Changed:
-    """Returns `change(params, memory)` if the condition holds, otherwise the memory.
+    """Return `change(params, memory)` if the condition holds, otherwise the memory.
 
     `jax.vmap` turns `jax.lax.cond` into a selection, which computes both branches in every step. Here the change is
     computed only in steps in which the condition holds for at least one row of the batch.

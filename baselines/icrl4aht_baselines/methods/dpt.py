@@ -90,7 +90,7 @@ class DPT(nn.Module):
     finished_episodes_only: bool = True
 
     def __call__(self, context: Transition, query: Any, deterministic: bool = True) -> DPTOutput:
-        """Returns the answers to one query (B, ..) or several (B, Q, ..) after every part of a context (B, K)."""
+        """Return the answers to one query (B, ..) or several (B, Q, ..) after every part of a context (B, K)."""
         tokens_BxKxD, obs_features = self.tokens.context(context, deterministic)
         batch, length, width = tokens_BxKxD.shape
         queries_BxQxD = self.tokens.query(query, deterministic).reshape(batch, -1, width)
@@ -106,7 +106,7 @@ class DPT(nn.Module):
         return DPTOutput(self.head(answers), predicted)
 
     def start(self, context: int, cached: bool) -> DPTMemory:
-        """Returns the memory of an ego before its first step: room for K transitions and a running episode.
+        """Return the memory of an ego before its first step: room for K transitions and a running episode.
 
         A context that grows by steps is not cached: it would have to be computed again in every step.
         """
@@ -115,7 +115,7 @@ class DPT(nn.Module):
         return DPTMemory(buffer, jnp.int32(0), caches, jnp.zeros(self.obs_shape), jnp.bool_(False))
 
     def act(self, step: StepInput, done: Bool[Array, ""], memory: DPTMemory) -> tuple[Float[Array, " A"], DPTMemory]:
-        """Returns the policy for one step of an ego, and the memory with the outcome of the step before.
+        """Return the policy for one step of an ego, and the memory with the outcome of the step before.
 
         An episode's last transition is left out: its successor in that episode is never shown, and the first
         observation of the next episode is not its successor.
@@ -137,7 +137,7 @@ class DPT(nn.Module):
         return self.head(feature), DPTMemory(buffer, complete, caches, obs, jnp.bool_(True))
 
     def _answer_from_tokens(self, query: Array, buffer: RingBuffer, complete: Array) -> Array:
-        """Computes the answer from the tokens of the complete context."""
+        """Compute the answer from the tokens of the complete context."""
         window, valid = buffer.last(len(buffer.tokens) - KEPT_STEPS, complete)
         sequence = jnp.append(window, query[None], axis=0).at[valid].set(query)  # tokens behind it are not seen
         return self.trunk(sequence[None])[0, valid]
@@ -145,7 +145,7 @@ class DPT(nn.Module):
     def _cache_context(
         self, done: Array, buffer: RingBuffer, complete: Array, caches: tuple[AttentionCache, ...]
     ) -> tuple[AttentionCache, ...]:
-        """Computes the keys and values of the context if an episode has ended, which is when it changes."""
+        """Compute the keys and values of the context if an episode has ended, which is when it changes."""
         trunk, variables = self.trunk.unbind()
         slots = caches[0].slots
 
@@ -159,7 +159,7 @@ class DPT(nn.Module):
     def _answer_from_caches(
         self, query: Array, complete: Array, caches: tuple[AttentionCache, ...]
     ) -> tuple[Array, tuple[AttentionCache, ...]]:
-        """Computes the answer from the cached keys and values of the context."""
+        """Compute the answer from the cached keys and values of the context."""
         last = caches[0].slots - 1
         valid = jnp.minimum(complete, last)
         visible = jnp.append(jnp.arange(last) < valid, True)
@@ -167,12 +167,12 @@ class DPT(nn.Module):
 
 
 def _in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Array, "B K+1 ..."]:
-    """Returns one value for every part of a context of K = `length` transitions: value j mod Q after the first j."""
+    """Return one value for every part of a context of K = `length` transitions: value j mod Q after the first j."""
     return values[:, jnp.arange(length + 1) % values.shape[1]]
 
 
 def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:
-    """Returns the Decision-Pretrained Transformer; 3,285,022 parameters at C = 40 channels."""
+    """Return the Decision-Pretrained Transformer; 3,285,022 parameters at C = 40 channels."""
     check_no_teammate_loss("dpt", options)
     tokens = make_tokens(TransitionTokens, options, world)
     head, next_obs = nn.Dense(world.actions), make_next_obs_head(options, world)

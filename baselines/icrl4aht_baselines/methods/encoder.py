@@ -21,5 +21,5 @@ class FlatEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Num[Array, "*B N"]) -> Float[Array, "*B F"]:
-        """Returns features of observations, which are integers or float."""
+        """Return features of observations, which are integers or float."""
         return orthogonal_dense(self.features)(obs.astype(self.dtype))

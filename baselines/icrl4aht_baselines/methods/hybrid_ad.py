@@ -29,29 +29,29 @@ class RecurrentTrunk(nn.Module):
         self.norm, self.drop = nn.LayerNorm(), nn.Dropout(self.dropout)
 
     def __call__(self, x: Float[Array, "B N D"], *, deterministic: bool = True) -> Float[Array, "B N D"]:
-        """Returns features of complete sequences."""
+        """Return features of complete sequences."""
         zeros = tuple(jnp.zeros((x.shape[0], self.width), x.dtype) for _ in range(self.layers))
         return jnp.swapaxes(self._scan(jnp.swapaxes(x, 0, 1), zeros, deterministic)[0], 0, 1)
 
     def start(self, context: int) -> tuple[Float[Array, " D"], ...]:
-        """Returns the states before the first token, one per layer, whatever the context's length."""
+        """Return the states before the first token, one per layer, whatever the context's length."""
         return tuple(jnp.zeros(self.width) for _ in range(self.layers))
 
     def start_after(self, x: Float[Array, "N D"], context: int) -> tuple[Float[Array, " D"], ...]:
-        """Returns the states after a sequence of tokens."""
+        """Return the states after a sequence of tokens."""
         return self._advance(x, self.start(context))[1]
 
     def advance(
         self, x: Float[Array, " D"], memory: tuple[Float[Array, " D"], ...]
     ) -> tuple[Float[Array, " D"], tuple[Float[Array, " D"], ...]]:
-        """Returns the features of one more token, and the states after it."""
+        """Return the features of one more token, and the states after it."""
         features, states = self._advance(x[None], memory)
         return features[0], states
 
     def follow(
         self, x: Float[Array, "N B D"], states: tuple[Float[Array, "B D"], ...]
     ) -> tuple[Float[Array, "N B D"], tuple[Float[Array, "B D"], ...]]:
-        """Returns the features of B sequences with time on the first axis, and the states after them."""
+        """Return the features of B sequences with time on the first axis, and the states after them."""
         return self._scan(x, states, True)
 
     def _advance(self, x: Float[Array, "N D"], states: tuple[Array, ...]) -> tuple[Float[Array, "N D"], tuple]:

@@ -74,11 +74,11 @@ class Method:
     takes_labels: bool = True
 
     def init(self, key: Array) -> Any:
-        """Returns initial parameters, float32."""
+        """Return initial parameters, float32."""
         return jax.jit(self.model.init)(key, *self.example)["params"]
 
     def start(self, context: int, cached: bool) -> Any:
-        """Returns the memory of an ego before its first step.
+        """Return the memory of an ego before its first step.
 
         Args:
             context: K, the steps or transitions that it remembers; older ones have no part in its actions.
@@ -88,23 +88,23 @@ class Method:
         return self.model.apply({}, context, cached, method="start")
 
     def act(self, params: Any, step: StepInput, done: Bool[Array, ""], memory: Any) -> tuple[Float[Array, " A"], Any]:
-        """Returns policy logits, float32, and the memory after one step; `done`: the step before ended an episode."""
+        """Return policy logits, float32, and the memory after one step; `done`: the step before ended an episode."""
         output, memory = self.model.apply({"params": params}, step, done, memory, method="act")  # type: ignore[misc]
         return self.logits(output).astype(jnp.float32), memory
 
 
 def compute_dtype(options: ModelOptions) -> Any:
-    """Returns the dtype of activations."""
+    """Return the dtype of activations."""
     return jnp.bfloat16 if options.bfloat16 else jnp.float32
 
 
 def make_transformer(options: ModelOptions) -> Transformer:
-    """Returns the transformer of these options."""
+    """Return the transformer of these options."""
     return Transformer(options.layers, options.width, options.heads, options.dropout, options.positions, options.remat)
 
 
 def make_tokens(kind: type[TokensType], options: ModelOptions, world: World) -> TokensType:
-    """Returns a tokenizer of the given class for a world."""
+    """Return a tokenizer of the given class for a world."""
     dtype = compute_dtype(options)
     return kind(
         encoder=world.encoder(dtype),
@@ -132,7 +132,7 @@ class NextObsHead(nn.Module):
 
 
 def make_next_obs_head(options: ModelOptions, world: World) -> NextObsHead | None:
-    """Returns the head of the auxiliary loss, or None without +next_obs."""
+    """Return the head of the auxiliary loss, or None without +next_obs."""
     return NextObsHead(options.width, world.actions, int(np.prod(world.obs_shape))) if options.next_obs else None
 
 
@@ -148,19 +148,19 @@ def check_no_teammate_loss(name: str, options: ModelOptions) -> None:
 
 
 def squared_error(predicted: Float[Array, "*B N"], obs: Num[Array, "*B ..."]) -> Float[Array, "*B"]:
-    """Returns the squared error of predicted observations, mean over an observation's entries."""
+    """Return the squared error of predicted observations, mean over an observation's entries."""
     target = obs.astype(jnp.float32).reshape(predicted.shape)
     return jnp.square(predicted.astype(jnp.float32) - target).mean(axis=-1)
 
 
 def cross_entropy(logits: Float[Array, "*B A"], action: Int[Array, "*B"], smoothing: float) -> Float[Array, "*B"]:
-    """Returns the cross-entropy of actions against a policy, with label smoothing."""
+    """Return the cross-entropy of actions against a policy, with label smoothing."""
     target = optax.smooth_labels(jax.nn.one_hot(action, logits.shape[-1]), smoothing)
     return optax.softmax_cross_entropy(logits.astype(jnp.float32), target)
 
 
 def mean_of_rows(values: Float[Array, "B L"], mask: Bool[Array, "B L"]) -> Float[Array, ""]:
-    """Returns the mean over rows of the mean over each row's valid positions (the paper's 1/|M|).
+    """Return the mean over rows of the mean over each row's valid positions (the paper's 1/|M|).
 
     Rows weigh the same whatever their padding, so the loss of a batch is the mean of the losses of its parts.
     """
@@ -168,7 +168,7 @@ def mean_of_rows(values: Float[Array, "B L"], mask: Bool[Array, "B L"]) -> Float
 
 
 def run_model(model: nn.Module, options: ModelOptions, params: Any, key: Any, *inputs: Any, **named: Any) -> Any:
-    """Returns the model's output, computed in the dtype of the options; with dropout if there is a key."""
+    """Return the model's output, computed in the dtype of the options; with dropout if there is a key."""
     dtype = compute_dtype(options)
     params = jax.tree.map(lambda leaf: leaf.astype(dtype), params)
     rngs = {} if key is None else {"dropout": key}

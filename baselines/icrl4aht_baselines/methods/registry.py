@@ -39,7 +39,7 @@ PLAYING = ("rl2",)
 
 
 def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
-    """Returns the function that makes a method from (ModelOptions, World).
+    """Return the function that makes a method from (ModelOptions, World).
 
     Raises:
         UnknownNameError: if there is no such method; lists the valid names and the nearest.
@@ -66,7 +66,7 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
 
 
 def all_methods() -> list[str]:
-    """Returns the names of all methods, those of other packages last."""
+    """Return the names of all methods, those of other packages last."""
     return [*METHODS, *METHOD_PLUGINS.names]
 
 
@@ -76,7 +76,7 @@ def overcooked_world(
     view: BatchView | None = None,
     canonical: bool = False,
 ) -> World:
-    """Returns the world of OvercookedV2 on layouts with observations of one shape.
+    """Return the world of OvercookedV2 on layouts with observations of one shape.
 
     Args:
         layouts: the layouts in batches.

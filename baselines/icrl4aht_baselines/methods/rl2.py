@@ -1,6 +1,6 @@
 """RL^2 (Duan et al. 2016): a recurrent policy whose state lives through all episodes of a task, trained by PPO.
 
-The model reads AD's tokens and acts as all other models do. It is trained by playing, see `icrl4aht_baselines.online.rl2`.
+The model reads AD's tokens and acts as all other models do. `icrl4aht_baselines.online.rl2` trains it by playing.
 
 Shapes: `B` batch size, `T` steps, `A` actions, `D` width, `S` size of the recurrent state.
 """
@@ -55,19 +55,19 @@ class RL2Model(nn.Module):
     head: PolicyValueHead
 
     def __call__(self, steps: StepInput, state: Float[Array, "B S"]) -> tuple[PolicyValue, Float[Array, "B S"]]:
-        """Returns the output at T steps of B tasks, inputs (T, B, ..), and the state after the last one."""
+        """Return the output at T steps of B tasks, inputs (T, B, ..), and the state after the last one."""
         layers = tuple(jnp.split(state, self.trunk.layers, axis=-1))
         features, layers = self.trunk.follow(self.tokens(steps), layers)
         return self.head(features), jnp.concatenate(layers, axis=-1)
 
     def start(self, context: int, cached: bool) -> Float[Array, " S"]:
-        """Returns the state before a task, whatever the context: it forgets nothing at once."""
+        """Return the state before a task, whatever the context: it forgets nothing at once."""
         return jnp.zeros(self.trunk.layers * self.trunk.width)
 
     def act(
         self, step: StepInput, done: Bool[Array, ""], state: Float[Array, " S"]
     ) -> tuple[PolicyValue, Float[Array, " S"]]:
-        """Returns the output for one step of one task, and the state after it."""
+        """Return the output for one step of one task, and the state after it."""
         layers = tuple(jnp.split(state, self.trunk.layers))
         feature, layers = self.trunk.advance(self.tokens(step), layers)
         return self.head(feature), jnp.concatenate(layers)
@@ -78,7 +78,7 @@ def _no_batches(params: Any, slow: Any, batch: Any, key: Any) -> tuple[Array, di
 
 
 def rl2(options: ModelOptions, world: World) -> Method:
-    """Returns the recurrent policy of RL^2."""
+    """Return the recurrent policy of RL^2."""
     check_no_teammate_loss("rl2", options)
     trunk = RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
     model = RL2Model(make_tokens(StepTokens, options, world), trunk, PolicyValueHead(options.width, world.actions))

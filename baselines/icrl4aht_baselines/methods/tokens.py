@@ -57,23 +57,23 @@ class Transition(NamedTuple):
 
 
 def plain_view(obs: Array, layouts: Array | None) -> Array:
-    """Returns the observations of batches that hold observations."""
+    """Return the observations of batches that hold observations."""
     return obs
 
 
 def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
-    """Returns the steps (B, L) of an AD batch."""
+    """Return the steps (B, L) of an AD batch."""
     obs = group_equal(view(batch.obs, batch.layouts))
     return StepInput(obs, batch.prev_actions, batch.prev_rewards, batch.prev_teammate_actions)  # type: ignore[arg-type]
 
 
 def percept_step(percept: Any) -> StepInput:
-    """Returns the input of an acting ego, converted from an `agents.Percept`."""
+    """Return the input of an acting ego, converted from an `agents.Percept`."""
     return StepInput(percept.obs, percept.prev_action, percept.prev_reward, percept.prev_teammate_action)
 
 
 def batch_transitions(batch: DPTBatch, view: BatchView) -> tuple[Transition, Any]:
-    """Returns the context's transitions (B, K) and the queries' observations, (B, ..) or (B, Q, ..), of a DPT batch."""
+    """Return the context's transitions (B, K) and the queries' observations, (B, ..) or (B, Q, ..), of a DPT batch."""
     both = jnp.stack([jnp.asarray(batch.context_obs), jnp.asarray(batch.context_next_obs)], axis=2)
     obs, query = group_equal(view(both, batch.layouts)), view(batch.query_obs, batch.layouts)
     mate: Any = batch.context_teammate_actions
@@ -107,7 +107,7 @@ class StepTokens(Tokens):
 
     @nn.compact
     def __call__(self, step: StepInput, deterministic: bool = True) -> Float[Array, "*B D"]:
-        """Returns one token per step."""
+        """Return one token per step."""
         parts = [nn.Embed(self.actions, FEATURES, name="action")(step.prev_action)]
         if self.teammate_actions:
             parts.append(nn.Embed(self.actions, FEATURES, name="teammate_action")(step.prev_teammate_action))
@@ -126,7 +126,7 @@ class TransitionTokens(Tokens):
         self.project, self.drop = nn.Dense(self.width), nn.Dropout(self.dropout)
 
     def context(self, transition: Transition, deterministic: bool = True) -> tuple[Array, Float[Array, "*B F"]]:
-        """Returns one token (*B, D) per transition, and the encoded observations before the actions."""
+        """Return one token (*B, D) per transition, and the encoded observations before the actions."""
         seen = self.encoder(transition.obs)
         before, after = seen[..., 0, :], seen[..., 1, :]
         parts = [before, jax.nn.one_hot(transition.action, self.actions)]
@@ -135,7 +135,7 @@ class TransitionTokens(Tokens):
         return self._token([*parts, after, self.reward_scale * transition.reward[..., None]], deterministic), before
 
     def query(self, obs: Any, deterministic: bool = True) -> Float[Array, "*B D"]:
-        """Returns one token per observation for which an action is predicted."""
+        """Return one token per observation for which an action is predicted."""
         seen = self.encoder(obs)
         rest = self.actions * (1 + self.teammate_actions) + seen.shape[-1] + 1
         return self._token([seen, jnp.zeros((*seen.shape[:-1], rest))], deterministic)
@@ -157,14 +157,14 @@ class RingBuffer(NamedTuple):
 
     @classmethod
     def empty(cls, slots: int, width: int) -> RingBuffer:
-        """Returns a buffer without entries."""
+        """Return a buffer without entries."""
         return cls(jnp.zeros((slots, width)), jnp.int32(0))
 
     def add(self, token: Float[Array, " D"]) -> RingBuffer:
-        """Returns the buffer with one more entry, which replaces the oldest of a full buffer."""
+        """Return the buffer with one more entry, which replaces the oldest of a full buffer."""
         return RingBuffer(self.tokens.at[self.written % len(self.tokens)].set(token), self.written + 1)
 
     def last(self, context: int, stop: Int[Array, ""]) -> tuple[Float[Array, "K D"], Int[Array, ""]]:
-        """Returns the entries stop - K .. stop - 1 in order, at the front of the array, and their number."""
+        """Return the entries stop - K .. stop - 1 in order, at the front of the array, and their number."""
         first = jnp.maximum(stop - context, 0)
         return self.tokens[(first + jnp.arange(context)) % len(self.tokens)], stop - first

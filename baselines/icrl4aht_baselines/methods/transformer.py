@@ -71,7 +71,7 @@ class TransformerBlock(nn.Module):
         context: int,
         deterministic: bool,
     ) -> Float[Array, "B N D"]:
-        """Returns features of complete sequences; see `Transformer.__call__` for the arguments."""
+        """Return features of complete sequences; see `Transformer.__call__` for the arguments."""
         q, k, v = self._project(x_BxNxD, positions_N)  # each (B, N, H, Dh)
         attended = causal_attention(q[:, :context], k[:, :context], v[:, :context])
         if context < x_BxNxD.shape[1]:
@@ -87,7 +87,7 @@ class TransformerBlock(nn.Module):
         slot: Int[Array, ""],
         visible_S: Bool[Array, " S"],
     ) -> tuple[Float[Array, " D"], AttentionCache]:
-        """Returns the features of one token, whose key and value are written into a slot before it attends."""
+        """Return the features of one token, whose key and value are written into a slot before it attends."""
         x_1x1xD = x_D[None, None]
         q, k, v = (projected[0, 0] for projected in self._project(x_1x1xD, position[None]))  # each (H, Dh)
         cache = AttentionCache(cache.keys.at[:, slot].set(k), cache.values.at[:, slot].set(v))
@@ -97,13 +97,13 @@ class TransformerBlock(nn.Module):
     def cache(
         self, x_NxD: Float[Array, "N D"], positions_N: Int[Array, " N"]
     ) -> tuple[Float[Array, "N D"], AttentionCache]:
-        """Returns the features of one sequence without padding, and its keys and values, N slots."""
+        """Return the features of one sequence without padding, and its keys and values, N slots."""
         q, k, v = self._project(x_NxD[None], positions_N)  # each (1, N, H, Dh)
         features = self._add_residuals(x_NxD[None], causal_attention(q, k, v), True)[0]
         return features, AttentionCache(*(part[0].swapaxes(0, 1) for part in (k, v)))
 
     def _project(self, x_BxNxD: Array, positions_N: Int[Array, " N"]) -> list[Float[Array, "B N H Dh"]]:
-        """Returns queries, keys and values."""
+        """Return queries, keys and values."""
         qkv_BxNx3xHxDh = self.qkv(self.attention_norm(x_BxNxD)).reshape(*x_BxNxD.shape[:2], 3, self.heads, -1)
         q, k, v = (qkv_BxNx3xHxDh[:, :, i] for i in range(3))
         return [_rotate(q, positions_N), _rotate(k, positions_N), v] if self.rope else [q, k, v]
@@ -119,13 +119,13 @@ class TransformerBlock(nn.Module):
 def _attend_to_cache(
     q_HxDh: Float[Array, "H Dh"], cache: AttentionCache, visible_S: Bool[Array, " S"]
 ) -> Float[Array, "H Dh"]:
-    """Returns one token's attention. `jax.nn.dot_product_attention` takes ten times as long for it on a CPU."""
+    """Return one token's attention. `jax.nn.dot_product_attention` takes ten times as long for it on a CPU."""
     scores_HxS = jnp.einsum("hd,hsd->hs", q_HxDh, cache.keys) / q_HxDh.shape[-1] ** 0.5
     return jnp.einsum("hs,hsd->hd", jax.nn.softmax(scores_HxS, where=visible_S), cache.values)
 
 
 def _rotate(x_BxNxHxDh: Float[Array, "B N H Dh"], positions_N: Int[Array, " N"]) -> Float[Array, "B N H Dh"]:
-    """Rotates each pair of features by an angle in proportion to the position (Su et al. 2021)."""
+    """Rotate each pair of features by an angle in proportion to the position (Su et al. 2021)."""
     half = x_BxNxHxDh.shape[-1] // 2
     angle_NxF = positions_N[:, None] * 10_000.0 ** (-jnp.arange(half) / half)
     cos, sin = (f(angle_NxF)[:, None, :].astype(x_BxNxHxDh.dtype) for f in (jnp.cos, jnp.sin))
@@ -165,7 +165,7 @@ class Transformer(nn.Module):
         context: int | None = None,
         deterministic: bool = True,
     ) -> Float[Array, "B N D"]:
-        """Returns features of complete sequences, in which every token sees those up to itself.
+        """Return features of complete sequences, in which every token sees those up to itself.
 
         Args:
             x: tokens.
@@ -188,7 +188,7 @@ class Transformer(nn.Module):
         position: Int[Array, ""],
         visible_S: Bool[Array, " S"],
     ) -> tuple[Float[Array, " D"], tuple[AttentionCache, ...]]:
-        """Returns the features of one token, written into `slot`; it sees the visible slots, its own among them."""
+        """Return the features of one token, written into `slot`; it sees the visible slots, its own among them."""
         updated = []
         for block, cache in zip(self.blocks, caches, strict=True):
             x_D, cache = block.step(x_D, position, cache, slot, visible_S)
@@ -196,12 +196,12 @@ class Transformer(nn.Module):
         return self.norm(x_D), tuple(updated)
 
     def empty_caches(self, slots: int) -> tuple[AttentionCache, ...]:
-        """Returns zero caches of `slots` slots, one per layer."""
+        """Return zero caches of `slots` slots, one per layer."""
         zeros = jnp.zeros((self.heads, slots, self.width // self.heads))
         return (AttentionCache(zeros, zeros),) * self.layers
 
     def caches_of(self, x_NxD: Float[Array, "N D"], slots: int) -> tuple[AttentionCache, ...]:
-        """Returns caches of `slots` slots, one per layer, of which the first N hold a sequence; N is not 0."""
+        """Return caches of `slots` slots, one per layer, of which the first N hold a sequence; N is not 0."""
         behind = ((0, 0), (0, slots - len(x_NxD)), (0, 0))
         caches = []
         for block in self.blocks:
@@ -210,17 +210,17 @@ class Transformer(nn.Module):
         return tuple(caches)
 
     def start(self, context: int) -> TransformerMemory:
-        """Returns an empty memory for `context` tokens."""
+        """Return an empty memory for `context` tokens."""
         return TransformerMemory(self.empty_caches(context), jnp.int32(0))
 
     def start_after(self, x_NxD: Float[Array, "N D"], context: int) -> TransformerMemory:
-        """Returns a memory for `context` tokens that holds a sequence; N is not 0."""
+        """Return a memory for `context` tokens that holds a sequence; N is not 0."""
         return TransformerMemory(self.caches_of(x_NxD, context), jnp.int32(len(x_NxD)))
 
     def advance(
         self, x_D: Float[Array, " D"], memory: TransformerMemory
     ) -> tuple[Float[Array, " D"], TransformerMemory]:
-        """Returns the features of one more token, and the memory with it, which must not be full before."""
+        """Return the features of one more token, and the memory with it, which must not be full before."""
         caches, written = memory
         visible_S = jnp.arange(caches[0].slots) <= written
         feature_D, caches = self.step(x_D, caches, written, written, visible_S)

@@ -45,7 +45,7 @@ class ViewChange(NamedTuple):
     sideways: Bool[Array, "*B"]
 
     def observations(self, obs: Num[Array, "*B 5 5 46"]) -> Num[Array, "*B 5 5 46"]:
-        """Returns the observations as the ego sees them."""
+        """Return the observations as the ego sees them."""
         hidden, rows, columns = (flag[..., None, None, None] for flag in self)
         counters = jnp.where(_RECIPE, 0, obs).at[..., _WALL].max(obs[..., _INDICATOR])
         obs = jnp.where(hidden, counters, obs)
@@ -53,18 +53,18 @@ class ViewChange(NamedTuple):
         return jnp.where(columns, _exchanged(jnp.flip(obs, _COLUMNS), "left", "right"), obs)
 
     def actions(self, actions: Int[Array, "*B"]) -> Int[Array, "*B"]:
-        """Returns actions in the ego's view for actions in the environment, and the other way round."""
+        """Return actions in the ego's view for actions in the environment, and the other way round."""
         for mirrored, axis in ((self.upside_down, _ROWS), (self.sideways, _COLUMNS)):
             actions = jnp.where(mirrored, jnp.asarray(_MIRRORED_ACTIONS[axis], actions.dtype)[actions], actions)
         return actions
 
     def at_each_step(self, steps: int, axis: int) -> ViewChange:
-        """Returns the changes with an axis of steps inserted."""
+        """Return the changes with an axis of steps inserted."""
         return ViewChange(*(jnp.repeat(jnp.expand_dims(flag, axis), steps, axis) for flag in self))
 
 
 def _exchanged(obs: Array, one: str, other: str) -> Array:
-    """Returns observations in which agents face one direction where they faced the other.
+    """Return observations in which agents face one direction where they faced the other.
 
     Slices are much faster than a gather of all channels.
     """
@@ -79,7 +79,7 @@ def _exchanged(obs: Array, one: str, other: str) -> Array:
 
 
 def mirrored_action(actions: np.ndarray, mirroring: np.ndarray) -> np.ndarray:
-    """Returns the actions of mirrored rows.
+    """Return the actions of mirrored rows.
 
     Args:
         actions: int (B, ..).
@@ -92,13 +92,13 @@ def mirrored_action(actions: np.ndarray, mirroring: np.ndarray) -> np.ndarray:
 
 
 def no_change(*shape: int) -> ViewChange:
-    """Returns changes of shape (*B,) that change nothing."""
+    """Return changes of shape (*B,) that change nothing."""
     no: Any = jnp.zeros(shape, bool)
     return ViewChange(no, no, no)
 
 
 def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> BatchView:
-    """Returns the view of batches of state records whose ego sees hidden recipe indicators, or a mirrored game.
+    """Return the view of batches of state records whose ego sees hidden recipe indicators, or a mirrored game.
 
     The number of a row's layout in a batch says both: number n of N layouts, and N times the number of the mirroring, 0
     for none, 1 for upside down, 2 for sideways, 3 for both.

@@ -15,7 +15,7 @@ from icrl4aht_data.overcooked.layouts import EMPTY, STEP, Layout, get_layout
 
 
 def with_four_recipes(layout: Layout) -> Layout:
-    """Returns a layout with the four recipes that the protocol `published` has on the layout track.
+    """Return a layout with the four recipes that the protocol `published` has on the layout track.
 
     Raises:
         OptionError: if the layout has no pile of one of their ingredients.
@@ -27,7 +27,7 @@ def with_four_recipes(layout: Layout) -> Layout:
 
 
 def unseen_layouts(layout: Layout, count: int) -> list[Layout]:
-    """Returns rearranged versions of a layout that no model is trained on, with the layout's own recipes.
+    """Return rearranged versions of a layout that no model is trained on, with the layout's own recipes.
 
     They have the layout's name: what a model was told of the layout, such as hidden recipe indicators, holds for them.
 
@@ -39,7 +39,7 @@ def unseen_layouts(layout: Layout, count: int) -> list[Layout]:
 
 
 def rearranged_layouts(layout: Layout, count: int) -> list[Layout]:
-    """Returns layouts with the same rooms, and with counters, piles, pots and other fixtures in other places.
+    """Return layouts with the same rooms, and with counters, piles, pots and other fixtures in other places.
 
     A fixture moves only to cells that the same agents reach, so that the same work is possible. None of the layouts is
     one of the benchmark, mirrored ones included. Every second one has the four recipes of `with_four_recipes`. Fewer
@@ -93,6 +93,6 @@ def _touches(layout: Layout, cell: int, room: np.ndarray) -> bool:
 
 
 def _mirrored(rows: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Returns a map and its mirror images."""
+    """Return a map and its mirror images."""
     flipped = [rows, rows[::-1]]
     return flipped + [tuple(row[::-1] for row in one) for one in flipped]

@@ -91,7 +91,7 @@ def prepare_play(
     histories: HistoryOptions,
     tasks: Sequence[Task] = (),
 ) -> PlayJob:
-    """Returns the training of a method that plays with the teammates of a release's histories, and of other tasks.
+    """Return the training of a method that plays with the teammates of a release's histories, and of other tasks.
 
     Args:
         name: of the method.
@@ -137,7 +137,7 @@ def prepare_play(
 
 
 def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple[Dataset, Dataset | None, list[Layout]]:
-    """Returns the release, the histories on the chosen layouts, and these layouts.
+    """Return the release, the histories on the chosen layouts, and these layouts.
 
     Where tasks are played as well, layouts need no histories.
     """
@@ -155,7 +155,7 @@ def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple
 
 
 def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
-    """Returns the tasks on some layouts."""
+    """Return the tasks on some layouts."""
     check_heuristics(tasks)
     found = [task for task in tasks if task.layout in layouts]
     if tasks and not found:
@@ -175,7 +175,7 @@ def _check_unused(name: str, histories: HistoryOptions) -> None:
 
 
 def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
-    """Returns the teammates of all tasks of a selection of histories, and of some more."""
+    """Return the teammates of all tasks of a selection of histories, and of some more."""
     found: _Teammates = {}
     if dataset is not None:
         history_of = dict(zip(dataset.column("task_id").tolist(), dataset.ids.tolist(), strict=True))
@@ -191,7 +191,7 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
 
 
 def _oracles(layouts: Sequence[Layout]) -> _Teammates:
-    """Returns the oracle as a teammate of several speeds on each layout."""
+    """Return the oracle as a teammate of several speeds on each layout."""
     entries = {f"{ORACLE} that idles in {idle:.0%}": {"kind": ORACLE, "idle": idle} for idle in ORACLE_IDLES}
     return {
         (layout, ORACLE): {name: _Teammate(entry, _build(layout, entry)) for name, entry in entries.items()}
@@ -200,7 +200,7 @@ def _oracles(layouts: Sequence[Layout]) -> _Teammates:
 
 
 def _build(layout: Layout, entry: dict[str, Any]) -> Policy:
-    """Returns the policy of a teammate's entry, as in a task or of `_oracles`."""
+    """Return the policy of a teammate's entry, as in a task or of `_oracles`."""
     if entry["kind"] == ORACLE:
         return oracle_teammate(layout)._replace(params=jnp.float32(entry["idle"]))
     return build_teammate(layout, entry)
@@ -219,7 +219,7 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
 def _groups(
     teammates: _Teammates, shares: Mapping[str, float], hidden: Sequence[str], play: PlayOptions, tasks: int
 ) -> tuple[list[TaskGroup], set[str]]:
-    """Returns the groups of tasks, and the ids of the tasks whose teammates they play with; with few tasks not all are.
+    """Return the groups of tasks, and the ids of the tasks whose teammates they play with; with few tasks not all are.
 
     Raises:
         OptionError: if other layouts are wanted and a layout has learned teammates alone, which play on it only.
@@ -251,7 +251,7 @@ def _groups(
 
 
 def _heuristic_families(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Teammate]]]:
-    """Returns the families of each layout that are heuristics, which can play on other layouts as well."""
+    """Return the families of each layout that are heuristics, which can play on other layouts as well."""
     found: dict[Layout, dict[str, dict[str, _Teammate]]] = {layout: {} for layout, _ in teammates}
     for (layout, family), mates in teammates.items():
         if all(mate.entry["kind"] in ("heuristic", ORACLE) for mate in mates.values()):
@@ -268,7 +268,7 @@ def _heuristic_families(teammates: _Teammates) -> dict[Layout, dict[str, dict[st
 def _rearranged_groups(
     layout: Layout, families: Mapping[str, dict[str, _Teammate]], tasks: int, versions: int, hidden: bool
 ) -> list[tuple[TaskGroup, set[str]]]:
-    """Returns a group of each family on rearranged versions of a layout, and the tasks that its teammates are of.
+    """Return a group of each family on rearranged versions of a layout, and the tasks that its teammates are of.
 
     The versions are divided equally among the families, and the tasks of a family among its versions, at
     least one each.
@@ -293,12 +293,12 @@ def _rearranged_groups(
 
 
 def _rebuilt(mates: Mapping[str, _Teammate], layout: Layout) -> dict[str, _Teammate]:
-    """Returns heuristics on another layout."""
+    """Return heuristics on another layout."""
     return {task_id: mate._replace(policy=_build(layout, mate.entry)) for task_id, mate in mates.items()}
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
-    """Returns the share of the tasks on each layout, in units of those on layouts where the ego matters.
+    """Return the share of the tasks on each layout, in units of those on layouts where the ego matters.
 
     With a drawn teammate it matters if the oracle earns more than an ego that does nothing. Teammates without
     measurements count as ones with which it matters.
@@ -321,7 +321,7 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
 def _played_cells(
     dataset: Dataset | None, tasks: Sequence[Task], played: set[str], labels: Labels | None
 ) -> list[dict[str, Any]]:
-    """Returns the record of training data of the tasks that are played, see `training_cells`."""
+    """Return the record of training data of the tasks that are played, see `training_cells`."""
     cells = []
     if dataset is not None:
         of_played = np.isin(dataset.column("task_id"), sorted(played))
@@ -330,7 +330,7 @@ def _played_cells(
 
 
 def _task_cells(tasks: Sequence[Task], labels: Labels | None) -> list[dict[str, Any]]:
-    """Returns what playing tasks without histories adds to the record of training data, see `training_cells`."""
+    """Return what playing tasks without histories adds to the record of training data, see `training_cells`."""
     cells: dict[tuple[str, str, str, str], list[Task]] = {}
     for task in tasks:
         key = task.layout.name, task.split, task.teammate_family, task.teammate_kind

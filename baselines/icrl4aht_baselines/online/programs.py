@@ -31,7 +31,7 @@ class SharedProgram(NamedTuple):
     run: Callable[..., Any]
 
     def repeated(self, rows: Sequence[int]) -> SharedProgram:
-        """Returns the program of some of the members by their positions, each as often as it is named."""
+        """Return the program of some of the members by their positions, each as often as it is named."""
         return self._replace(
             members=[self.members[row] for row in rows], constants=[one[list(rows)] for one in self.constants]
         )

@@ -108,7 +108,7 @@ def make_groups(
     shares: Mapping[str, float],
     hidden: Collection[str] = (),
 ) -> list[TaskGroup]:
-    """Divides tasks among layouts by their shares, and equally among the families of each layout.
+    """Divide tasks among layouts by their shares, and equally among the families of each layout.
 
     Args:
         teammates: layout and family -> training teammates; see `chosen_teammates` for those of each task.
@@ -130,7 +130,7 @@ def make_groups(
 
 
 def chosen_teammates(teammates: int, tasks: int) -> np.ndarray:
-    """Returns the number of the teammate of each task of a group, int (tasks,).
+    """Return the number of the teammate of each task of a group, int (tasks,).
 
     Every teammate has as many tasks as the others, or one more. If there are fewer tasks than teammates, some teammates
     have none. The order is random, because the manners of teammates follow the order of the tasks.
@@ -163,7 +163,7 @@ class _Player:
         self.tasks = len(teammates)
 
     def start(self, key: Key[Array, ""]) -> RolloutState:
-        """Returns the state before the first episode of all tasks."""
+        """Return the state before the first episode of all tasks."""
         env_key, change_key = jax.random.split(key)
         state = self.rollout.start(jax.random.split(env_key, self.tasks))
         return state._replace(ego=state.ego._replace(change=self._draw_change(change_key)))
@@ -178,7 +178,7 @@ class _Player:
     def episode(
         self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
     ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
-        """Returns the state after one episode of every task, the episode for learning, and its returns."""
+        """Return the state after one episode of every task, the episode for learning, and its returns."""
         change_key, end_key = jax.random.split(key)
         after, played = self.rollout.episode(params, mates, state)
         ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
@@ -250,7 +250,7 @@ class _LayoutsPlayer:
         self.episode: Any = jax.jit(self._play)
 
     def start(self, key: Key[Array, ""]) -> RolloutState:
-        """Returns the state before the first episode of all tasks."""
+        """Return the state before the first episode of all tasks."""
         state = run_all(self._start, 0, jax.random.split(key, self.tasks))
         return jax.tree.map(lambda leaf: leaf[:, 0], state)
 
@@ -267,7 +267,7 @@ class _LayoutsPlayer:
 def _group_players(
     group: TaskGroup, method: Method, play: PlayOptions, mirror: bool
 ) -> Sequence[_GroupPlayer | _LayoutsPlayer]:
-    """Returns the players of a group; more than one if its layouts differ in more than their tables."""
+    """Return the players of a group; more than one if its layouts differ in more than their tables."""
     if len(group.layouts) == 1:
         return [_GroupPlayer(group, method, play, mirror)]
     layouts = list(dict.fromkeys(group.layouts))
@@ -295,7 +295,7 @@ def _group_players(
 
 
 def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
-    """Returns steps as an ego sees them whose view is changed.
+    """Return steps as an ego sees them whose view is changed.
 
     Args:
         change: the changes (*B,).
@@ -315,7 +315,7 @@ def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"])
 
 
 def _select(which: Bool[Array, " B"], one: Any, other: Any) -> Any:
-    """Returns a pytree with the leaves of `one` where `which`, and of `other` elsewhere."""
+    """Return a pytree with the leaves of `one` where `which`, and of `other` elsewhere."""
 
     def choose(a: Array, b: Array) -> Array:
         return jnp.where(which.reshape(which.shape + (1,) * (a.ndim - 1)), a, b)
@@ -324,7 +324,7 @@ def _select(which: Bool[Array, " B"], one: Any, other: Any) -> Any:
 
 
 def _model_policy(method: Method, layout: Layout, changes: bool) -> Policy:
-    """Returns the policy that plays while it learns: it draws its actions. `changes`: whether its view may change."""
+    """Return the policy that plays while it learns: it draws its actions. `changes`: whether its view may change."""
 
     def init(params: Any, key: Array) -> PlayerMemory:
         return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))
@@ -409,11 +409,11 @@ class PlayTrainer:
         self._compiled: list[Any] | None = None
 
     def init(self) -> PlayState:
-        """Returns the state before the first step."""
+        """Return the state before the first step."""
         return jax.jit(self._initial_state)()
 
     def state_like(self) -> Any:
-        """Returns shapes and dtypes of the state, to restore a checkpoint by."""
+        """Return shapes and dtypes of the state, to restore a checkpoint by."""
         return jax.eval_shape(self._initial_state)
 
     def _initial_state(self) -> PlayState:
@@ -424,15 +424,15 @@ class PlayTrainer:
         return PlayState(params, ppo_optimizer(self.ppo.config).init(params), tasks, jnp.int32(0))
 
     def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 0) -> StepNumbers:
-        """Returns the numbers of the steps."""
+        """Return the numbers of the steps."""
         return StepNumbers(start, stop)
 
     def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
-        """Returns nothing: such models are compared by `evaluate` on validation tasks."""
+        """Return nothing: such models are compared by `evaluate` on validation tasks."""
         return []
 
     def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:
-        """Plays one episode of every task and learns from them; returns the state after it and the numbers to log."""
+        """Play one episode of every task and learn from them; return the state after it and the numbers to log."""
         play_key, learn_key = jax.random.split(jax.random.fold_in(jax.random.key(self.options.seed + 1), number))
         keys = jax.random.split(play_key, len(self.players))
         if self._compiled is None:
@@ -451,7 +451,7 @@ class PlayTrainer:
         return PlayState(params, optimizer, tasks, state.step + 1), log
 
     def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:
-        """Compiles the episodes of all groups side by side."""
+        """Compile the episodes of all groups side by side."""
         with ThreadPoolExecutor() as pool:
             lowered = [
                 player.episode.lower(state.params, mates, tasks, key)
@@ -472,5 +472,5 @@ class PlayTrainer:
 
 
 def imitation_weight(play: PlayOptions, step: Int[Array, ""], steps: int) -> Float[Array, ""]:
-    """Returns the weight of imitating the oracle in a step of a training of `steps` steps; it falls linearly to 0."""
+    """Return the weight of imitating the oracle in a step of a training of `steps` steps; it falls linearly to 0."""
     return play.imitation * jnp.maximum(0.0, 1.0 - step / (play.imitation_end * steps))

@@ -75,7 +75,7 @@ class NoisyMemory(NamedTuple):
 
 
 def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> Policy:
-    """Returns an agent that sometimes acts at random, and remembers labels of the steps.
+    """Return an agent that sometimes acts at random, and remembers labels of the steps.
 
     Args:
         policy: the agent.
@@ -185,7 +185,7 @@ class Teammates(NamedTuple):
 
 
 def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] = ()) -> Teammates:
-    """Returns student tasks with the teammates of a selection's histories and of other tasks, each once.
+    """Return student tasks with the teammates of a selection's histories and of other tasks, each once.
 
     Args:
         dataset: the selection.

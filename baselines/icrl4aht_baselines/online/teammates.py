@@ -50,14 +50,14 @@ def check_heuristics(tasks: Iterable[Task]) -> None:
 
 
 def mixed_chances(tasks: int) -> np.ndarray:
-    """Returns the chances of the manners of each of some tasks, float32 (tasks, 4), in the shares of `MIXTURE`."""
+    """Return the chances of the manners of each of some tasks, float32 (tasks, 4), in the shares of `MIXTURE`."""
     shares = np.cumsum([share for share, _ in MIXTURE])
     kind = np.searchsorted(shares, (np.arange(tasks) + 0.5) / tasks * shares[-1])
     return np.array([chances for _, chances in MIXTURE], np.float32)[kind]
 
 
 def with_manners(teammates: Sequence[Policy], chances: np.ndarray) -> list[Policy]:
-    """Returns teammates of one family with manners.
+    """Return teammates of one family with manners.
 
     Args:
         teammates: policies that share their functions.

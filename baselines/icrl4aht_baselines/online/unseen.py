@@ -1,4 +1,4 @@
-"""Returns on layouts that no model was trained on: whether a model knows the game, or its training layouts.
+"""Return on layouts that no model was trained on: whether a model knows the game, or its training layouts.
 
 Shapes: `V` layouts, `E` episodes.
 """
@@ -72,7 +72,7 @@ def unseen_returns(
 def _returns(
     make: Callable[[Layout], Policy], layouts: Sequence[Layout], tasks: Sequence[Task], episodes: int
 ) -> Float[np.ndarray, "V E"]:
-    """Returns the returns of an ego on each layout, with the teammate of the task of the same number."""
+    """Return the returns of an ego on each layout, with the teammate of the task of the same number."""
     rollouts = [
         EvaluationRollout(layout, make(layout), [build_teammate(layout, task.teammate)], get_protocol("seeded"))
         for layout, task in zip(layouts, tasks, strict=True)
@@ -89,7 +89,7 @@ def _returns(
 def _played_returns(
     program: SharedProgram, rollouts: Sequence[EvaluationRollout], keys: Any, episodes: int
 ) -> Float[np.ndarray, "V E"]:
-    """Returns the return of each episode on the layouts of one program."""
+    """Return the return of each episode on the layouts of one program."""
     (start,) = shared_programs([one.start for one in rollouts], keys[0])
     state = run_all(start, 0, keys[jnp.array(program.members)])
     mates = stacked(one.teammate_params for one in rollouts)

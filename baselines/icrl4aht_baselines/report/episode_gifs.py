@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from icrl4aht_generation.policy import Policy
 
-from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent, get_agent
+from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent
 from icrl4aht_baselines.evaluate.evaluator import play_tasks
 from icrl4aht_baselines.evaluate.protocols import Protocol
 from icrl4aht_baselines.report.overlap import describe_overlap
@@ -166,14 +166,14 @@ def restore_ego(source: ResultSource) -> Callable[[Layout], Policy]:
     """
     name, details = source.settings["agent"], dict(source.settings.get("details", {}))
     if name in AGENTS:
-        return get_agent(name)
+        return AGENTS[name]
     if source.trained is None and "model" not in details:
         raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor of a run folder")
     folder = details.get("model") or (source.trained or {})["run"]
     if "model" not in details and not Path(folder).is_dir():
         raise OptionError(f"its run folder {folder} is missing")
     details.pop("variant", None)
-    agent = find_agent(folder, PlayMode.from_details(details))
+    agent = find_agent(folder, **PlayMode.from_details(details)._asdict())
     if agent.details != details:
         raise OptionError(f"{folder} holds another model than these results are of: {agent.details}, not {details}")
     return agent.make

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from icrl4aht_baselines.agents.egos import get_agent
+from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.report.results import EvaluationRun, as_run
@@ -37,7 +37,7 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
         for agent in REFERENCES:
             results = evaluate(
                 agent,
-                get_agent(agent),
+                AGENTS[agent],
                 tasks,
                 get_protocol(protocol),
                 out=out / protocol / agent,

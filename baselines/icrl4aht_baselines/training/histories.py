@@ -61,7 +61,7 @@ class TrainingTask(NamedTuple):
 
 
 def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
-    """Returns the training of a method on histories; each process of several gets its share of the batches.
+    """Return the training of a method on histories; each process of several gets its share of the batches.
 
     The held-out part `teammates` are the release's histories of split validation on the training layouts that pass the
     same filters. Without any, some teammates of the training split are held out instead, see `hold_out`.
@@ -117,7 +117,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
 
 
 def history_settings(dataset: Dataset) -> dict[str, Any]:
-    """Returns what a run's settings say of the release: root, hash of its manifest, data version, and layouts."""
+    """Return what a run's settings say of the release: root, hash of its manifest, data version, and layouts."""
     return {
         "root": str(dataset.origin if dataset.origin.remote else dataset.root.resolve()),
         "manifest_sha256": file_hash(dataset.root / MANIFEST),
@@ -127,7 +127,7 @@ def history_settings(dataset: Dataset) -> dict[str, Any]:
 
 
 def _view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
-    """Returns the view of a training's batches; None for the default one, of state records."""
+    """Return the view of a training's batches; None for the default one, of state records."""
     changed = [f"mirror = {mirror}"] * mirror + [f"hide_recipe = {', '.join(hidden)}"] * bool(hidden)
     if changed and (dataset.obs != "state" or dataset.channels != "canonical"):
         raise OptionError(
@@ -140,7 +140,7 @@ def _view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | 
 
 
 def _labels_of(method: Method, wanted: Labels | None) -> Labels | None:
-    """Returns the labels that a method learns from, or None for one that learns from the histories' own actions."""
+    """Return the labels that a method learns from, or None for one that learns from the histories' own actions."""
     if method.data == "dpt":
         return wanted or "expert"
     if wanted is not None and not method.takes_labels:
@@ -177,7 +177,7 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
 
 
 def _validation_part(release: Dataset, chosen: Dataset, histories: HistoryOptions) -> Dataset | None:
-    """Returns the histories of split validation on the chosen layouts that pass the filters, if there are any."""
+    """Return the histories of split validation on the chosen layouts that pass the filters, if there are any."""
     if histories.split == VALIDATION:
         return None
     filters: Any = {FILTERS[name]: list(values) for name, values in histories.filters.items()}
@@ -188,7 +188,7 @@ def _validation_part(release: Dataset, chosen: Dataset, histories: HistoryOption
 
 
 def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -> Dataset:
-    """Returns the histories that pass filters, see `HistoryOptions.filters`.
+    """Return the histories that pass filters, see `HistoryOptions.filters`.
 
     Raises:
         EmptySelectionError: for a value that no history has, or if no history has one of each filter's values.
@@ -214,7 +214,7 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
 
 
 def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[str, Any]]:
-    """Returns what a model is trained on: one entry for each layout, split, teammate family, algorithm and source.
+    """Return what a model is trained on: one entry for each layout, split, teammate family, algorithm and source.
 
     An entry has these five names, the `labels`, None for a method that uses none, the numbers of `tasks` and
     `histories`, `tasks_hash`, a hash of the task ids, and `teammates`, the ids of the teammates, see
@@ -249,7 +249,7 @@ def _sampler(
     labels: Labels | None,
     draws: Mapping[str, Any],
 ) -> Any:
-    """Returns the sampler of a part of the histories; `draws` are further options of it."""
+    """Return the sampler of a part of the histories; `draws` are further options of it."""
     lengths, every = dataset.column("T"), histories.every
     if options.context > lengths.min():
         raise OptionError(
@@ -280,7 +280,7 @@ def _sampler(
 
 
 def _draws(dataset: Dataset, options: TrainOptions, histories: HistoryOptions) -> dict[str, Any]:
-    """Returns the sampler's options on how histories are drawn in training; held-out ones are drawn uniformly.
+    """Return the sampler's options on how histories are drawn in training; held-out ones are drawn uniformly.
 
     Raises:
         OptionError: if a window does not fit the part of a history that a curriculum begins with.
@@ -312,7 +312,7 @@ def _check_thinned(dataset: Dataset, context: int, every: int) -> None:
 
 
 def _longer_source(dataset: Dataset, context: int) -> str:
-    """Returns the advice to choose a source whose histories all have so many steps, if there is one."""
+    """Return the advice to choose a source whose histories all have so many steps, if there is one."""
     lengths, sources = dataset.column("T"), dataset.column("source")
     longer = [name for name in dataset.counts("source") if lengths[sources == name].min() >= context]
     return f", or choose --source {longer[0]}, whose histories are longer" if longer else ""
@@ -391,7 +391,7 @@ class TrainedModel(NamedTuple):
 
 
 def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
-    """Returns the parameters of a run, to start another training from, and notes it in that training's settings.
+    """Return the parameters of a run, to start another training from, and notes it in that training's settings.
 
     Args:
         run: run folder of the model.
@@ -416,7 +416,7 @@ def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
 
 
 def read_trained(folder: Path) -> TrainedModel:
-    """Returns the model of a run folder.
+    """Return the model of a run folder.
 
     Raises:
         OptionError: if the folder is not a run on histories or has another format, or if its checkpoint is missing or

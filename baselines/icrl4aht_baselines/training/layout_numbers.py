@@ -29,7 +29,7 @@ class LayoutNumbers:
         return self.batch(i)
 
     def batch(self, i: int, out: Any = None) -> Any:
-        """Returns batch i, written into `out` if it is given."""
+        """Return batch i, written into `out` if it is given."""
         batch = self._sampler.batch(i, out)
         rows = np.zeros(len(batch.obs if hasattr(batch, "obs") else batch.query_obs), np.int32)
         return batch._replace(layouts=self._numbers[rows if batch.layouts is None else batch.layouts])
@@ -49,7 +49,7 @@ class MirroredBatches(LayoutNumbers):
         self._layouts = layouts
 
     def batch(self, i: int, out: Any = None) -> Any:
-        """Returns batch i, written into `out` if it is given."""
+        """Return batch i, written into `out` if it is given."""
         batch = super().batch(i, out)
         drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
         mirroring = drawn.integers(4, size=len(batch.layouts), dtype=np.int32)
@@ -65,7 +65,7 @@ class MirroredBatches(LayoutNumbers):
 
 
 def number_layouts(sampler: Any, layouts: Sequence[Layout], mirror: bool = False) -> Any:
-    """Returns the sampler with layouts numbered as in `layouts`, of which its histories may be on a part only."""
+    """Return the sampler with layouts numbered as in `layouts`, of which its histories may be on a part only."""
     numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
     if mirror:
         return MirroredBatches(sampler, numbers, len(layouts))

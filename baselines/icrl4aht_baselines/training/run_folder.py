@@ -1,6 +1,6 @@
 """Run folders: config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/, perhaps tensorboard/.
 
-Checkpoints, logs and resuming are those of `icrl4aht_generation.learners.resume`; this module has the settings of a run.
+Checkpoints, logs and resuming are those of `icrl4aht_generation.learners.resume`. This module has a run's settings.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD = "config.json", "curves.png", "che
 
 
 def format_versions() -> dict[str, Any]:
-    """Returns the versions that a run's config.json states: of the folder's format and of this package."""
+    """Return the versions that a run's config.json states: of the folder's format and of this package."""
     return {"run_format": RUN_FORMAT, "package_version": version("icrl4aht-data")}
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Returns a run's settings.
+    """Return a run's settings.
 
     Raises:
         OptionError: if the folder is not a run, or has another format.
@@ -58,7 +58,7 @@ _DEFAULTS = {"model": ModelOptions(), "play": PlayOptions(), "histories": Histor
 
 
 def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
-    """Start a run in a folder, or check that the run in it has the same settings. Returns the settings in the folder.
+    """Start a run in a folder, or check that the run in it has the same settings. Return the settings in the folder.
 
     An option that the folder does not state is one that came after the run: the run has its default.
 
@@ -84,7 +84,7 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_defaults(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the settings of a run with the defaults of those options of a new one that it does not state."""
+    """Return the settings of a run with the defaults of those options of a new one that it does not state."""
     parts = {
         part: asdict(options)
         for part, options in _DEFAULTS.items()

@@ -30,7 +30,7 @@ class SeenInTraining(NamedTuple):
 
 
 def read_trained_on(entries: Any, where: str) -> SeenInTraining:
-    """Returns what a record of training data says.
+    """Return what a record of training data says.
 
     Args:
         entries: JSON list of entries with `layout` and `family`, usually also `algorithm` (the kind of a heuristic, or
@@ -60,7 +60,7 @@ def _kinds_of(family: str) -> tuple[str, ...]:
 
 
 def _read_entry(entry: Any, where: str) -> tuple[str, tuple[str, ...], list[str] | None]:
-    """Returns an entry's layout, teammate kinds and teammate ids."""
+    """Return an entry's layout, teammate kinds and teammate ids."""
     fields = entry if isinstance(entry, dict) else {}
     layout, family, algorithm = (fields.get(name) for name in ("layout", "family", "algorithm"))
     ids = fields.get("teammates")

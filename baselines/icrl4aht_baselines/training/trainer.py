@@ -42,7 +42,7 @@ StepProgress = Callable[[int, float | None], None]
 
 
 def format_loss(loss: float | None) -> str:
-    """Returns the loss as a note for a progress bar; empty for None."""
+    """Return the loss as a note for a progress bar; empty for None."""
     return "" if loss is None else f"loss {loss:.3f}"
 
 
@@ -75,13 +75,13 @@ class TrainState(NamedTuple):
 
 
 def learning_rate_schedule(options: TrainOptions) -> optax.Schedule:
-    """Returns the learning rate per step: linear warm-up, then cosine to 0 (paper, App. E.4)."""
+    """Return the learning rate per step: linear warm-up, then cosine to 0 (paper, App. E.4)."""
     warmup = round(options.warmup * options.steps)
     return optax.warmup_cosine_decay_schedule(0.0, options.learning_rate, warmup, max(options.steps, warmup + 1))
 
 
 def training_optimizer(options: TrainOptions) -> optax.GradientTransformation:
-    """Returns AdamW on gradients clipped by global norm."""
+    """Return AdamW on gradients clipped by global norm."""
     adam = optax.adamw(learning_rate_schedule(options), weight_decay=options.weight_decay)
     return optax.chain(optax.clip_by_global_norm(options.clip), adam)
 
@@ -117,11 +117,11 @@ class Trainer:
         self.validate = jax.jit(self._validate, in_shardings=(same, self.rows), out_shardings=same)
 
     def init(self) -> TrainState:
-        """Returns the state before the first step, on the trainer's devices."""
+        """Return the state before the first step, on the trainer's devices."""
         return jax.jit(self._initial_state, out_shardings=self.everywhere)()
 
     def state_like(self) -> Any:
-        """Returns shapes, dtypes and shardings of the state, to restore a checkpoint by."""
+        """Return shapes, dtypes and shardings of the state, to restore a checkpoint by."""
         shapes = jax.eval_shape(self._initial_state)
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=self.everywhere), shapes)
 
@@ -131,7 +131,7 @@ class Trainer:
         return TrainState(params, slow, self._optimizer.init(params), jnp.int32(0))
 
     def _step(self, state: TrainState, batch: Any) -> tuple[TrainState, dict[str, Array]]:
-        """Returns the state after one update, and the numbers to log."""
+        """Return the state after one update, and the numbers to log."""
         key = jax.random.fold_in(jax.random.key(self.options.seed + 1), state.step)
         gradient, log = self._gradient(state, batch, key)
         change, optimizer = self._optimizer.update(gradient, state.optimizer, state.params)
@@ -145,7 +145,7 @@ class Trainer:
         return TrainState(params, slow, optimizer, state.step + 1), log
 
     def _gradient(self, state: TrainState, batch: Any, key: Array) -> tuple[Any, dict[str, Array]]:
-        """Returns gradient and log of a batch: the mean of its parts, which are computed one after the other."""
+        """Return gradient and log of a batch: the mean of its parts, which are computed one after the other."""
         parts = self.options.accumulate
         gradient_of = jax.value_and_grad(self.method.loss, has_aux=True)
 
@@ -167,7 +167,7 @@ class Trainer:
         return jax.tree.map(lambda leaf: leaf / parts, total)
 
     def _split_rows(self, rows: Array) -> Array:
-        """Reshapes (B, ..) to (accumulate, B / accumulate, ..), so that every part has rows on every device."""
+        """Reshape (B, ..) to (accumulate, B / accumulate, ..), so that every part has rows on every device."""
         parts = rows.reshape(-1, self.options.accumulate, *rows.shape[1:]).swapaxes(0, 1)
         return jax.lax.with_sharding_constraint(parts, self._parts)
 
@@ -175,11 +175,11 @@ class Trainer:
         return self.method.loss(state.params, state.slow, batch, None)[1]
 
     def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 2) -> Batches:
-        """Returns batches on the devices; the next one is transferred during a step."""
+        """Return batches on the devices; the next one is transferred during a step."""
         return Batches(sampler, start, stop, prefetch=prefetch, device=self.rows)
 
     def validation_lines(self, state: TrainState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
-        """Returns log lines with the mean of every logged number over the first batches of each held-out part."""
+        """Return log lines with the mean of every logged number over the first batches of each held-out part."""
         lines = []
         for name, sampler in samplers.items():
             with self.batches(sampler, 0, self.options.validation_batches, prefetch=0) as batches:
@@ -283,7 +283,7 @@ def train(
 
 
 def _with_params(state: Any, params: Any) -> Any:
-    """Returns a state before the first step with other parameters.
+    """Return a state before the first step with other parameters.
 
     Raises:
         OptionError: if they are of another model.
@@ -296,7 +296,7 @@ def _with_params(state: Any, params: Any) -> Any:
 
 
 def agree_on_stop(save: bool, received: int) -> tuple[bool, int]:
-    """Returns whether all processes save now, and the signal that stops them all, or 0.
+    """Return whether all processes save now, and the signal that stops them all, or 0.
 
     Clocks differ and a signal may reach one process only, but saving needs all of them in the same step: process 0
     decides when to save, and a signal to any process stops all. With several processes this waits for the step.

@@ -77,10 +77,10 @@ def test_it_plays_as_the_run_does(run, models, tmp_path):
 def test_a_bundled_model_plays_in_its_own_way(run, tmp_path, monkeypatch):
     bundle_run(run, "ad-drawn", "teammate", tmp_path, sampled=True)
     monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
-    by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", PlayMode())
+    by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", greedy=True)
     assert by_default.name == "ad-drawn" and by_default.details and by_default.details["sampled"] is True
     assert greedy.name == "ad-drawn (greedy)" and greedy.details and "sampled" not in greedy.details
-    assert find_agent("ad-drawn", PlayMode(greedy=False, forget=True)).name == "ad-drawn (forgets)"
+    assert find_agent("ad-drawn", forget=True).name == "ad-drawn (forgets)"
     assert find_ego("--agent", "ad-drawn", acting="exact", greedy=None).name == "ad-drawn"
     assert find_ego("--agent", "ad-drawn", greedy=True).name == "ad-drawn (greedy)"
     assert find_ego("--agent", str(run), greedy=False).name == "AD+mlp (sampled)"
@@ -167,11 +167,9 @@ def test_models_command(models):
 
 class TestPlayMode:
     def test_other_ways_have_other_names(self, run):
-        assert find_agent(str(run), PlayMode(greedy=False, forget=True)).name == "AD+mlp (sampled) (forgets)"
-        with pytest.raises(
-            OptionError, match=r"mode = 'exact': expected a PlayMode, such as PlayMode\(acting='exact'\)"
-        ):
-            find_agent(str(run), "exact")  # type: ignore[arg-type]
+        assert find_agent(run, greedy=False, forget=True).name == "AD+mlp (sampled) (forgets)"
+        with pytest.raises(UnknownNameError, match=r"unknown acting 'exat'.*Did you mean 'exact'"):
+            find_agent(run, acting="exat")  # type: ignore[arg-type]
 
     def test_details_and_back(self):
         for mode in (PlayMode(), PlayMode("exact", False), PlayMode(forget=True)):
@@ -181,7 +179,7 @@ class TestPlayMode:
     @pytest.mark.slow
     def test_a_model_that_forgets_plays_each_episode_as_its_first(self, run):
         """With its memory cleared, what came before an episode changes nothing."""
-        agent = find_agent(str(run), PlayMode(greedy=False, forget=True))
+        agent = find_agent(run, greedy=False, forget=True)
         policy = agent.make(get_layout("demo_wide"))
         rng = np.random.default_rng(0)
         percepts = [_percept(rng, done=False) for _ in range(3)]
@@ -196,7 +194,7 @@ class TestPlayMode:
             return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(memory)])
 
         np.testing.assert_array_equal(after([]), after([_percept(rng, done=False) for _ in range(2)]))
-        keeps = find_agent(str(run), PlayMode(greedy=False)).make(get_layout("demo_wide"))
+        keeps = find_agent(run, greedy=False).make(get_layout("demo_wide"))
         policy = keeps
         assert not np.array_equal(after([]), after([_percept(rng, done=False) for _ in range(2)]))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.agents.egos import PlayMode, find_agent
+from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.drift import Drift, measure_drift
 from icrl4aht_baselines.evaluate.evaluator import evaluate
@@ -52,7 +52,7 @@ def runs(lite, tmp_path_factory) -> Path:
     [pytest.param("ad", "AD+TA", "exact", marks=pytest.mark.slow), ("dpt", "DPT+TA", "cached")],
 )
 def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting):
-    agent = find_agent(str(runs / name), PlayMode(acting))
+    agent = find_agent(runs / name, acting=acting)
     assert agent.name == label
     (result,) = evaluate(agent.name, agent.make, WIDE[:1], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(result.returns) == (1, 2)
@@ -110,8 +110,8 @@ class TestBadRuns:
     def test_folders_without_a_run(self, runs, tmp_path):
         with pytest.raises(UnknownNameError, match="unknown agent 'no/where'; valid: stay, random, oracle"):
             find_agent("no/where")
-        with pytest.raises(OptionError, match=r"not a run: expected config\.json with run_format"):
-            find_agent(str(tmp_path))
+        with pytest.raises(UnknownNameError, match=r"not a run: config\.json is missing; `icrl4aht-data train` makes"):
+            find_agent(tmp_path)
 
     def test_another_version_and_another_shape(self, runs, tmp_path):
         def copy(name: str, **changes) -> str:

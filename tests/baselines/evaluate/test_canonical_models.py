@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines import experiments
-from icrl4aht_baselines.agents.egos import find_agent, with_channels
+from icrl4aht_baselines.agents.egos import find_agent, with_view
 from icrl4aht_baselines.agents.host import Percept, from_host
 from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.evaluator import evaluate
@@ -83,10 +83,10 @@ def test_an_ego_of_canonical_channels_sees_them_on_every_layout(layout):
     (record,) = random_records(layout, 1, np.random.default_rng(4))
     own = jnp.asarray(observe(layout, record, 0))
     percept = Percept(own, 1, 2.0, 3, False)
-    seen, _ = jax.jit(with_channels(shown, "canonical", layout).act, static_argnums=(0, 1))((), (), percept, 0)
+    seen, _ = jax.jit(with_view(shown, layout, "canonical").act, static_argnums=(0, 1))((), (), percept, 0)
     np.testing.assert_array_equal(seen.obs, observe(layout, record, 0, canonical=True))
     assert seen._replace(obs=0) == percept._replace(obs=0)
-    assert with_channels(shown, "own", layout) is shown
+    assert with_view(shown, layout, "own") is shown
 
 
 def test_an_ego_outside_jax_may_take_canonical_channels():

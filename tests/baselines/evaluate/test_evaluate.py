@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.agents.egos import NamedEgo, get_agent, random, stay
+from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, find_agent, random, stay
 from icrl4aht_baselines.agents.host import Percept, from_host
 from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
@@ -225,7 +225,9 @@ def test_impossible_teammates_fail_before_any_work(tmp_path):
 
 def test_unknown_names():
     with pytest.raises(UnknownNameError, match=r"unknown agent 'rnadom'; valid: .*Did you mean 'random'\?"):
-        get_agent("rnadom")
+        find_agent("rnadom")
+    with pytest.raises(UnknownNameError, match=r"oracle, ad-reference, .*\. A trained model is named by its folder"):
+        find_agent("runs/ad")  # nothing is suggested, since no name is close
     with pytest.raises(UnknownNameError, match=r"unknown protocol 'publish'; valid: published, seeded"):
         get_protocol("publish")
 
@@ -306,7 +308,7 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
     for name in ("_bundled_by_id", "_instances"):  # what is cached of other manifests would outlast this test
         monkeypatch.setattr(results_of_runs, name, getattr(results_of_runs, name).__wrapped__)
     monkeypatch.setattr(
-        "icrl4aht_baselines.commands.cli.find_ego", lambda option, name, **mode: NamedEgo(name, get_agent(name))
+        "icrl4aht_baselines.commands.cli.find_ego", lambda option, name, **mode: NamedEgo(name, AGENTS[name])
     )
     settings = {"agent": "stay", "seeds": [0], "protocol": dataclasses.asdict(PUBLISHED), "code_version": "0"}
 

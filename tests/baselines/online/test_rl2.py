@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.agents.egos import PlayMode, find_agent
+from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import get_protocol
@@ -394,7 +394,7 @@ class TestCommand:
         trained = read_trained(out)
         assert (trained.label, trained.step, trained.channels) == ("RL2+TA+mlp", 1, "canonical")
         assert {cell["labels"] for cell in trained.trained_on} == {"oracle"}
-        agent = find_agent(str(out), PlayMode(greedy=False))
+        agent = find_agent(out, greedy=False)
         assert agent.details and agent.details["sampled"] is True
         assert trained.hide_recipe == ("cramped_up",)
         task = published_task("cramped_down", "H1/t0")

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_baselines.agents.egos import get_agent
+from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.evaluate.evaluator import play_tasks
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout
@@ -58,7 +58,7 @@ def h4(layout: Layout) -> Policy:
 def episodes(agent: str, layout: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Records uint8 (N, T, S), actions (N, T, 2) and rewards (N, T) of all episodes of a layout."""
     tasks = [t for t in TASKS if t.layout.name == layout and t.teammate_family == FAMILY_ON[layout]]
-    make = h4 if agent == "h4" else get_agent(agent)
+    make = h4 if agent == "h4" else AGENTS[agent]
     played = list(play_tasks(make, tasks, SHORT))
     record, actions, reward = (np.concatenate([np.asarray(p[k]) for p in played]) for k in range(3))
     return record, actions, reward
@@ -106,7 +106,7 @@ def _counts(items: np.ndarray) -> np.ndarray:
 
 def test_it_is_deterministic():
     """Equal states and different keys yield equal actions."""
-    policy = get_agent("oracle")(LAYOUTS["asymm_right"])
+    policy = AGENTS["oracle"](LAYOUTS["asymm_right"])
     record = jnp.asarray(episodes("oracle", "asymm_right")[0][0, 0])
     act = jax.jit(lambda key: policy.act(policy.params, policy.init(policy.params, key), record, key)[0])
     assert act(jax.random.key(1)) == act(jax.random.key(3))
@@ -123,7 +123,7 @@ class TestTeammate:
     def test_does_all_of_the_work_alone(self, name: str):
         layout = get_layout(name)
         mates = [oracle_teammate(layout)._replace(params=jnp.float32(idle)) for idle in (0.0, 0.5, 1.0)]
-        rollout = EvaluationRollout(layout, get_agent("stay")(layout), mates, PROTOCOLS["seeded"])
+        rollout = EvaluationRollout(layout, AGENTS["stay"](layout), mates, PROTOCOLS["seeded"])
         state = rollout.start(jax.random.split(jax.random.key(0), len(mates)))
         _, played = jax.jit(rollout.episode)(rollout.ego.params, rollout.teammate_params, state)
         fast, slow, idle = np.asarray(played.reward).sum(axis=-1)

@@ -1,0 +1,50 @@
+"""What users import from the package."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
+
+USE = """
+import sys
+import icrl4aht_baselines
+assert "jax" not in sys.modules, "importing the package imports JAX"
+import icrl4aht_baselines.evaluate.protocols  # the package `evaluate` is imported first
+from icrl4aht_baselines import evaluate, find_agent, from_host, report, test_tasks
+agent = find_agent("stay")
+tasks = test_tasks("teammate", "coord_simple", "H4")[:1]
+(result,) = evaluate(agent.name, agent.make, tasks, icrl4aht_baselines.evaluate.get_protocol("published", 2))
+print(result.returns)
+"""
+
+
+def test_one_line_imports_what_a_user_needs():
+    found = subprocess.run([sys.executable, "-c", USE], check=True, capture_output=True, text=True, timeout=120)
+    assert found.stdout == "[[40.0, 40.0]]\n"
+
+
+def test_other_names():
+    import icrl4aht_baselines
+
+    with pytest.raises(AttributeError, match="module 'icrl4aht_baselines' has no attribute 'evalute'"):
+        icrl4aht_baselines.evalute  # noqa: B018
+
+
+def test_the_test_tasks_of_a_track():
+    from icrl4aht_baselines import test_tasks as tasks_of  # pytest would collect a function of its real name
+
+    sizes = [
+        len(tasks_of(track, layout))
+        for track, layout in (("teammate", None), ("layout", None), ("layout", "cramped_down"))
+    ]
+    assert sizes == [120, 40, 20]
+    assert {task.layout.name for task in tasks_of("teammate", "demo_cook_wide")} == {"demo_wide"}
+    assert [task.teammate_family for task in tasks_of("teammate", family="H1")] == ["H1"] * 30
+    with pytest.raises(EmptySelectionError, match=r"family = H9: no test task of .*; it has .* H1, H2, H3, H4"):
+        tasks_of("teammate", family="H9")
+    with pytest.raises(UnknownNameError, match="unknown layout 'demo_wid'"):
+        tasks_of("teammate", "demo_wid")
