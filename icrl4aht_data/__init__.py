@@ -2,22 +2,32 @@
 
 ds = load_icrl4aht(split="train", layout="coord_simple")
 batch = ds.ad(batch_size=64, length=500, seed=0)[0]
+
+Public names are imported at their first use, so that command lines start quickly.
 """
 
-from icrl4aht_data.benchmark.facts import FAMILIES, SOURCES, SPLITS, TRACKS
-from icrl4aht_data.checking.report import Report
-from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.dataset import Dataset, load_icrl4aht
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
 from icrl4aht_data.environments import register_environments
-from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.overcooked.actions import ACTIONS
-from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
-from icrl4aht_data.reading.episodes import Episode, Episodes
-from icrl4aht_data.reading.history import History
-from icrl4aht_data.sampling.ad import ADBatch, ADSampler
-from icrl4aht_data.sampling.batches import Batches
-from icrl4aht_data.sampling.dpt import DPTBatch, DPTSampler
-from icrl4aht_data.sampling.draws import Curriculum
+
+if TYPE_CHECKING:
+    from icrl4aht_data.benchmark.facts import FAMILIES, SOURCES, SPLITS, TRACKS
+    from icrl4aht_data.checking.report import Report
+    from icrl4aht_data.checking.verify import verify_release
+    from icrl4aht_data.dataset import Dataset, load_icrl4aht
+    from icrl4aht_data.errors import Icrl4ahtError
+    from icrl4aht_data.overcooked.actions import ACTIONS
+    from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
+    from icrl4aht_data.reading.episodes import Episode, Episodes
+    from icrl4aht_data.reading.history import History
+    from icrl4aht_data.sampling.ad import ADBatch, ADSampler
+    from icrl4aht_data.sampling.batches import Batches
+    from icrl4aht_data.sampling.dpt import DPTBatch, DPTSampler
+    from icrl4aht_data.sampling.draws import Curriculum
 
 __version__ = "0.1.0"
 """Version of this package, which pyproject.toml reads from here."""
@@ -47,5 +57,46 @@ __all__ = [
     "load_icrl4aht",
     "verify_release",
 ]
+
+_MODULES = {
+    "FAMILIES": "benchmark.facts",
+    "SOURCES": "benchmark.facts",
+    "SPLITS": "benchmark.facts",
+    "TRACKS": "benchmark.facts",
+    "Report": "checking.report",
+    "verify_release": "checking.verify",
+    "Dataset": "dataset",
+    "load_icrl4aht": "dataset",
+    "Icrl4ahtError": "errors",
+    "ACTIONS": "overcooked.actions",
+    "LAYOUTS": "overcooked.layouts",
+    "Layout": "overcooked.layouts",
+    "get_layout": "overcooked.layouts",
+    "Episode": "reading.episodes",
+    "Episodes": "reading.episodes",
+    "History": "reading.history",
+    "ADBatch": "sampling.ad",
+    "ADSampler": "sampling.ad",
+    "Batches": "sampling.batches",
+    "DPTBatch": "sampling.dpt",
+    "DPTSampler": "sampling.dpt",
+    "Curriculum": "sampling.draws",
+}
+"""Public name -> the module that defines it."""
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name or a module of this package, imported at its first use."""
+    if name in _MODULES:
+        globals()[name] = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+        return globals()[name]
+    if not name.startswith("_") and find_spec(f"{__name__}.{name}"):
+        return import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 register_environments()

@@ -18,9 +18,9 @@ import psutil
 import pytest
 from click.testing import CliRunner
 from filelock import FileLock
-from icrl4aht_generation.cli import cli
 
 from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.writing.published import from_published, to_published
 from tests.helpers.paths import ROOT
 from tests.helpers.published_files import KEPT, publish

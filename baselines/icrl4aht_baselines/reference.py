@@ -343,7 +343,7 @@ class _Making:
         """Returns the release of noise histories, which is made if it is missing."""
         folder = self.out / "noise"
         if not (folder / "lite").is_dir():
-            command = ["-m", "icrl4aht_generation", "generate", "--profile", PROFILE, "--out", str(folder)]
+            command = ["-m", "icrl4aht_data", "generate", "--profile", PROFILE, "--out", str(folder)]
             with self.timed(folder.name):
                 failed = subprocess.run([sys.executable, *command], check=False).returncode
             if failed:

@@ -1,94 +1,52 @@
-"""The `icrl4aht-data` command line: options in, calls to the package, text or JSON out."""
+"""The program `icrl4aht-data`: its commands are imported when they run, and its errors become exit codes.
+
+Exit codes: 0 success; 1 an error, a problem that was found, or the reader of the output has gone; 2 a misused command;
+128 + the signal for a training that a signal stopped, and that was saved.
+"""
 
 from __future__ import annotations
 
-import json
+import errno
+import os
 import sys
-from functools import partial
+from functools import cache
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import click
-from rich.console import Console
 
-from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.checking.report import verdict_in_words
-from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.commands.browse import browse
-from icrl4aht_data.commands.doctor import diagnose, in_words
-from icrl4aht_data.commands.options import (
-    COUNT,
-    COUNT_OR_NONE,
-    SETTINGS,
-    Folder,
-    NewFile,
-    Root,
-    Sections,
-    examples,
-    family_map_option,
-    filter_options,
-    is_terminal,
-    json_option,
-    overwrite_option,
-    quiet_option,
-    run,
-    version_option,
-    wanted_filters,
-)
-from icrl4aht_data.commands.summaries import (
-    facts_table,
-    layout_table,
-    summarize_selection,
-    summarize_tasks,
-    tab_separated,
-    task_table,
-)
-from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
-from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import ALL_KINDS, OBSERVATIONS
-from icrl4aht_data.plotting import PICTURES, plot_learning_curves
-from icrl4aht_data.publishing.build import build_release
-from icrl4aht_data.publishing.upload import upload_release
-from icrl4aht_data.remote.download import fetch_planned, plan_download
-from icrl4aht_data.remote.download import repair as repair_files
-from icrl4aht_data.utils.new_file import check_new_file
-from icrl4aht_data.utils.progress import counted, progress_bars
-from icrl4aht_data.utils.text import counted_noun
-from icrl4aht_data.writing.combine import combine_releases
-from icrl4aht_data.writing.convert import to_release
-from icrl4aht_data.writing.minari import to_minari
-from icrl4aht_data.writing.parquet import to_parquet
-from icrl4aht_data.writing.published import from_published, to_published
-from icrl4aht_data.writing.published_index import parse_family_map
-from icrl4aht_data.writing.release_folder import HISTORIES_H5
-from icrl4aht_data.writing.statistics import print_statistics
+from icrl4aht_data.commands.verbs import SECTIONS, VERB_GROUP, VERBS, Verb
+from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
+from icrl4aht_data.utils.files import FULL, describe_disk
+from icrl4aht_data.utils.plugins import Plugins
+from icrl4aht_data.utils.requirements import missing_library
 
-_FORMS = (*ALL_KINDS, "published", "parquet", "minari")
-
-_root = click.argument("root", required=False, type=Root())
-
-
-def _load(root: str | Path | None, filters: dict[str, tuple[str, ...]]) -> Dataset:
-    return load_icrl4aht(root, **wanted_filters(filters))
-
-
-_SECTIONS = {
-    "Look": ("list", "show", "browse", "verify", "doctor"),
-    "Fetch and convert": ("download", "convert", "combine"),
-    "Publish": ("release", "upload"),
+_REMEDIES = {
+    errno.ENOENT: "check the path; a new file's folder has to exist",
+    errno.ENOTDIR: "a file is where a folder is needed: give another folder",
+    errno.EEXIST: "a file is where a folder is needed: give another folder",
+    errno.EISDIR: "a folder is where a file is needed: give another name",
+    errno.EACCES: "give a folder that you may write to, and files that you may read",
+    errno.EPERM: "give a folder that you may write to, and files that you may read",
+    errno.EROFS: "give a folder that can be written to",
+    errno.EFBIG: "a limit on the size of files is set, see `ulimit -f`",
+    **dict.fromkeys(FULL, "free some space, or give a folder on another disk"),
 }
 
-_EXAMPLES = examples(
-    "icrl4aht-data list",
-    "icrl4aht-data show --layout coord_simple --plot curves.png",
-    "icrl4aht-data verify path/to/release --deep",
-    "icrl4aht-data download hf://datasets/you/icrl4aht --layout coord_simple",
-)
+_EPILOG = """\b
+Examples:
+  icrl4aht-data list
+  icrl4aht-data show --layout coord_simple --plot curves.png
+  icrl4aht-data download hf://datasets/you/icrl4aht --layout coord_simple
+  icrl4aht-data train ad --layout demo_wide --out runs/ad
+  icrl4aht-data evaluate --agent runs/ad --layout demo_wide --out runs/ad-results
 
-_EPILOG = f"""{_EXAMPLES}
+ROOT is a release: its folder, or its address hf://datasets/<org>/<repo>[@<revision>], https://... or s3://... The
+default is the mini release that is part of the package.
 
-Exit codes: 0 success, 1 a failure or a problem found, 2 a misused command. `icrl4aht-data doctor` prints the folders
+Exit codes: 0 success, 1 a failure or a problem found, 2 a misused command, 130 or 143 training stopped by SIGINT or
+SIGTERM, and saved. Commands that train or generate resume what was stopped. `icrl4aht-data doctor` prints the folders
 and environment variables in use.
 
 \b
@@ -97,384 +55,127 @@ Completion, in bash (for zsh and fish: zsh_source, fish_source):
 """
 
 
-@click.group(cls=Sections, sections=_SECTIONS, context_settings=SETTINGS, epilog=_EPILOG)
-@version_option
-def cli() -> None:
-    """Read, check, fetch and publish the learning histories of the ICRL4AHT benchmark.
+@cache
+def all_verbs() -> dict[str, Verb]:
+    """Return every command of this and other installed packages: its words -> its row of the table.
 
-    ROOT is a release: its folder, or its address hf://datasets/<org>/<repo>[@<revision>], https://... or s3://...
-    The default is the mini release that is part of the package.
+    Raises:
+        PluginError: for a table that cannot be imported, or for a command that exists already.
+    """
+    plugins, verbs = Plugins(VERB_GROUP, ()), {verb.name: verb for verb in VERBS}
+    for package in plugins.names:
+        for verb in plugins.load(package, tuple):
+            if not isinstance(verb, Verb) or verb.name in verbs:
+                raise plugins.error(package, f"expected Verbs with new names, found {verb!r:.100}")
+            verbs[verb.name] = verb
+    return verbs
+
+
+class VerbGroup(click.Group):
+    """Command group whose help lists commands under headings, without importing them.
+
+    Args:
+        prefix: words before the commands of this group and a space, such as "research "; empty for the program.
     """
 
+    def __init__(self, *args: Any, prefix: str = "", **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._prefix = prefix
 
-@cli.command("list")
-@_root
-@filter_options
-@json_option
-def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
-    """List the tasks of a release.
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self._verbs())
 
-    Prints for each task layout, split, teammate, source, histories, steps, the mean return of an episode at the start
-    and at the end of learning, the labels: expert, with what the policy earns that they come from, acting greedily (if
-    it was measured), and oracle; the end of the task's id, and the ids of its histories, if they are short. Where the
-    output is not a terminal, prints all facts of a task on one line, separated by tabs, below a line with their names.
-    """
-    tasks = summarize_tasks(_load(root, filters).entries)
-    if as_json:
-        click.echo(json.dumps(tasks, indent=2))
-        return
-    if not is_terminal():
-        click.echo(tab_separated([tasks[0], *(task.values() for task in tasks)]))
-        return
-    Console(markup=False).print(task_table(tasks))
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        verb = self._verbs().get(cmd_name)
+        if verb is None:
+            return None
+        if not verb.target:
+            return VerbGroup(cmd_name, prefix=f"{verb.name} ", help=verb.help)
+        module, _, attribute = verb.target.partition(":")
+        return getattr(import_module(module), attribute)
 
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        verbs = self._verbs()
+        width = max(map(len, verbs))
+        for section in dict.fromkeys(verb.section for verb in verbs.values()):
+            with formatter.section(section):
+                rows = [(name, verb.help) for name, verb in verbs.items() if verb.section == section]
+                formatter.write_dl([(name.ljust(width), text) for name, text in rows])
 
-@cli.command()
-@_root
-@filter_options
-@click.option(
-    "--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show only this history; list prints the ids."
-)
-@click.option(
-    "--plot",
-    type=NewFile(*PICTURES),
-    metavar="FILE",
-    help="Also draw learning curves, by task or, of more than 12, by layout: .png, .svg or .pdf.",
-)
-@overwrite_option
-@json_option
-def show(
-    root: str | Path | None,
-    as_json: bool,
-    history_id: int | None,
-    plot: Path | None,
-    overwrite: bool,
-    **filters: tuple[str, ...],
-) -> None:
-    """Show a release, a part of it or one history.
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
+        if not self._prefix and f"research {args[0]}" in all_verbs():
+            ctx.fail(f"{args[0]} is a command of the group research: icrl4aht-data research {' '.join(args)}")
+        if not args[0].startswith("-") and args[0] not in self._verbs():
+            ctx.fail(str(unknown("command", args[0], self._verbs())))
+        return super().resolve_command(ctx, args)
 
-    Prints a summary, a table of the layouts with totals, versions, counts, splits, sources and labels; for one history
-    everything in its index entry. Where the output is not a terminal, prints each fact on one line, after its name and
-    a tab. Only --plot writes a file.
-    """
-    if overwrite and plot is None:
-        raise click.UsageError("--overwrite replaces a picture: give --plot FILE with it")
-    if plot is not None:
-        check_new_file(plot, overwrite)
-    dataset = _load(root, filters)
-    if history_id is None:
-        facts = summarize_selection(dataset)
-    else:
-        dataset = dataset.select([history_id])
-        facts = {
-            **dataset[0].entry.to_json(),
-            "environment": dataset.environment_parameters(history_id),
+    def _verbs(self) -> dict[str, Verb]:
+        """Return the commands of this group by their last word, in the order of their headings."""
+        found = {
+            name.removeprefix(self._prefix): verb
+            for name, verb in all_verbs().items()
+            if name.startswith(self._prefix) and " " not in name.removeprefix(self._prefix)
         }
-        if dataset.knows_tasks:
-            facts["teammate"] = dataset.recover_teammate(history_id)
-    if plot is not None:
-        plot_learning_curves(dataset, plot)
-        facts["plot"] = str(plot)
-    if as_json:
-        click.echo(json.dumps(facts, indent=2))
-        return
-    if not is_terminal():
-        click.echo(tab_separated(facts.items()))
-        return
-    console = Console(markup=False, highlight=False)
-    if history_id is None:
-        console.print(facts.pop("summary"), "", layout_table(dataset), "", sep="\n")
-        del facts["layouts"]  # the table has them
-    else:
-        console.print(repr(dataset[0]), "", sep="\n")
-    console.print(facts_table(facts))
+        order = {section: number for number, section in enumerate(SECTIONS)}
+        return dict(sorted(found.items(), key=lambda item: order.get(item[1].section, len(order))))
 
 
-cli.add_command(browse)
-
-
-@cli.command(
-    epilog=examples(
-        "icrl4aht-data download hf://datasets/you/icrl4aht --layout coord_simple --dry-run",
-        "icrl4aht-data download https://example.org/icrl4aht --to icrl4aht",
-    )
+cli = VerbGroup(
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
+    help="Learning histories of the ICRL4AHT benchmark: read, train on and rebuild them.",
+    epilog=_EPILOG,
 )
-@click.argument("root", required=False, type=Root(remote=True), envvar="ICRL4AHT_REMOTE", metavar="[ADDRESS]")
-@filter_options
-@click.option("--to", type=Folder(), metavar="FOLDER", help="Write the release here.")
-@click.option("--dry-run", is_flag=True, help="Fetch only the index; print the files to download, and their bytes.")
-@quiet_option
-@json_option
-def download(
-    root: str | Path | None, to: Path | None, dry_run: bool, quiet: bool, as_json: bool, **filters: tuple[str, ...]
-) -> None:
-    """Download a release, or a part of it.
-
-    ADDRESS is hf://datasets/<org>/<repo>[@<revision>], https://... or s3://...; by default $ICRL4AHT_REMOTE. Each file
-    is checked when it arrives; the same command resumes an interrupted download, and replaces files that have changed.
-    Without --to, a Hub repository goes into the Hub's cache, another release below $ICRL4AHT_DATA_DIR
-    (~/.local/share/icrl4aht); load_icrl4aht(root=ADDRESS) finds either. FOLDER must be new, empty, or have files of
-    this release only.
-    """
-    if root is None:
-        raise click.UsageError("give the ADDRESS of a release, or set ICRL4AHT_REMOTE")
-    with progress_bars(quiet, of_bytes=True) as show:
-        plan = plan_download(str(root), to=to, advance=show, **wanted_filters(filters))
-        facts = plan.to_json()
-        if not dry_run:
-            traffic = fetch_planned(plan, counted(show, "download", plan.size))
-            facts |= {"fetched_bytes": traffic.bytes, "requests": traffic.requests}
-    if as_json:
-        click.echo(json.dumps(facts, indent=2))
-    elif not quiet:
-        if dry_run:
-            for name in sorted((*plan.absent, *plan.changed)):
-                click.echo(f"{plan.files[name]:>15,}  {name}")
-        for name in plan.replaced:
-            click.echo(f"{name}: had changed, was fetched again")
-        verb = "to download" if dry_run else "downloaded"
-        fetched = len(plan.absent) + len(plan.changed)
-        here = f"{counted_noun(len(plan.files) - fetched, 'file')} present already, with the right hashes"
-        click.echo(f"{plan.root}: {counted_noun(fetched, 'file')}, {plan.size:,} bytes {verb}; {here}")
-        click.echo(f"folder: {plan.root.folder}")
-
-
-@cli.command()
-@_root
-@filter_options
-@click.option("--quick", is_flag=True, help="Check only names, sizes and the index.")
-@click.option("--deep", is_flag=True, help="Also replay every step and render every observation.")
-@click.option("--repair", is_flag=True, help="Fetch damaged and missing files again, then verify once more.")
-@click.option("--from", "origin", metavar="ADDRESS", help="Repair from here.", show_default="the origin of ROOT")
-@quiet_option
-@json_option
-def verify(
-    root: str | Path | None,
-    quick: bool,
-    deep: bool,
-    repair: bool,
-    origin: str | None,
-    quiet: bool,
-    as_json: bool,
-    **filters: tuple[str, ...],
-) -> None:
-    """Verify a release: every byte, count and range.
-
-    Prints one line per problem, and exits with 1 if there is one. Writes nothing without --repair. A remote release is
-    fetched first, unless --quick; repairing a shard fetches only its damaged parts.
-    """
-    if quick and (deep or repair):
-        raise click.UsageError("--quick reads no contents: give --deep or --repair without it")
-    level = "quick" if quick else "deep" if deep else "full"
-    if origin and not repair:
-        raise click.UsageError("--from is the source of a repair: give --repair with it")
-    wanted = wanted_filters(filters)
-    with progress_bars(quiet) as advance:
-        report = verify_release(root, level=level, advance=advance, **wanted)
-        if repair and not report.ok:
-            if root is None and origin is None:
-                raise OptionError("the bundled release is repaired by installing the package again")
-            first = report
-            outcome, traffic = repair_files(MINI if root is None else root, first.files_at_fault, source=origin)
-            report = verify_release(root, level=level, advance=advance, **wanted)
-            report.repaired = [name for name, error in outcome.items() if error is None]
-            report.notes += [f"{name}: not repaired: {error}" for name, error in outcome.items() if error is not None]
-            report.fetched_bytes += first.fetched_bytes + traffic.bytes
-            report.requests += first.requests + traffic.requests
-    if as_json:
-        click.echo(json.dumps(report.to_json(), indent=2))
-    else:
-        for name in report.repaired:
-            click.echo(f"{name}: repaired")
-        for finding in report.findings:
-            click.echo(finding.problem if finding.file == "." else f"{finding.file}: {finding.problem}")
-        if not quiet:
-            click.echo("\n".join([f"{report.root}: {verdict_in_words(report)}", *report.notes]))
-    sys.exit(0 if report.ok else 1)
-
-
-@cli.command(
-    epilog=examples(
-        "icrl4aht-data convert path/to/release --to full --layout coord_simple --out full",
-        "icrl4aht-data convert path/to/published --out lite",
-        "icrl4aht-data convert path/to/release --layout demo_wide --to minari --out demo_wide-v0",
-    )
-)
-@click.argument("root", type=Root(), metavar="SOURCE")
-@click.option(
-    "--out",
-    "target",
-    type=click.Path(path_type=Path),
-    metavar="PATH",
-    required=True,
-    help="Write the release, the folder of published files, the Minari dataset or the Parquet file here.",
-)
-@overwrite_option
-@click.option(
-    "--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet", "minari"]), help="The form to convert to."
-)
-@click.option(
-    "--tasks",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
-    help="Tasks of published files.",
-    show_default="tasks.jsonl in SOURCE",
-)
-@family_map_option
-@click.option("--kept-steps", type=COUNT, default=KEPT_STEPS, help="Steps of an episode in published files.")
-@filter_options
-@quiet_option
-def convert(
-    root: str | Path,
-    target: Path,
-    overwrite: bool,
-    form: str | None,
-    tasks: Path | None,
-    family_map: tuple[str, ...],
-    kept_steps: int,
-    quiet: bool,
-    **filters: tuple[str, ...],
-) -> None:
-    """Convert a release or published files.
-
-    SOURCE is a release, or a folder with the published code's histories.h5 and histories_index.jsonl. Writes a release
-    folder (full, lite, observations), a folder with the published code's two files (published), a Minari dataset
-    (minari) in a folder named as in demo_wide-v0, which minari.load_dataset opens, or a Parquet file with the index
-    (parquet). Published files become lite by default or, where they have no state records, observations.
-    """
-    with progress_bars(quiet) as show:
-        advance = partial(show, "histories")
-        advance(0, None)  # the total is not known yet
-        if isinstance(root, Path) and (root / HISTORIES_H5).exists():
-            if (form is not None and form not in ALL_KINDS) or any(filters.values()):
-                raise click.UsageError("published files convert to full, lite or observations, without filters")
-            form = from_published(
-                root,
-                target,
-                form,
-                tasks=tasks,
-                family_map=parse_family_map(family_map),
-                kept_steps=kept_steps,
-                overwrite=overwrite,
-                advance=advance,
-            )
-        else:
-            dataset = _load(root, filters)
-            if form is None:
-                raise click.UsageError(
-                    "give the form to convert to: --to full, lite, observations, published, minari, parquet"
-                )
-            if tasks or family_map or kept_steps != KEPT_STEPS:
-                raise click.UsageError(
-                    f"{root} is a release: --tasks, --family-map and --kept-steps are for published files"
-                )
-            if form in ALL_KINDS:
-                to_release(dataset, target, form, overwrite=overwrite, advance=advance)
-            elif form == "published":
-                to_published(dataset, target, overwrite=overwrite, advance=advance)
-            elif form == "minari":
-                to_minari(dataset, target, overwrite=overwrite, advance=advance)
-            else:
-                to_parquet(dataset, target, overwrite=overwrite)
-    limit = ", no state records: nothing can be replayed or drawn" if form == OBSERVATIONS else ""
-    if not quiet:
-        click.echo(f"{target}: {form}{limit}")
-
-
-@cli.command(epilog=examples("icrl4aht-data combine path/to/release path/to/another --data-version 1.0.0 --out both"))
-@click.argument("releases", nargs=-1, required=True, type=Root(), metavar="ROOT...")
-@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the combination here.")
-@overwrite_option
-@click.option(
-    "--data-version",
-    metavar="SEMVER",
-    help="Data version of the combination, such as 1.0.0.",
-    show_default="the version of the releases, if they agree",
-)
-@quiet_option
-def combine(
-    releases: tuple[str | Path, ...], out: Path, overwrite: bool, data_version: str | None, quiet: bool
-) -> None:
-    """Combine releases into one.
-
-    They have to be of one kind and share no task. The combination gets a new card; the cards of the releases are kept
-    in meta/source_card.md.
-    """
-    combine_releases(out, releases, data_version, overwrite=overwrite)
-    if not quiet:
-        click.echo(f"release: {out}")
-        print_statistics(read_info(out), Console())
-
-
-@cli.group()
-def release() -> None:
-    """Prepare a release for publication."""
-
-
-@release.command(epilog=examples("icrl4aht-data release build path/to/release --out build/release"))
-@click.argument("source", required=False, type=Folder())
-@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
-@overwrite_option
-@click.option("--link", is_flag=True, help="Use hard links, not copies: saves space, but editing one changes both.")
-@quiet_option
-@json_option
-def build(source: Path | None, out: Path, overwrite: bool, link: bool, quiet: bool, as_json: bool) -> None:
-    """Build a release for publication.
-
-    Copies all data of SOURCE, a release folder (by default the bundled mini release), which is verified first, and adds
-    what people and tools look for in a dataset: README.md with a dataset card, figures, the index as Parquet for
-    viewers, croissant.json, LICENSE, CITATION.cff, cards of the learned teammates and a new manifest. Needs the extras
-    plot and hf.
-    """
-    with progress_bars(quiet) as advance:
-        build_release(source, out, link=link, overwrite=overwrite, advance=advance)
-    files = list(read_manifest(out))
-    size = sum((out / name).stat().st_size for name in files)
-    if as_json:
-        click.echo(json.dumps({"release": str(out), "files": files, "bytes": size}, indent=2))
-    elif not quiet:
-        click.echo(f"release: {out}, {len(files)} files, {size:,} bytes; its card is {out / 'README.md'}")
-
-
-@cli.command(epilog=examples("icrl4aht-data upload build/release hf://datasets/you/icrl4aht --dry-run"))
-@click.argument("folder", type=Folder())
-@click.argument("address", type=Root(remote=True))
-@click.option("--private", is_flag=True, help="Make a new repository private; refuse one that is public.")
-@click.option("--dry-run", is_flag=True, help="Print the plan; change nothing.")
-@quiet_option
-@json_option
-def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool, as_json: bool) -> None:
-    """Upload a release to the Hugging Face Hub, and tag it.
-
-    FOLDER is a release, as `release build` makes it; ADDRESS is hf://datasets/<org>/<repo>. The release is verified
-    first; a missing repository is created. The same command resumes an interrupted upload. Afterwards the repository's
-    content is compared with the manifest, and only then tagged with the data version. A tag never moves: other data
-    need another version. `hf auth login` stores the token.
-    """
-    with progress_bars(quiet) as advance:
-        done = upload_release(
-            folder, address, private=private, dry_run=dry_run, show=not quiet and sys.stderr.isatty(), advance=advance
-        )
-    if as_json:
-        click.echo(json.dumps(done.to_json(), indent=2))
-    elif not quiet:
-        click.echo("\n".join(done.in_words()))
-
-
-@cli.command()
-@json_option
-def doctor(as_json: bool) -> None:
-    """Examine this installation, and report problems.
-
-    Prints versions, optional packages and the extras that install them, devices, the folders in use (their settings,
-    contents and permissions), environment variables, and the state of the bundled release. Writes nothing, and does
-    not use the network. Exits with 1 and a next step for each problem if there is one.
-    """
-    found = diagnose()
-    click.echo(json.dumps(found, indent=2) if as_json else "\n".join(in_words(found)))
-    sys.exit(0 if found["ok"] else 1)
+"""The program."""
+click.version_option(package_name="icrl4aht-data", message="%(package)s %(version)s")(cli)
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the program on the command line's arguments."""
     run(cli)
+
+
+def run(command: click.Command) -> None:
+    """Run a command line; errors about its input become one line and an exit code.
+
+    Output that nobody reads is no error message: where the reader of a pipe has gone (`| head`) the command stops
+    quietly with exit code 1, and output that was closed from the start (`>&-`) is dropped.
+    """
+    for name in ("stdout", "stderr"):  # closed ones are opened on the null device, so that no file gets their number
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
+    try:
+        command()
+    except BrokenPipeError:
+        sys.exit(1)
+    except UnknownNameError as error:
+        _stop(str(error), 2)
+    except Icrl4ahtError as error:
+        _stop(str(error), 1)
+    except OSError as error:
+        _stop(_in_words(error), 1)
+    except ModuleNotFoundError as error:
+        if (message := missing_library(error.name or "", "baselines")) is None:
+            raise
+        _stop(message, 1)
+    except SystemExit as stop:
+        if message := getattr(stop, "message", None):  # of a training that was stopped and saved
+            click.echo(message, err=True)
+        raise
+
+
+def _stop(message: str, code: int) -> None:
+    click.echo(f"error: {message}", err=True)
+    sys.exit(code)
+
+
+def _in_words(error: OSError) -> str:
+    """Return the message with the user's name of the file, not that of the temporary file or lock next to it."""
+    if error.errno is None or error.filename is None:
+        return str(error)
+    path = Path(os.fsdecode(error.filename))
+    if path.name.startswith(".") and path.suffix in (".partial", ".lock"):
+        path = path.with_name(path.stem.removeprefix("."))
+    remedy = _REMEDIES.get(error.errno)
+    if error.errno in FULL:
+        remedy = f"{remedy}: {describe_disk(path)}"
+    return f"{path}: {os.strerror(error.errno)}" + (f"; {remedy}" if remedy else "")

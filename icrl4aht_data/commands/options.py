@@ -1,15 +1,9 @@
-"""Shared parts of the command lines `icrl4aht-data`, `icrl4aht-data` and `icrl4aht-data`.
-
-Exit codes: 0 success; 1 an error, or a release in which `verify` found a problem, or the reader of the output has gone;
-2 a misused command.
-"""
+"""Types of arguments, options and progress bars that the commands share."""
 
 from __future__ import annotations
 
-import errno
-import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,54 +11,9 @@ import click
 from click.shell_completion import CompletionItem
 
 from icrl4aht_data.benchmark.facts import SPLITS, TRACKS, all_families
-from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
+from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout_names
 from icrl4aht_data.remote.remote_release import is_address
-from icrl4aht_data.utils.files import FULL, describe_disk
-from icrl4aht_data.utils.installation import PACKAGE
-from icrl4aht_data.utils.requirements import missing_library
-
-SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "show_default": True}
-
-_REMEDIES = {
-    errno.ENOENT: "check the path; a new file's folder has to exist",
-    errno.ENOTDIR: "a file is where a folder is needed: give another folder",
-    errno.EEXIST: "a file is where a folder is needed: give another folder",
-    errno.EISDIR: "a folder is where a file is needed: give another name",
-    errno.EACCES: "give a folder that you may write to, and files that you may read",
-    errno.EPERM: "give a folder that you may write to, and files that you may read",
-    errno.EROFS: "give a folder that can be written to",
-    errno.EFBIG: "a limit on the size of files is set, see `ulimit -f`",
-    **dict.fromkeys(FULL, "free some space, or give a folder on another disk"),
-}
-
-
-class Sections(click.Group):
-    """Command group whose help lists the commands under headings.
-
-    Args:
-        sections: heading -> names of commands. Commands without a heading are listed last.
-    """
-
-    def __init__(self, *args: Any, sections: Mapping[str, Sequence[str]], **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.sections = sections
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return [name for names in self._sorted().values() for name in names]
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        longest = max(map(len, self.commands))
-        for heading, names in self._sorted().items():
-            rows = [(name, self.commands[name].get_short_help_str(formatter.width - longest - 6)) for name in names]
-            with formatter.section(heading):
-                formatter.write_dl([(name.ljust(longest), text) for name, text in rows])
-
-    def _sorted(self) -> dict[str, list[str]]:
-        known = {heading: [n for n in names if n in self.commands] for heading, names in self.sections.items()}
-        listed = {name for names in known.values() for name in names}
-        known["Others"] = [name for name in self.commands if name not in listed]
-        return {heading: names for heading, names in known.items() if names}
 
 
 class Names(click.ParamType):
@@ -171,11 +120,6 @@ COUNT = click.IntRange(min=1)
 COUNT_OR_NONE = click.IntRange(min=0)
 
 
-def version_option(command: Any) -> Any:
-    """Add `--version`, which prints the version of the installed package."""
-    return click.version_option(package_name=PACKAGE, message="%(package)s %(version)s")(command)
-
-
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace what exists, if it carries this package's mark and nothing was added."
@@ -224,55 +168,3 @@ def is_terminal() -> bool:
 def examples(*lines: str) -> str:
     """Return a help epilog that shows command lines."""
     return "\n".join(["\b", f"Example{'s' * (len(lines) > 1)}:", *(f"  {line}" for line in lines)])
-
-
-def run(command: click.Command, extra: str | None = None) -> None:
-    """Run a command line; errors about its input become one line and an exit code.
-
-    Output that nobody reads is no error message: where the reader of a pipe has gone (`| head`) the command stops
-    quietly with exit code 1, and output that was closed from the start (`>&-`) is dropped.
-
-    Args:
-        command: the command line.
-        extra: the extra that all of its commands need; messages about missing modules suggest it if it has them.
-    """
-    _open_outputs()
-    try:
-        command()
-    except BrokenPipeError:
-        sys.exit(1)
-    except UnknownNameError as error:
-        _stop(str(error), 2)
-    except Icrl4ahtError as error:
-        _stop(str(error), 1)
-    except OSError as error:
-        _stop(_in_words(error), 1)
-    except ModuleNotFoundError as error:
-        if (message := missing_library(error.name or "", extra)) is None:
-            raise
-        _stop(message, 1)
-
-
-def _open_outputs() -> None:
-    """Open closed output streams on the null device, also so that no file gets their descriptors."""
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
-
-
-def _stop(message: str, code: int) -> None:
-    click.echo(f"error: {message}", err=True)
-    sys.exit(code)
-
-
-def _in_words(error: OSError) -> str:
-    """Return the message with the user's name of the file, not that of the temporary file or lock next to it."""
-    if error.errno is None or error.filename is None:
-        return str(error)
-    path = Path(os.fsdecode(error.filename))
-    if path.name.startswith(".") and path.suffix in (".partial", ".lock"):
-        path = path.with_name(path.stem.removeprefix("."))
-    remedy = _REMEDIES.get(error.errno)
-    if error.errno in FULL:
-        remedy = f"{remedy}: {describe_disk(path)}"
-    return f"{path}: {os.strerror(error.errno)}" + (f"; {remedy}" if remedy else "")

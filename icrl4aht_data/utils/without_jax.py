@@ -45,5 +45,8 @@ class _Loader(SourceFileLoader):
         try:
             super().exec_module(module)
         except ModuleNotFoundError as error:
-            error.msg = missing_library(error.name or "", module.__name__.partition(".")[0]) or error.msg
+            error.msg = (
+                missing_library(error.name or "", module.__name__.partition(".")[0].removeprefix("icrl4aht_"))
+                or error.msg
+            )
             raise

@@ -14,7 +14,6 @@ import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines import experiments
 from icrl4aht_baselines.agents.egos import NamedEgo, stay
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate import protocols
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.results import read_result
@@ -37,6 +36,7 @@ from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import Checkpoints
 
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -306,7 +306,7 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
     small += ["--layers", "2", "--warmup", "0.5", "--save-minutes", "0.5"]
     small += ["--teammate-family", "rl", "--algorithm", "fcp", "--algorithm", "brdiv"]
     chosen = ["--method", "ad", "--layout", "cramped_up", "--only", "ta", "--root", str(release)]
-    result = CliRunner().invoke(cli, ["ablate", "ta", *chosen, *small], catch_exceptions=False)
+    result = CliRunner().invoke(cli, ["research", "ablate", "ta", *chosen, *small], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert "left out: nothing" in result.output
     ((name, plan, out),) = calls
@@ -324,7 +324,9 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
     }
     rest: dict[str, Any] = {"methods": ("ad",), "families": ("H4",), "tasks": 1, "gifs": False, "root": str(release)}
     assert plan == ExperimentPlan(**options, **rest)
-    assert CliRunner().invoke(cli, ["tracks", *small, "--size", "tiny"], catch_exceptions=False).exit_code == 0
+    assert (
+        CliRunner().invoke(cli, ["research", "tracks", *small, "--size", "tiny"], catch_exceptions=False).exit_code == 0
+    )
     assert (calls[1][0], calls[1][2]) == ("tracks", Path("runs/tracks"))
     assert (plan.size, calls[1][1].size) == ("small", "tiny")
 
@@ -371,7 +373,7 @@ def suite(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path):
-    arguments = ["heldout-rl", "--suite", str(suite), "--method", "ad", "--layout", "cramped_up"]
+    arguments = ["research", "heldout-rl", "--suite", str(suite), "--method", "ad", "--layout", "cramped_up"]
     small = ["--steps", "1", "--context", "8", "--batch-size", "2", "--tasks", "1", "--episodes", "2"]
     small += ["--layers", "1", "--width", "8", "--heads", "2"]
     command = [*arguments, *small, "--root", str(release), "--out", str(tmp_path)]
@@ -430,9 +432,9 @@ def test_impossible_plans(release, tmp_path):
         "no training histories of teammate_family rl on coord_simple; it has asymm_both, coord_ring, cramped_up, demo_"
     )
     fails(EmptySelectionError, absent, **learned)
-    result = CliRunner().invoke(cli, ["sweep", "context", "--context", "9"])
+    result = CliRunner().invoke(cli, ["research", "sweep", "context", "--context", "9"])
     assert "context = 9: `sweep context` sets it; choose by --only, such as K250" in str(result.exception)
     assert (
         "unknown sweep 'sizes'; valid: context, size. Did you mean 'size'"
-        in CliRunner().invoke(cli, ["sweep", "sizes"]).output
+        in CliRunner().invoke(cli, ["research", "sweep", "sizes"]).output
     )

@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from icrl4aht_baselines import reference
 from icrl4aht_baselines.agents import bundled
 from icrl4aht_baselines.agents.bundled import MODELS
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
 from icrl4aht_baselines.reference import (
@@ -34,6 +33,7 @@ from PIL import Image
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from tests.helpers.evaluated import evaluated_run
@@ -62,14 +62,24 @@ def test_unknown_names(tmp_path):
         make_reference("ad-nois", "teammate", tmp_path, print)
     with pytest.raises(UnknownNameError, match="unknown track 'x'; valid: teammate, layout"):
         make_reference("ad-noise", "x", tmp_path, print)
-    result = CliRunner().invoke(cli, ["reference", "--name", "ad-nois"])
+    result = CliRunner().invoke(cli, ["research", "reference", "--name", "ad-nois"])
     assert result.exit_code == 2 and "ad-noise" in result.output
 
 
 def test_a_teacher_takes_the_place_of_rl2(tmp_path, monkeypatch):
     with pytest.raises(OptionError, match=r"ad-noise learns from no histories.*ad-student, dpt-student, ad-rising"):
         make_reference("ad-noise", "teammate", tmp_path, print, teacher="rl2-reference")
-    command = ["reference", "--name", "ad-student", "--name", "ad-noise", "--out", str(tmp_path / "out"), "--teacher"]
+    command = [
+        "research",
+        "reference",
+        "--name",
+        "ad-student",
+        "--name",
+        "ad-noise",
+        "--out",
+        str(tmp_path / "out"),
+        "--teacher",
+    ]
     for teacher, message in (
         ("rl2-referenc", "--teacher: unknown agent"),
         ("rl2-reference", "ad-noise learns from no"),
@@ -115,7 +125,7 @@ def test_one_track_of_a_bundled_model_is_replaced(tmp_path, monkeypatch):
     monkeypatch.setattr(reference, "make_reference", make)
     monkeypatch.setattr(bundled, "bundle_run", lambda run, name, track, **way: copied.append((name, track)))
     monkeypatch.setattr(reference, "write_bundled_card", lambda name, found, **way: cards.append(found))
-    command = ["reference", "--name", "rl2", "--track", "layout", "--out", str(tmp_path), "--bundle-as"]
+    command = ["research", "reference", "--name", "rl2", "--track", "layout", "--out", str(tmp_path), "--bundle-as"]
     result = CliRunner().invoke(cli, [*command, "rl2-reference"], catch_exceptions=False)
     assert result.exit_code == 0
     assert made == [("layout", None), ("teammate", MODELS / "rl2-reference" / "teammate")]

@@ -9,7 +9,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 
 import pytest
-from icrl4aht_generation.cli import cli
+from icrl4aht_generation import commands
 from icrl4aht_generation.collection.task_folder import artefact_settings
 from icrl4aht_generation.learners.config import PPOConfig, Widths
 from icrl4aht_generation.profiles import FOLDER, Profile, load_profile, profile_names
@@ -138,7 +138,7 @@ def test_given_hyper_parameters_replace_the_profiles_and_enter_its_hashes(change
 
 @pytest.mark.parametrize("command", ["generate", "plan", "speed"])
 def test_every_hyper_parameter_of_the_ego_is_an_option(command):
-    options = {option.name for option in cli.commands[command].params}
+    options = {option.name for option in getattr(commands, command).params}
     known = {field.name for kind in (PPOConfig, Widths) for field in fields(kind)} - {"widths"}
     assert known <= options
 

@@ -258,8 +258,10 @@ def test_package_that_is_not_installed(elsewhere, monkeypatch):
 def test_missing_module_names_its_extra(tmp_path):
     """A process without flax, as where only the reader is installed."""
     (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['flax'] = None\n")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    command = [sys.executable, "-m", "icrl4aht_generation", "speed", "--profile", "smoke"]
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "generation", ROOT / "baselines")))
+    }
+    command = [sys.executable, "-m", "icrl4aht_data", "research", "speed", "--profile", "smoke"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 1
     assert done.stderr.endswith(

@@ -1,4 +1,4 @@
-"""Help texts of the three programs: complete and consistent, with valid examples; completion in shells."""
+"""The help of the program: every command is listed, explained and found; it is printed before anything is imported."""
 
 from __future__ import annotations
 
@@ -6,124 +6,89 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import click
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.commands.cli import cli as baselines_cli
-from icrl4aht_generation.cli import cli as generation_cli
 
-from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.commands.options import LAYOUT, Names, Sections
-from tests.packaging.test_readme import ROOT, understand
+from icrl4aht_data.commands.cli import VerbGroup, all_verbs, cli
+from icrl4aht_data.commands.verbs import Verb
+from tests.packaging.test_readme import understand
 
-PROGRAMS = {
-    "icrl4aht-data": cli,
-    "icrl4aht-data": generation_cli,
-    "icrl4aht-data": baselines_cli,
-}
+PUBLIC = (
+    "list show browse verify download convert combine release upload doctor generate teammates plan check train "
+    "evaluate report results models control demo watch collect"
+)
+RESEARCH = "draws manifests diversity speed reference unseen drift headroom sweep ablate tracks heldout-rl"
 
 
-def commands(program: str, command: click.Command) -> Iterator[tuple[str, click.Command]]:
-    """Yield a command and its subcommands, with the words that run each."""
-    yield program, command
-    if isinstance(command, click.Group):
-        for name, below in command.commands.items():
-            yield from commands(f"{program} {name}", below)
+def find(verb: Verb) -> click.Command:
+    """Return a command as the program finds it."""
+    command: click.Command | None = cli
+    for word in verb.name.split():
+        assert isinstance(command, VerbGroup)
+        command = command.get_command(click.Context(command), word)
+    assert command is not None
+    return command
 
 
-EVERY = dict(pair for program, group in PROGRAMS.items() for pair in commands(program, group))
+def test_every_command_exists():
+    assert set(cli.list_commands(click.Context(cli))) == {*PUBLIC.split(), "research"}
+    assert {name for name in all_verbs() if " " in name} == {f"research {one}" for one in RESEARCH.split()} | {
+        "release build"
+    }
 
 
-def help_of(command: click.Command) -> str:
-    result = CliRunner().invoke(command, ["--help"])
+@pytest.mark.parametrize("words", all_verbs())
+def test_help(words):
+    command = find(all_verbs()[words])
+    result = CliRunner().invoke(cli, [*words.split(), "--help"])
     assert result.exit_code == 0, result.output
-    return result.output
-
-
-@pytest.mark.parametrize("typed", EVERY)
-def test_help(typed):
-    command = EVERY[typed]
-    assert "Usage" in help_of(command)
-    assert command.help
-    first = command.help.splitlines()[0]
-    assert first.endswith("."), "the first line is one sentence"
-    if typed not in PROGRAMS:
-        assert command.get_short_help_str(62) == first, "a list of commands shows it completely"
+    assert (command.help or "").splitlines()[0] == all_verbs()[words].help, "the table and the command's own text"
+    assert command.get_short_help_str(62) == all_verbs()[words].help, "a list of commands shows it completely"
     for option in command.params:
-        if isinstance(option, click.Option):
-            assert option.help, f"{option.name} has no help"
-            assert option.help.endswith("."), f"{option.name}: a sentence"
+        assert not isinstance(option, click.Option) or option.help, f"{option.name} has no help"
 
 
-@pytest.mark.parametrize("typed", EVERY)
-def test_help_lists_the_valid_names(typed):
-    for option in EVERY[typed].params:
-        if isinstance(option, click.Option) and isinstance(option.type, Names) and option.type is not LAYOUT:
-            names, text = list(option.type.valid()), (option.help or "") + help_of(EVERY[typed])
-            if "such as" not in (option.help or ""):
-                assert all(name in text for name in names), f"{option.name}: {names}"
+def test_the_programs_help_imports_no_command():
+    """No JAX either; it takes less than half a second of CPU time on one core, mostly for NumPy."""
+    code = "import sys; from icrl4aht_data.commands.cli import cli; cli(['--help'], standalone_mode=False); "
+    code += "print('loaded:', *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    text, _, loaded = done.stdout.partition("loaded: ")
+    assert all(f"\n  {name} " in text for name in PUBLIC.split()), done
+    targets = {verb.target.partition(":")[0] for verb in all_verbs().values()}
+    assert not {*targets, "jax", "h5py", "rich", "icrl4aht_data.dataset"} & {*loaded.split()}
 
 
-def test_every_command_has_a_heading():
-    for group in PROGRAMS.values():
-        assert isinstance(group, Sections)
-        listed = group.list_commands(click.Context(group))
-        assert sorted(listed) == sorted(group.commands)
-        assert "Others:" not in help_of(group)
-
-
-def test_a_command_without_a_heading_comes_last():
-    group = Sections(sections={"Look": ["show", "not made"]})
-    for name in ("other", "show"):
-        group.add_command(click.Command(name, help=f"{name}."))
-    assert group.list_commands(click.Context(group)) == ["show", "other"]
-    text = help_of(group)
-    assert text.index("Look:") < text.index("show") < text.index("Others:") < text.index("other")
-
-
-def test_options_of_one_name_have_one_type():
-    types: dict[str, set[str]] = {}
-    for command in EVERY.values():
-        for option in command.params:
-            if isinstance(option, click.Option):
-                types.setdefault(option.opts[0], set()).add(option.type.name)
-    mixed = {name for name, kinds in types.items() if len(kinds) > 1}
-    assert mixed == {"--out", "--tasks", "--to"}, "their commands explain them"
+def test_a_research_command_without_its_group_is_named():
+    result = CliRunner().invoke(cli, ["draws", "--overwrite"])
+    assert result.exit_code == 2
+    assert "icrl4aht-data research draws --overwrite" in result.output
 
 
 def examples() -> list[str]:
-    epilogs = [command.epilog or "" for command in EVERY.values()]
-    lines = [line.strip() for epilog in epilogs for line in epilog.splitlines() if line.startswith("  ")]
-    return sorted({line for line in lines if line.startswith(tuple(PROGRAMS))})
+    epilogs = [find(verb).epilog or "" for verb in all_verbs().values()] + [cli.epilog or ""]
+    return sorted({line.strip() for text in epilogs for line in text.splitlines() if line.startswith("  icrl4aht")})
 
 
 @pytest.mark.parametrize("line", examples())
 def test_examples_are_valid(line):
-    program = next(name for name in PROGRAMS if line.startswith(name))
-    understand(PROGRAMS[program], shlex.split(line)[len(program.split()) :])
+    understand(cli, shlex.split(line)[1:])
 
 
 def completed(*words: str) -> list[str]:
     """Return what the console script offers in bash after these words."""
     line = " ".join(("icrl4aht-data", *words))
     request = {"_ICRL4AHT_DATA_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(len(words))}
-    return [offer.partition(",")[2] for offer in script(request).splitlines()]
-
-
-def script(environment: dict[str, str]) -> str:
     path = Path(sys.executable).with_name("icrl4aht-data")
-    environment = os.environ | {"PYTHONPATH": str(ROOT)} | environment
+    environment = os.environ | request
     done = subprocess.run([path], env=environment, capture_output=True, text=True, check=True)
-    return done.stdout
+    return [offer.partition(",")[2] for offer in done.stdout.splitlines()]
 
 
 def test_completion():
-    source = script({"_ICRL4AHT_DATA_COMPLETE": "bash_source"})
-    assert "complete -o nosort -F _icrl4aht_data_completion icrl4aht-data" in source
-    assert 'eval "$(_ICRL4AHT_DATA_COMPLETE=bash_source icrl4aht-data)"' in help_of(cli)
     assert completed("ver") == ["verify"]
     assert completed("list", "--layout", "demo_") == ["demo_simple", "demo_wide"]
     assert "--json" in completed("doctor", "--")

@@ -303,7 +303,7 @@ def test_named_extras_train_evaluate_and_draw(grown, wheel, tmp_path):
     run("python", "-c", "import jax, flax, optax, importlib.util as u; assert not u.find_spec('matplotlib')")
     assert run("python", "-c", EVALUATE).endswith("\nFalse\n")
     assert "ad-reference" in run("icrl4aht-data", "models")
-    run("icrl4aht-data", "manifests", "--check")
+    run("icrl4aht-data", "research", "manifests", "--check")
     small = ("--layout", "demo_wide", "--tasks", "1", "--episodes", "2")
     run("icrl4aht-data", "evaluate", "--agent", "ad-reference", *small, "--out", "results")
     settings = ("--layout", "demo_wide", "--steps", "2", "--batch-size", "2", "--context", "20")

@@ -268,16 +268,3 @@ def unseen_command(
     click.echo(unseen_table(add_unseen(StoredResults({}, {}), found)))
     if store:
         write_stored(results_file(), add_unseen(read_stored(results_file()), found))
-
-
-EXPERIMENT_COMMANDS = (
-    sweep_command,
-    ablate_command,
-    tracks_command,
-    heldout_rl_command,
-    control_command,
-    headroom_command,
-    drift_command,
-    unseen_command,
-)
-"""Commands of this module."""

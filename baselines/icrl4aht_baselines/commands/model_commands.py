@@ -100,7 +100,7 @@ def collect_command(
     out: Path,
     overwrite: bool,
 ) -> None:
-    """Record histories of an agent with the teammates of a release.
+    """Record histories of an agent with a release's teammates.
 
     Writes a release of source student: what the agent did, what it would have done without the noise (expert actions),
     and what the scripted oracle would have done (oracle actions). Validation teammates are played, too.
@@ -279,7 +279,3 @@ def models_command() -> None:
     for model in bundled_models().values():
         for line in describe_model(model):
             click.echo(line)
-
-
-MODEL_COMMANDS = (collect_command, reference_command, results_command, models_command)
-"""Commands of this module."""

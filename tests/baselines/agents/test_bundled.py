@@ -14,7 +14,6 @@ from click.testing import CliRunner
 from icrl4aht_baselines.agents import Percept, bundled
 from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
 from icrl4aht_baselines.agents.egos import PlayMode, find_agent
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import get_protocol
@@ -27,6 +26,7 @@ from icrl4aht_baselines.training.trainer import train
 from icrl4aht_generation.teammates.instances import published_task
 from PIL import Image
 
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.control import control, worlds
 from icrl4aht_generation.policy import Policy
+
+from icrl4aht_data.commands.cli import cli
 
 TINY = control.ControlSize(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
 

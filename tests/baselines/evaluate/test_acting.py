@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import find_agent
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.drift import Drift, measure_drift
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
@@ -24,6 +23,7 @@ from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions,
 from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_generation.teammates.instances import published_tasks
 
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.small_models import random_parameters
@@ -76,7 +76,7 @@ def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
         return found
 
     monkeypatch.setattr("icrl4aht_baselines.evaluate.drift.measure_drift", on_two_layers)
-    result = CliRunner().invoke(cli, ["drift", str(runs / "ad")], catch_exceptions=False)
+    result = CliRunner().invoke(cli, ["research", "drift", str(runs / "ad")], catch_exceptions=False)
     assert "AD+TA on demo_wide with 5 teammates of H4, K = 30" in result.output
     (episode,) = found
     assert f"{episode.distance.max():>10.6f}" in result.output
@@ -93,7 +93,7 @@ def test_the_drift_command(runs, monkeypatch):
         yield Drift(np.full((5, 100), 0.25), np.ones((5, 100), bool))
 
     monkeypatch.setattr("icrl4aht_baselines.evaluate.drift.measure_drift", play)
-    command = ["drift", str(runs / "ad"), "--episodes", "2", "--family", "H1"]
+    command = ["research", "drift", str(runs / "ad"), "--episodes", "2", "--family", "H1"]
     result = CliRunner().invoke(cli, command, catch_exceptions=False)
     assert "AD+TA on demo_wide with 5 teammates of H1, K = 30" in result.output
     assert result.output.splitlines()[-1].split() == ["0", "100.0%", "0.250000", "0.250000"]

@@ -15,7 +15,6 @@ from click.testing import CliRunner
 from icrl4aht_baselines import experiments
 from icrl4aht_baselines.agents.egos import find_agent, with_view
 from icrl4aht_baselines.agents.host import Percept, from_host
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.experiments import EXPERIMENTS, ExperimentPlan, run_experiment
@@ -29,6 +28,7 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task
 
 from icrl4aht_data.benchmark.facts import TESTED_ON
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
@@ -212,9 +212,9 @@ def test_the_options_of_the_experiments(monkeypatch, tmp_path):
 
     monkeypatch.setattr(experiments, "run_experiment", run_plan)
     for given in (["--layout", "all"], ["--layout", "demo_wide", "--channels", "canonical"]):
-        result = CliRunner().invoke(cli, ["tracks", *given, "--out", str(tmp_path)], catch_exceptions=False)
+        result = CliRunner().invoke(cli, ["research", "tracks", *given, "--out", str(tmp_path)], catch_exceptions=False)
         assert result.exit_code == 0, result.output
     assert [(plan.layouts, plan.channels) for plan in plans] == [(("all",), None), (("demo_wide",), "canonical")]
-    wrong = CliRunner().invoke(cli, ["tracks", "--layout", "al"])
+    wrong = CliRunner().invoke(cli, ["research", "tracks", "--layout", "al"])
     assert wrong.exit_code == 2
     assert "unknown layout 'al'; valid: all, coord_simple" in wrong.output

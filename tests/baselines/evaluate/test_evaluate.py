@@ -14,7 +14,6 @@ import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, find_agent, random, stay
 from icrl4aht_baselines.agents.host import Percept, from_host
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
 from icrl4aht_baselines.evaluate.results import Result, read_result, write_result
@@ -29,6 +28,7 @@ from icrl4aht_generation.teammates.instances import published_tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
@@ -308,7 +308,8 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
     for name in ("_bundled_by_id", "_instances"):  # what is cached of other manifests would outlast this test
         monkeypatch.setattr(results_of_runs, name, getattr(results_of_runs, name).__wrapped__)
     monkeypatch.setattr(
-        "icrl4aht_baselines.commands.cli.find_ego", lambda option, name, **mode: NamedEgo(name, AGENTS[name])
+        "icrl4aht_baselines.commands.train_commands.find_ego",
+        lambda option, name, **mode: NamedEgo(name, AGENTS[name]),
     )
     settings = {"agent": "stay", "seeds": [0], "protocol": dataclasses.asdict(PUBLISHED), "code_version": "0"}
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import find_agent
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
@@ -43,6 +42,7 @@ from icrl4aht_generation.teammates.instances import published_task
 from icrl4aht_generation.teammates.registry import build_teammate, sample_teammate
 
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.actions import STAY

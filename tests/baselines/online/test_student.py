@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, stay
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.online import student
 from icrl4aht_baselines.online.student import collect_release, record_histories, release_teammates, with_noise
 from icrl4aht_baselines.reference import RL2_HISTORIES
@@ -23,6 +22,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import STAY
 from tests.helpers.evaluated import TEST_TASKS

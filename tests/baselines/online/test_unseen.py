@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import AGENTS
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
 from icrl4aht_baselines.online import unseen
@@ -20,6 +19,7 @@ from icrl4aht_baselines.report import stored_results
 from icrl4aht_baselines.report.stored_results import UNSEEN, read_stored
 from icrl4aht_generation.teammates.registry import build_teammate
 
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
 
 TASKS = [
@@ -69,7 +69,7 @@ class TestCommand:
 
     def test_table_and_store(self, played, monkeypatch, tmp_path):
         monkeypatch.setattr(stored_results, "results_file", lambda: tmp_path / "results.json")
-        command = ["unseen", "--agent", "rl2-reference", "--versions", "2", "--store"]
+        command = ["research", "unseen", "--agent", "rl2-reference", "--versions", "2", "--store"]
         result = CliRunner().invoke(cli, command, catch_exceptions=False)
         assert result.exit_code == 0, result.output
         assert played == [(["stay", "oracle", "rl2-reference"], {"asymm_both", "cramped_up"}, 2, 40)]
@@ -85,6 +85,6 @@ class TestCommand:
         ],
     )
     def test_misuse(self, played, options, message):
-        result = CliRunner().invoke(cli, ["unseen", *options])
+        result = CliRunner().invoke(cli, ["research", "unseen", *options])
         assert result.exit_code == 2 and message in " ".join(result.output.split()), result.output
         assert not played

@@ -9,7 +9,6 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.results import Result, read_result, write_result
 from icrl4aht_baselines.report import stored_results
@@ -45,6 +44,7 @@ from icrl4aht_baselines.training.run_folder import RUN_FORMAT
 
 from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import write_tasks
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from tests.helpers.paths import ROOT
 

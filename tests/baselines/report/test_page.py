@@ -10,7 +10,6 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.commands.cli import cli
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.report import episode_gifs as gifs
 from icrl4aht_baselines.report import rendering
@@ -24,6 +23,7 @@ from matplotlib.figure import Figure
 
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, read_headroom
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import legend_below
 from icrl4aht_data.utils.installation import install_command

@@ -533,7 +533,7 @@ def test_the_command_that_is_told_to_stop(lite, tmp_path):
     small = ["--batch-size", "2", "--context", "4", "--layers", "1", "--width", "8", "--heads", "2", "--log-every", "1"]
     command = [
         "-m",
-        "icrl4aht_baselines",
+        "icrl4aht_data",
         "train",
         "ad",
         "--layout",

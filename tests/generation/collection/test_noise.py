@@ -300,7 +300,7 @@ def test_killed_at_two_moments(made, tmp_path):
 def test_the_commands(tmp_path):
     """A release generated in one process, then its tasks on Ray, with the same bits; the release is valid."""
     (tmp_path / "noise.toml").write_text(NOISE)
-    command = ("-m", "icrl4aht_generation", "generate", "--profile", str(tmp_path / "noise.toml"), "--out")
+    command = ("-m", "icrl4aht_data", "generate", "--profile", str(tmp_path / "noise.toml"), "--out")
     again = ("--tasks", str(tmp_path / "a/lite/meta/tasks.jsonl"), "--executor", "ray", "--workers", "1")
     for name, options in (("a", ()), ("b", again)):
         process = start(*command, str(tmp_path / name), *options)
@@ -308,7 +308,7 @@ def test_the_commands(tmp_path):
         assert process.returncode == 0, output + errors
         assert "demo_wide with utility_greedy, noise: finished at " in output
     for command in (
-        ("-m", "icrl4aht_generation", "check", str(tmp_path / "a"), str(tmp_path / "b")),
+        ("-m", "icrl4aht_data", "check", str(tmp_path / "a"), str(tmp_path / "b")),
         ("-m", "icrl4aht_data", "verify", str(tmp_path / "a" / "lite"), "--deep"),
     ):
         process = start(*command)

@@ -13,7 +13,6 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
-from icrl4aht_generation.cli import main
 from icrl4aht_generation.collection import job
 from icrl4aht_generation.collection.board import TaskBoard
 from icrl4aht_generation.collection.job import CollectionError
@@ -27,6 +26,7 @@ from icrl4aht_generation.releases.check import compare_rebuilds
 from rich.console import Console
 
 from icrl4aht_data import verify_release
+from icrl4aht_data.commands.cli import main
 from icrl4aht_data.errors import OptionError
 from tests.helpers.tiny import artefact, start
 
@@ -158,7 +158,7 @@ def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(built, pair, tmp_pa
 
 @pytest.mark.slow
 def test_two_collectors_at_once_do_each_task_once(built, pair, tmp_path):
-    command = ["-m", "icrl4aht_generation", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
+    command = ["-m", "icrl4aht_data", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
     processes = [start(*command) for _ in range(2)]
     outputs = [process.communicate() for process in processes]
     assert [process.returncode for process in processes] == [0, 0], outputs
@@ -186,7 +186,7 @@ def test_ray_with_two_workers(built, pair, tmp_path):
     broken = partial_folder(tmp_path / "artefacts" / artefact(pair, 1).name)
     broken.mkdir(parents=True)
     (broken / LEARNER).write_bytes(b"junk")
-    command = ["-m", "icrl4aht_generation", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
+    command = ["-m", "icrl4aht_data", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
     command += ["--executor", "ray", "--workers", "2", "--retries", "1"]
     addresses: set[str] = set()
     process = start(*command)

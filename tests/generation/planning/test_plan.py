@@ -8,7 +8,6 @@ from typing import Any, cast
 import jax
 import pytest
 from click.testing import CliRunner
-from icrl4aht_generation.cli import cli
 from icrl4aht_generation.collection.noise import noise_bytes
 from icrl4aht_generation.planning import plan
 from icrl4aht_generation.profiles import load_profile
@@ -16,6 +15,7 @@ from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
 from icrl4aht_data.benchmark.tasks import make_task
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.overcooked.layouts import get_layout
 from tests.helpers.tiny import LEARNED, NOISE, artefact
 

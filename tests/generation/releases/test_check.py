@@ -8,10 +8,10 @@ import shutil
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_generation.cli import cli
 from icrl4aht_generation.learners.resume import xla_threads
 from icrl4aht_generation.releases.check import compare_rebuilds
 
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
 from tests.helpers.tiny import artefact
 

@@ -16,7 +16,6 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from icrl4aht_generation.cli import cli, main
 from icrl4aht_generation.collection import job
 from icrl4aht_generation.collection import task as collect
 from icrl4aht_generation.collection import task_folder as artefacts
@@ -35,6 +34,7 @@ from rich.console import Console
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import ALGORITHMS
+from icrl4aht_data.commands.cli import cli, main
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import NearestTest

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_generation.cli import cli
 from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.record import HistoryArrays
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA
@@ -27,6 +26,7 @@ from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_te
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest

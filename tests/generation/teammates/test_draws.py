@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from icrl4aht_generation.cli import cli
 from icrl4aht_generation.teammates import draws, measuring
 from icrl4aht_generation.teammates.draws import (
     DRAWS_PER_SEED,
@@ -25,6 +24,7 @@ from icrl4aht_generation.teammates.draws import (
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, TRACKS
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 
 H1, H2, H3, H4 = HEURISTIC_FAMILIES
@@ -253,7 +253,7 @@ def test_a_stopped_measurement_resumes(monkeypatch, tmp_path):
 
     monkeypatch.setattr(measuring, "measure_draws", measure)
     path = tmp_path / "draws.jsonl"
-    arguments = ["draws", "--out", str(path), "--layout", "demo_wide", "--layout", "cramped_up"]
+    arguments = ["research", "draws", "--out", str(path), "--layout", "demo_wide", "--layout", "cramped_up"]
     assert CliRunner().invoke(cli, arguments).exit_code != 0
     assert {found.layout for found in read_draws_table(path)} == {"demo_wide"}
     for _ in range(2):
@@ -267,6 +267,7 @@ def test_a_stopped_measurement_resumes(monkeypatch, tmp_path):
 
 
 def test_layouts_without_training_tasks_are_refused(tmp_path):
-    result = CliRunner().invoke(cli, ["draws", "--layout", "asymm_right", "--out", str(tmp_path / "draws.jsonl")])
+    arguments = ["research", "draws", "--layout", "asymm_right", "--out", str(tmp_path / "draws.jsonl")]
+    result = CliRunner().invoke(cli, arguments)
     assert "unknown training layout 'asymm_right'" in str(result.exception)
     assert not list(tmp_path.iterdir())

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
-from icrl4aht_generation.cli import cli
 from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
 from icrl4aht_generation.teammates.instances import published_tasks
 
 from icrl4aht_data.benchmark import tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import TaskFormatError, UnknownNameError
 
 PUBLISHED_HASHES = """
@@ -85,15 +85,15 @@ def test_bundled_manifests_are_the_diverse_tasks(track, split):
 def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     short = tmp_path / "short.jsonl"
     tasks.write_tasks(short, published_tasks("layout")[:-1])
-    assert CliRunner().invoke(cli, ["manifests", "--check"]).exit_code == 0
-    monkeypatch.setattr("icrl4aht_generation.cli.manifest_path", lambda track, split, teammates="": short)
-    result = CliRunner().invoke(cli, ["manifests", "--check"])
+    assert CliRunner().invoke(cli, ["research", "manifests", "--check"]).exit_code == 0
+    monkeypatch.setattr("icrl4aht_generation.commands.manifest_path", lambda track, split, teammates="": short)
+    result = CliRunner().invoke(cli, ["research", "manifests", "--check"])
     assert result.exit_code == 1
     assert "differs from the parameter sets or draws" in str(result.exception)
 
 
 def test_manifests_are_replaced_on_demand(tmp_path):
-    arguments = ["manifests", "--out", str(tmp_path / "new")]
+    arguments = ["research", "manifests", "--out", str(tmp_path / "new")]
     for _ in range(2):  # the second time, equal files are there
         assert CliRunner().invoke(cli, arguments).exit_code == 0
     path = tmp_path / "new" / "layout_test.jsonl"

@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from icrl4aht_generation.cli import cli as generation_cli
+from icrl4aht_generation.commands import generate
 
 from icrl4aht_data import Curriculum, load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import write_tasks
@@ -100,7 +100,7 @@ class TestConversion:
             from_published(tmp_path / "files", tmp_path / "out", kept_steps=KEPT)
 
     def test_generation_offers_the_other_kinds_only(self):
-        (kind,) = (p for p in generation_cli.commands["generate"].params if p.name == "kind")
+        (kind,) = (p for p in generate.params if p.name == "kind")
         assert tuple(kind.type.choices) == KINDS == ("full", "lite")  # type: ignore[attr-defined]
 
 

@@ -1,4 +1,4 @@
-"""The command line `icrl4aht-data`, and its commands that train, evaluate and report."""
+"""Commands of `icrl4aht-data` that train, evaluate and report."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ import click
 from icrl4aht_generation.teammates.instances import published_task
 from rich.console import Console
 
-from icrl4aht_baselines.commands.experiment_commands import EXPERIMENT_COMMANDS
-from icrl4aht_baselines.commands.model_commands import MODEL_COMMANDS
 from icrl4aht_baselines.commands.options import (
     EGO_NAME,
     METHOD_NAME,
@@ -42,22 +40,17 @@ from icrl4aht_baselines.commands.options import (
     training_options,
 )
 from icrl4aht_baselines.training.options import HistoryOptions
-from icrl4aht_baselines.training.stopping import TrainingStopped
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
 from icrl4aht_data.commands.options import (
     LAYOUT,
     SEED,
-    SETTINGS,
     TRACK,
     Folder,
     NewFile,
-    Sections,
     examples,
     overwrite_option,
-    run,
-    version_option,
 )
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -69,35 +62,7 @@ from icrl4aht_data.utils.progress import counted, progress_bars
 _console = Console(soft_wrap=True)
 
 
-_SECTIONS = {
-    "Train and evaluate": ("demo", "train", "evaluate", "report", "watch", "collect"),
-    "Reference models": ("models", "reference", "results"),
-    "The paper's experiments": ("tracks", "sweep", "ablate", "heldout-rl"),
-    "Check": ("control", "drift", "headroom", "unseen"),
-}
-
-
-@click.group(
-    cls=Sections,
-    sections=_SECTIONS,
-    context_settings=SETTINGS,
-    epilog=examples(
-        "icrl4aht-data train ad --layout demo_wide --out runs/ad",
-        "icrl4aht-data evaluate --agent runs/ad --layout demo_wide --out runs/ad-results",
-        "icrl4aht-data report runs/ad-results",
-    ),
-)
-@version_option
-def cli() -> None:
-    """Train reference learners and evaluate agents on the ICRL4AHT benchmark.
-
-    Needs the extra baselines. The same program is installed as icrl4aht-data. Finished work is kept: the same
-    command resumes a stopped one. Exit codes: 0 done, 1 a failure or a failed check, 2 a misused command, 130 or 143
-    training stopped by SIGINT or SIGTERM, and saved.
-    """
-
-
-@cli.command(
+@click.command(
     "evaluate",
     epilog=examples(
         "icrl4aht-data evaluate --agent random --out runs/random",
@@ -194,7 +159,7 @@ def evaluate_command(
     _console.print(f"{len(chosen)} {noun} in {out}; `icrl4aht-data report {out}` shows them")
 
 
-@cli.command("report")
+@click.command("report")
 @click.argument("runs", nargs=-1, required=True, type=Folder(), metavar="RESULTS...")
 @click.option(
     "--out", type=Folder(), metavar="FOLDER", help="Write the report here.", show_default="report in the first RESULTS"
@@ -239,7 +204,7 @@ def report_command(
         click.echo(f"wrote {path}")
 
 
-@cli.command(
+@click.command(
     "watch",
     epilog=examples("icrl4aht-data watch --layout demo_wide --teammate H3/t1 --ego oracle --out episode.gif"),
 )
@@ -266,7 +231,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     _console.print(f"{ego} with {mate}: return {shown.earned:g}; wrote {out}")
 
 
-@cli.command(
+@click.command(
     "train",
     epilog=examples(
         "icrl4aht-data train ad --layout demo_wide --out runs/ad",
@@ -358,7 +323,7 @@ def train_command(
         click.echo(f"{RUN_CURVES} was not drawn, matplotlib is not installed: {install_command('plot')}")
 
 
-@cli.command("demo")
+@click.command("demo")
 @click.option("--out", type=Folder(), metavar="FOLDER", default="build/demo", help="Write everything here.")
 def demo_command(out: Path) -> None:
     """Demonstrate every step on the bundled release.
@@ -369,16 +334,3 @@ def demo_command(out: Path) -> None:
     from icrl4aht_baselines.demo import run_demo
 
     run_demo(out, _console)
-
-
-for _command in (*MODEL_COMMANDS, *EXPERIMENT_COMMANDS):
-    cli.add_command(_command)
-
-
-def main() -> None:
-    """Entry point of `icrl4aht-data` and `icrl4aht-data`."""
-    try:
-        run(cli, extra="baselines")
-    except TrainingStopped as stopped:
-        click.echo(stopped.message, err=True)
-        raise

@@ -1,4 +1,4 @@
-"""Commands of `icrl4aht-data`: they parse, call, and print."""
+"""Commands of `icrl4aht-data` that rebuild releases, train teammates and maintain tasks."""
 
 from __future__ import annotations
 
@@ -19,15 +19,11 @@ from icrl4aht_data.commands.options import (
     COUNT,
     LAYOUT,
     SEED,
-    SETTINGS,
     Folder,
     Names,
-    Sections,
     examples,
     json_option,
     overwrite_option,
-    run,
-    version_option,
 )
 from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.format.schema import KINDS, Kind
@@ -65,33 +61,8 @@ _threads_option = click.option(
     show_default="the profile's, else all cores",
 )
 
-_SECTIONS = {
-    "Rebuild": ("plan", "generate", "check"),
-    "Learned teammates": ("teammates", "diversity"),
-    "Maintain": ("speed", "draws", "manifests"),
-}
 
-
-@click.group(
-    cls=Sections,
-    sections=_SECTIONS,
-    context_settings=SETTINGS,
-    epilog=examples(
-        "icrl4aht-data plan --profile mini",
-        "icrl4aht-data generate --profile smoke --out build/smoke",
-        "icrl4aht-data teammates --profile mini --layout cramped_up",
-    ),
-)
-@version_option
-def cli() -> None:
-    """Rebuild the ICRL4AHT dataset from the environment and the teammates.
-
-    Needs the extra generation. The same program is installed as icrl4aht-data. Finished work is kept: the same
-    command resumes a stopped one. Exit codes: 0 done, 1 a failure or a difference, 2 a misused command.
-    """
-
-
-@cli.command(
+@click.command(
     epilog=examples(
         "icrl4aht-data generate --profile smoke --out build/smoke",
         "icrl4aht-data generate --profile mini --out build/mini --kind lite --kind full",
@@ -179,7 +150,7 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
     return replace(profile, xla_threads=threads) if threads else profile
 
 
-@cli.command()
+@click.command()
 @_profile_option
 @click.option("--devices", type=COUNT, default=8, help="Also estimate the hours on this many devices.")
 @json_option
@@ -201,7 +172,7 @@ def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) ->
             click.echo(f"{name:<28} {value}")
 
 
-@cli.command(epilog=examples("icrl4aht-data check build/smoke build/again"))
+@click.command(epilog=examples("icrl4aht-data check build/smoke build/again"))
 @click.argument("a", type=Folder())
 @click.argument("b", type=Folder())
 @json_option
@@ -227,7 +198,7 @@ def check(a: Path, b: Path, as_json: bool) -> None:
     sys.exit(1 if compared.differences else 0)
 
 
-@cli.command()
+@click.command()
 @_profile_option
 @click.option("--layout", type=LAYOUT, default="demo_wide", help="Layout to measure on.")
 @_ego_options
@@ -245,7 +216,7 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
     click.echo(json.dumps({"profile": profile_name, "layout": name, **measured}))
 
 
-@cli.command()
+@click.command()
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 if the files differ.")
 @click.option(
     "--out", type=Folder(), metavar="FOLDER", help="Write the manifests here.", show_default="the package's folder"
@@ -280,7 +251,7 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
         console.print(f"{path}: {len(tasks)} tasks")
 
 
-@cli.command(epilog=examples("icrl4aht-data research draws --layout demo_wide --out draws.jsonl"))
+@click.command(epilog=examples("icrl4aht-data research draws --layout demo_wide --out draws.jsonl"))
 @click.option(
     "--layout", "layouts", type=LAYOUT, multiple=True, help="Training layout; repeat for more.", show_default="all"
 )
@@ -329,7 +300,7 @@ _algorithms_option = click.option(
 )
 
 
-@cli.command(epilog=examples("icrl4aht-data teammates --profile mini --layout cramped_up --algorithm fcp"))
+@click.command(epilog=examples("icrl4aht-data teammates --profile mini --layout cramped_up --algorithm fcp"))
 @_profile_option
 @_layouts_option("the profile's")
 @_algorithms_option
@@ -364,7 +335,7 @@ def teammates(
     build_suite(profile, suite, wanted, seed, console)
 
 
-@cli.command()
+@click.command()
 @_layouts_option("all that are finished")
 @_algorithms_option
 @click.option(
@@ -388,8 +359,3 @@ def diversity(
     from icrl4aht_generation.populations.build import report_diversity
 
     report_diversity(suite, layouts, algorithms, greedy, console, out, overwrite)
-
-
-def main() -> None:
-    """Entry point of `icrl4aht-data` and `icrl4aht-data`."""
-    run(cli, extra="generation")

@@ -1,3 +1,0 @@
-from icrl4aht_baselines.commands.cli import main
-
-main()

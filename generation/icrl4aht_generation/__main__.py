@@ -1,3 +1,0 @@
-from icrl4aht_generation.cli import main
-
-main()

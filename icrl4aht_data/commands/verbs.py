@@ -1,0 +1,51 @@
+"""The commands of `icrl4aht-data` as a table, from which `--help` lists them without importing any.
+
+Another package adds commands by an entry point that names such a table, in a module that imports little:
+
+    [project.entry-points."icrl4aht_data.commands"]
+    my_package = "my_package.verbs:VERBS"
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+VERB_GROUP = "icrl4aht_data.commands"
+"""Group of entry points by which packages add commands."""
+
+
+class Verb(NamedTuple):
+    """One command of the program.
+
+    Attributes:
+        name: words that run it, such as "list" or "release build".
+        target: the click command, as "module:attribute"; empty for a group, whose commands have its name as first word.
+        section: heading in the list of commands.
+        help: one sentence.
+    """
+
+    name: str
+    target: str
+    section: str
+    help: str
+
+
+SECTIONS = ("Look", "Fetch and convert", "Train and evaluate", "Generate", "Publish", "Research")
+"""Headings in the order of the program's help; those of other packages follow."""
+
+_CLI = "icrl4aht_data.commands.release_commands"
+
+VERBS = (
+    Verb("list", f"{_CLI}:list_", "Look", "List the tasks of a release."),
+    Verb("show", f"{_CLI}:show", "Look", "Show a release, a part of it or one history."),
+    Verb("browse", "icrl4aht_data.commands.browse:browse", "Look", "Write an HTML page on which to look at histories."),
+    Verb("verify", f"{_CLI}:verify", "Look", "Verify a release: every byte, count and range."),
+    Verb("doctor", f"{_CLI}:doctor", "Look", "Examine this installation, and report problems."),
+    Verb("download", f"{_CLI}:download", "Fetch and convert", "Download a release, or a part of it."),
+    Verb("convert", f"{_CLI}:convert", "Fetch and convert", "Convert a release, published files, or a Minari dataset."),
+    Verb("combine", f"{_CLI}:combine", "Fetch and convert", "Combine releases into one."),
+    Verb("release", "", "Publish", "Prepare a release for publication."),
+    Verb("release build", f"{_CLI}:build", "Publish", "Build a release for publication."),
+    Verb("upload", f"{_CLI}:upload", "Publish", "Upload a release to the Hugging Face Hub, and tag it."),
+    Verb("research", "", "Research", "Make what the package comes with, and the paper's experiments."),
+)
