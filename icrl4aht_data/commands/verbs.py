@@ -42,7 +42,7 @@ VERBS = (
     Verb("verify", f"{_CLI}:verify", "Look", "Verify a release: every byte, count and range."),
     Verb("doctor", f"{_CLI}:doctor", "Look", "Examine this installation, and report problems."),
     Verb("download", f"{_CLI}:download", "Fetch and convert", "Download a release, or a part of it."),
-    Verb("convert", f"{_CLI}:convert", "Fetch and convert", "Convert a release, published files, or a Minari dataset."),
+    Verb("convert", f"{_CLI}:convert", "Fetch and convert", "Convert a release or published files."),
     Verb("combine", f"{_CLI}:combine", "Fetch and convert", "Combine releases into one."),
     Verb("release", "", "Publish", "Prepare a release for publication."),
     Verb("release build", f"{_CLI}:build", "Publish", "Build a release for publication."),
