@@ -69,7 +69,8 @@ def make_environment(**options: Any) -> gymnasium.Env:
     """Return the Gymnasium environment of a task.
 
     Args:
-        options: options of `gymnasium.make` and of `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`, among them `task`.
+        options: options of `gymnasium.make` and of `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`, among them
+            `task`.
 
     Raises:
         OptionError: if Gymnasium or JAX is not installed.

@@ -7,6 +7,14 @@ A sampler is a sequence of batches, each a pure function of its number, so most 
     PyTorch        torch_loader(sampler, workers=4); needs the extra `torch`
     Hugging Face   hf_index(dataset), hf_episodes(dataset), hf_windows(sampler); need the extra `hf`
 
+`len(sampler)` batches make one pass: together they have as many steps as the selection. A sequence gives the same
+batches each time it is read, so for training over several passes take loaders that continue: `sampler.batches()` never
+ends, each pass over a `torch_loader` continues where the one before ended, and so does Grain with
+`grain.MapDataset.range(passes * len(sampler)).map(sampler.batch)`, whose `repeat` would give the same batches again.
+
+PyTorch's own `DataLoader(sampler, batch_size=None)` gives integers as int32, which its losses refuse as targets;
+`torch_loader` gives int64.
+
 Rows of episodes have state records, also those that `datasets.load_dataset(release, "episodes", streaming=True)` gives
 for a published release; `render_observations(rows)` makes observations of them.
 """
@@ -78,11 +86,15 @@ def torch_loader(
     context: str = "spawn",
     **options: Any,
 ) -> DataLoader[Any]:
-    """Return a DataLoader over batches start..stop as named tuples of tensors, in order for any number of workers.
+    """Return a DataLoader over a sampler's batches as named tuples of tensors, in order for any number of workers.
 
     The tensors are what PyTorch's losses and embeddings take: integers are int64 (observations keep their dtype), and
     `target_actions` are -100 on padding, which `F.cross_entropy` ignores. So `F.cross_entropy(logits, targets)` is
     right as it is for logits (B, 6, L), or (B, 6) for `query_target`. Fields that a batch does not have are None.
+
+    Each pass over the loader, `for batch in loader`, continues where the pass before ended, or would have ended if that
+    was left early. `len(loader)` is the number of batches of the next pass. Passes end at multiples of `len(sampler)`;
+    with `stop`, the first one has the batches start..stop - 1 and each further one as many.
 
     With workers, load the dataset with cache="mmap" or "stream": with "ram" each spawned worker decodes its own copy.
     Batches are random already, so DataLoader must not shuffle. To resume, pass the number of the next batch as `start`.
@@ -90,30 +102,65 @@ def torch_loader(
     Args:
         sampler: makes the batches.
         start: number of the first batch.
-        stop: number after the last batch; `len(sampler)` by default.
-        workers: number of processes, which are kept between epochs; 0 makes batches in this process.
+        stop: number after the last batch of the first pass; the next multiple of `len(sampler)` by default.
+        workers: number of processes, which are kept between passes; 0 makes batches in this process.
         context: "spawn", "forkserver" or "fork". Fork only while the process runs no threads, including JAX's.
         options: further options of DataLoader, such as prefetch_factor or pin_memory.
 
     Raises:
-        OptionError: if PyTorch is not installed, or for numbers that are not integers from 0.
+        OptionError: if PyTorch is not installed, for anything but a sampler, or for impossible numbers.
     """
     try:
         from torch.utils.data import DataLoader
     except ImportError as error:
         raise OptionError(f"a DataLoader needs PyTorch: {install_command('torch')}") from error
-    numbers = range(check_int("start", start, 0), len(sampler) if stop is None else check_int("stop", stop, 0))
+    numbers, per_pass = _numbers(sampler, start, stop), len(sampler)
+    if stop is None:
+        numbers = range(numbers.start, (numbers.start // per_pass + 1) * per_pass)
     if workers and sampler.dataset.cache.cache != "stream":
         _ = sampler.dataset.storage  # decoded here once: mapped by the workers, or inherited by forked ones
     processes = {"multiprocessing_context": context, "persistent_workers": True} if workers else {}
     return DataLoader(
         _TorchBatches(sampler),  # type: ignore[arg-type]
         batch_size=None,
-        sampler=numbers,
+        sampler=_Passes(numbers, per_pass if stop is None else len(numbers)),
         num_workers=check_int("workers", workers, 0),
         **processes,  # type: ignore[arg-type]
         **options,
     )
+
+
+def _numbers(sampler: Sampler, start: int, stop: int | None) -> range:
+    """Return the numbers of the batches start..stop, by default those up to `len(sampler)`.
+
+    Raises:
+        OptionError: for anything but a sampler, or for impossible numbers.
+    """
+    if not isinstance(sampler, Sampler):
+        raise OptionError(f"sampler = {sampler!r}: expected a sampler, such as ds.ad(batch_size=16, length=100)")
+    start = check_int("start", start, 0)
+    return range(start, len(sampler) if stop is None else check_int("stop", stop, start))
+
+
+class _Passes:
+    """Numbers of batches for a DataLoader, which iterates over them once for each pass; each pass continues the last.
+
+    Args:
+        numbers: batches of the first pass.
+        size: batches of each further pass.
+    """
+
+    def __init__(self, numbers: range, size: int) -> None:
+        self._numbers, self._size = numbers, size
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __iter__(self) -> Iterator[int]:
+        # A generator: DataLoader makes two iterators for its first pass with workers, and takes numbers from one.
+        numbers = self._numbers
+        self._numbers = range(numbers.stop, numbers.stop + self._size)
+        yield from numbers
 
 
 class _TorchBatches:
@@ -130,7 +177,7 @@ class _TorchBatches:
 
 
 def _for_losses(batch: Any) -> Any:
-    """A batch with int64 for int32, and targets that losses ignore on padding."""
+    """Return a batch with int64 for int32, and targets that losses ignore on padding."""
     present = {name: array for name, array in batch._asdict().items() if array is not None}
     arrays = {name: array.astype(np.int64) if array.dtype == np.int32 else array for name, array in present.items()}
     if isinstance(batch, ADBatch):
@@ -139,7 +186,7 @@ def _for_losses(batch: Any) -> Any:
 
 
 def hf_index(dataset: Selection) -> datasets.Dataset:
-    """The selection's index entries as a `datasets.Dataset`, one row for each history, with the columns of `Entry`.
+    """Return the selection's index entries as a `datasets.Dataset`: one row a history, with the columns of `Entry`.
 
     Raises:
         OptionError: if `datasets` is not installed.
@@ -150,7 +197,7 @@ def hf_index(dataset: Selection) -> datasets.Dataset:
 
 
 def hf_episodes(dataset: Selection) -> datasets.Dataset:
-    """The selection's episodes as a `datasets.Dataset`, one row for each episode, in order.
+    """Return the selection's episodes as a `datasets.Dataset`, one row for each episode, in order.
 
     The rows are those of the configuration `episodes` of a published release, with records as wide as the longest one
     of the selection's layouts. For the columns and their types see `arrow_tables.EPISODE_COLUMNS`: ids, names and
@@ -196,7 +243,8 @@ def render_observations(
 
     Raises:
         UnknownNameError: for channels, a dtype or a layout that does not exist.
-        OptionError: for no rows, rows of layouts with unequal channels, or records that are too short for the layout.
+        OptionError: for no rows, rows of layouts with unequal channels, records that are too short for the layout, or
+            anything but rows.
         NotStoredError: for rows without state records, as those of a release of observations are.
     """
     if channels not in CHANNELS:
@@ -226,6 +274,10 @@ def render_observations(
 def _column(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]], name: str) -> Any:
     try:
         return rows[name] if isinstance(rows, Mapping) else [row[name] for row in rows]
+    except TypeError as error:
+        raise OptionError(
+            f"rows = {str(rows)[:80]!r}: expected rows of episodes, such as hf_episodes(ds)[:8]"
+        ) from error
     except KeyError as error:
         raise NotStoredError(
             f"rows without a column {name!r}: expected rows of the configuration `episodes`, or of hf_episodes, of a "
@@ -234,13 +286,13 @@ def _column(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]], name: str) ->
 
 
 def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> datasets.IterableDataset:
-    """The rows of batches start..stop as a `datasets.IterableDataset`, with the columns of the batch.
+    """Return the rows of batches start..stop as a `datasets.IterableDataset`, with the columns of the batch.
 
     Integers are int64, and `target_actions` are -100 on padding, as in `torch_loader`. Rows hold NumPy arrays of the
     batch's dtypes. The result declares no `features`: with them, `datasets` makes lists of one-dimensional arrays, and
     its format "numpy" makes int64 of uint8.
 
-    The `state_dict` of the result resumes after the last row taken.
+    The `state_dict` of the result resumes after the last row taken. A second pass has the same rows.
 
     Args:
         sampler: makes the batches.
@@ -248,9 +300,9 @@ def hf_windows(sampler: Sampler, start: int = 0, stop: int | None = None) -> dat
         stop: number after the last batch; `len(sampler)` by default.
 
     Raises:
-        OptionError: if `datasets` is not installed, or for numbers that are not integers from 0.
+        OptionError: if `datasets` is not installed, for anything but a sampler, or for impossible numbers.
     """
-    numbers = list(range(check_int("start", start, 0), len(sampler) if stop is None else check_int("stop", stop, 0)))
+    numbers = list(_numbers(sampler, start, stop))
     library = _datasets()
     return library.IterableDataset.from_generator(_windows, gen_kwargs={"sampler": sampler, "numbers": numbers})
 

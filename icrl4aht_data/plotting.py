@@ -222,7 +222,7 @@ def animate_episode(
         records: state records uint8 (T, S) in order.
         rewards: real (T,), the reward of the step from each record.
         title: what the animation shows, in words.
-        cell: side of a map cell in pixels, at least 16.
+        cell: side of a map cell in pixels, 16 to 128.
         fps: frames per second, 1 to 50.
 
     Raises:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import SOURCES, SPLITS, TRACKS, all_families
-from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError, unknown
+from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, OptionError, UnknownNameError, unknown
 from icrl4aht_data.format.columns import QUERY_FIELDS, Columns, read_columns
 from icrl4aht_data.format.info import ReleaseInfo, read_info
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, Entry
@@ -74,6 +74,7 @@ class Index:
         Raises:
             UnknownNameError: for a field or a value that the benchmark does not know; lists the valid ones.
             EmptySelectionError: for valid values that no history of this release has; says what exists.
+            OptionError: for a mapping.
         """
         filters = {name: value for name, value in wanted.items() if value is not None}
         combinations = self.entries.combinations
@@ -82,6 +83,8 @@ class Index:
             name = ALIASES.get(given, given)
             if name not in QUERY_FIELDS:
                 raise unknown("filter", given, (*QUERY_FIELDS, *ALIASES))
+            if isinstance(value, Mapping):
+                raise OptionError(f"{given} = {value!r}: expected a name or a sequence of names")
             names = [value] if isinstance(value, str) or not isinstance(value, Iterable) else value
             codes = [self._code(name, one, given) for one in names]
             matching &= np.isin(combinations[:, QUERY_FIELDS.index(name)], codes)

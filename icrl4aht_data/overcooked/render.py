@@ -22,11 +22,14 @@ from icrl4aht_data.overcooked.state import faults, record_size
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import MARK
+from icrl4aht_data.utils.options import check_int
 
 if TYPE_CHECKING:
     from PIL import Image
 
-_ENLARGE, _SMALLEST_CELL, _GIF_COLOURS = 4, 16, 127  # and one transparent colour for pixels that do not change
+_ENLARGE = 4
+_CELL_SIZES = 16, 128  # pixels: below, details vanish; above, the frames of an episode take more than 400 MB
+_GIF_COLOURS = 127  # and one transparent colour for pixels that do not change
 
 
 def draw_frame(
@@ -37,7 +40,7 @@ def draw_frame(
     Args:
         layout: the layout.
         record: state record uint8 (S,).
-        cell: side of a map cell in pixels, at least 16.
+        cell: side of a map cell in pixels, 16 to 128.
         caption: text for the footer; a long one gets a smaller font.
         view: whether to outline the cells that the ego observes.
 
@@ -45,8 +48,8 @@ def draw_frame(
         uint8 (height, width, 3), RGB: `cell` pixels per row and column of the map, and a footer of 0.8 cells below.
 
     Raises:
-        OptionError: if Pillow is missing, the record has another shape or dtype or impossible values, or `cell` is too
-            small.
+        OptionError: if Pillow is missing, the record has another shape or dtype or impossible values, or `cell` is not
+            within 16..128.
     """
     return np.array(_picture(layout, _checked(layout, record, 1, cell), cell, caption, view))
 
@@ -87,7 +90,7 @@ def encode_episode(
         layout: the layout.
         records: state records uint8 (T, S) in order.
         rewards: real (T,), the reward of the step from each record; the captions then show the return so far.
-        cell: side of a map cell in pixels, at least 16.
+        cell: side of a map cell in pixels, 16 to 128.
         fps: frames per second, 1 to 50.
 
     Raises:
@@ -96,7 +99,7 @@ def encode_episode(
     records = _checked(layout, records, 2, cell)
     rewards = np.full(len(records), np.nan) if rewards is None else np.asarray(rewards)
     _require(rewards.shape == (len(records),), f"rewards ({len(records)},), one a record", rewards.shape)
-    _require(1 <= fps <= 50, "fps from 1 to 50", fps)
+    _require(isinstance(fps, (int, float)) and 1 <= fps <= 50, "fps from 1 to 50", repr(fps))
     frames, earned = [], 0.0
     for step, (record, reward) in enumerate(zip(records, rewards.tolist(), strict=True)):
         caption = f"step {step}" if math.isnan(reward) else f"step {step}   return {earned:g}"
@@ -131,7 +134,8 @@ def _checked(layout: Layout, records: np.ndarray, dimensions: int, cell: int) ->
     _require(fits, f"{expected} for layout {layout.name}", f"{records.dtype} {records.shape}")
     wrong = faults(layout, records)
     _require(not wrong, f"possible states of layout {layout.name}", "; ".join(wrong))
-    _require(cell >= _SMALLEST_CELL, f"cell of at least {_SMALLEST_CELL} pixels", cell)
+    least, most = _CELL_SIZES
+    _require(check_int("cell", cell, 0) in range(least, most + 1), f"cell from {least} to {most} pixels", cell)
     return records
 
 

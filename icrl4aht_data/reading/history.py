@@ -251,7 +251,7 @@ class History:
 
         Args:
             episode: number of the episode, from 0, or from the end if negative; the last one by default.
-            cell: side of a map cell in pixels, at least 16.
+            cell: side of a map cell in pixels, 16 to 128.
             fps: frames per second, 1 to 50.
 
         Raises:

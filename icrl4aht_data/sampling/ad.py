@@ -61,12 +61,8 @@ class ADBatch(NamedTuple, Generic[A]):
     is_first: A = cast(Any, None)  # needs a default after others; samplers always set it
     families: A | None = None
 
-    def describe(self) -> str:
-        """Return the fields with dtypes and shapes as text, one per line."""
-        return describe_batch(self)
-
-    def __repr__(self) -> str:
-        return batch_repr(self)
+    describe = describe_batch
+    __repr__ = batch_repr
 
 
 class _Windows(NamedTuple):
@@ -75,16 +71,16 @@ class _Windows(NamedTuple):
     Attributes:
         position: int64 (B,), positions in the selection.
         starts: int64 (B,), first steps.
-        valid: int64 (B,), how many steps are valid.
         rows: the steps of each window, as in `ReadRequest`: `starts`, or all of them, int64 (B, L).
-        previous: the steps before them, in the same way.
+        previous: the steps before them, in the same way; -1 before a history's first step.
+        valid: int64 (B,), number of steps of each window; padding follows them.
     """
 
     position: np.ndarray
     starts: np.ndarray
-    valid: np.ndarray
     rows: np.ndarray
     previous: np.ndarray
+    valid: np.ndarray
 
 
 class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
@@ -139,14 +135,14 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
     ) -> None:
         super().__init__(dataset, batch_size=batch_size, length=length, **options)
         self.every = check_int("every", every, 1)
-        if every > 1:
-            self.drawn_bytes = 32  # four numbers of each step
-        self.families = families
-        self.labels = None if labels is None else check_labels(dataset, labels)
+        self.drawn_bytes = 32 if every > 1 else 0  # four numbers of each step
+        self.families, self.labels = families, labels
         if labels is not None:
+            check_labels(dataset, labels)
             warn_of_weak_labels(dataset, labels)
 
     def options(self) -> dict[str, Any]:
+        # An option with its default is left out, so that positions stored before it existed can be resumed.
         chosen = {"every": self.every > 1, "labels": self.labels is not None, "families": self.families}
         return super().options() | {name: getattr(self, name) for name, differs in chosen.items() if differs}
 
@@ -168,14 +164,9 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
 
     @cached_property
     def _family_numbers(self) -> np.ndarray:
-        """int32 (H,): the value of `families` for each history of the selection."""
+        """The value of `families` for each history of the selection, int32 (H,)."""
         families = all_families()
         return np.array([families.index(str(name)) for name in self.dataset.column("teammate_family")], np.int32)
-
-    @property
-    def _targets(self) -> str:
-        """Field of the targets."""
-        return "actions" if self.labels is None else f"{self.labels}_actions"
 
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the windows of batch i: history ids and first steps, int64 (B,) each.
@@ -190,43 +181,40 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
     def _draw(self, i: int) -> _Windows:
         for_history, for_start, for_episode = self._random(i, 3)
         low, high = self._draws.steps(i)
-        weights = self._draws.history_weights(low, high)
-        if weights is None:
-            position = scale_to_range(for_history, len(self.dataset))
-        else:
-            position = weighted_choice(for_history, weights)
-        low, high = low[position], high[position]
+        position = weighted_choice(for_history, self._draws.history_weights(low, high), 0, len(low))
+        low, high, steps = low[position], high[position], self._draws.kept_steps
+        # A window is drawn from every n-th episode of a history's range, which are `total` steps, and without `every`
+        # from all of its steps. An episode that the history did not finish is no n-th one: it would be a gap.
+        first, total = np.zeros_like(low), high - low
         if self.every > 1:
-            return self._draw_thinned(position, low, high, for_start, for_episode)
-        starts = low + scale_to_range(for_start, np.maximum(high - low - self.length, 0) + 1)
-        return _Windows(position, starts, np.minimum(high - starts, self.length), starts, starts - 1)
-
-    def _draw_thinned(
-        self, position: np.ndarray, low: np.ndarray, high: np.ndarray, for_start: np.ndarray, for_episode: np.ndarray
-    ) -> _Windows:
-        """Windows of every n-th episode between two steps of each history; unfinished episodes are left out."""
-        steps = self._draws.kept_steps
-        episodes = (high - low) // steps
-        first = scale_to_range(for_episode, np.minimum(episodes, self.every))
-        total = -(-(episodes - first) // self.every) * steps  # of the episodes that remain
+            episodes = total // steps
+            first = scale_to_range(for_episode, np.minimum(episodes, self.every))
+            total = -(-(episodes - first) // self.every) * steps
         start = scale_to_range(for_start, np.maximum(total - self.length, 0) + 1)
-        step = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
-        rows = low[:, None] + (first[:, None] + self.every * (step // steps)) * steps + step % steps
-        rows[start == 0, 0] = (low + first * steps - 1)[start == 0]  # nothing of the window precedes its first step
-        return _Windows(position, rows[:, 1], np.minimum(total - start, self.length), rows[:, 1:], rows[:, :-1])
+        valid = np.minimum(total - start, self.length)
+        if self.every == 1:
+            # One number for each window: sources copy it as a block, ten times faster than L single rows.
+            return _Windows(position, low + start, low + start, low + start - 1, valid)
+        # Step t of these episodes is step t % steps of the episode number first + n * (t // steps) in the range. The
+        # row of step -1 comes first, for `prev_*`; padding repeats the last step, so that all rows exist.
+        t = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
+        rows = low[:, None] + (first[:, None] + self.every * (t // steps)) * steps + t % steps
+        # Nothing in the window's episodes precedes their first step: there `prev_*` are of the history's step before.
+        rows[start == 0, 0] = (low + first * steps - 1)[start == 0]
+        return _Windows(position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid)
 
     def batch(self, i: int, out: ADBatch[np.ndarray] | None = None) -> ADBatch[np.ndarray]:
         batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
-        position, starts, valid, rows, previous = self._draw(i)
+        position, starts, rows, previous, valid = self._draw(i)
         if self.every > 1:
-            previous = np.maximum(previous, 0)
+            previous = np.maximum(previous, 0)  # sources read a window from row -1 on, but no single row -1
 
         records = self._observer.records(batch.obs)
+        targets = "actions" if self.labels is None else f"{self.labels}_actions"
         reads = [
             ReadRequest(self._observer.field, position, rows, records),
-            ReadRequest(self._targets, position, rows, batch.target_actions),
+            ReadRequest(targets, position, rows, batch.target_actions),
             ReadRequest("dones", position, rows, batch.dones),
-            # Before a history's first step a source reads zeros; of single rows it reads none, see below.
             ReadRequest("actions", position, previous, batch.prev_actions),
             ReadRequest("rewards", position, previous, batch.prev_rewards),
         ]
@@ -239,11 +227,11 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
             batch.layouts[...] = self.dataset.layout_numbers[position]
         if batch.families is not None:
             batch.families[...] = self._family_numbers[position]
+        at_start = starts == 0
         batch.is_first[...] = False
-        batch.is_first[:, 0] = starts == 0
-        if self.every > 1:
-            for read in reads[3:]:
-                read.out[starts == 0, 0] = 0
+        batch.is_first[:, 0] = at_start
+        for read in reads[3:]:  # the `prev_*` fields
+            read.out[at_start, 0] = 0
         batch.attention_mask[...] = True
         if valid.min() < self.length:
             np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)

@@ -146,26 +146,12 @@ class Sampler(Generic[B, D]):
 
     @overload
     def batches(
-        self,
-        start: int = 0,
-        stop: int | None = None,
-        *,
-        prefetch: int = 2,
-        device: Any,
-        reuse: bool = False,
+        self, start: int = 0, stop: int | None = None, *, prefetch: int = 2, device: Any, reuse: bool = False
     ) -> Batches[D]: ...
 
-    def batches(
-        self,
-        start: int = 0,
-        stop: int | None = None,
-        *,
-        prefetch: int = 2,
-        device: Any = None,
-        reuse: bool = False,
-    ) -> Batches[Any]:
+    def batches(self, start: int = 0, stop: int | None = None, **options: Any) -> Batches[Any]:
         """Return an iterator over batches start, start + 1, .. that prefetches on a thread; see `Batches`."""
-        return Batches(self, start, stop, prefetch=prefetch, device=device, reuse=reuse)
+        return Batches(self, start, stop, **options)
 
     def options(self) -> dict[str, Any]:
         """Return all options that determine the batches, as JSON; `Batches` compares them when it resumes."""
@@ -183,7 +169,8 @@ class Sampler(Generic[B, D]):
         }
 
     def _random(self, i: int, count: int) -> np.ndarray:
-        """uint64 (count, local_size): this process's share of batch i's random integers below 2**32."""
+        """Return this process's share of batch i's random integers below 2**32, uint64 (count, local_size)."""
+        # Every process draws for all rows, so that a batch does not depend on how many processes share it.
         first = self.process_index * self.local_size
         return random_uint32(self.seed, i, count, self.batch_size)[:, first : first + self.local_size]
 
@@ -204,7 +191,7 @@ class Sampler(Generic[B, D]):
             raise self._too_large()
 
     def _too_large(self) -> OptionError:
-        """The error for batches that do not fit into memory; names the sizes, and the options that change them."""
+        """Return the error for batches that do not fit into memory: the sizes, and the options that change them."""
         free, rows = free_memory(), self.local_size
         name, spec = max(self.specs.items(), key=lambda item: array_bytes(item[1].shape, item[1].dtype))
         most = free * rows // self._bytes // 2 * self.process_count  # half of it: the next batch is made meanwhile
@@ -217,14 +204,16 @@ class Sampler(Generic[B, D]):
         )
 
     def _layout_specs(self) -> dict[str, ArraySpec]:
-        """The spec of `layouts`, which batches of state records of several layouts have."""
+        """Return the spec of `layouts`, which batches of state records of several layouts have."""
         several = self.dataset.obs == "state" and len(self.layouts) > 1
         return {"layouts": ArraySpec("int32", (self.local_size,))} if several else {}
 
     def _buffer(self, out: B | None) -> B:
-        """`out` if it has the declared arrays, or a new batch for None; see `empty`."""
+        """Return `out` if it has the declared arrays, or a new batch for None; see `empty`."""
         if out is None:
             return self.empty()
+        if not isinstance(out, self.batch_type):
+            raise OptionError(f"out = {out!r}: expected a batch from sampler.empty()")
         arrays = {name: array for name, array in out._asdict().items() if array is not None}  # type: ignore[attr-defined]
         for array in arrays.values():
             if not (isinstance(array, np.ndarray) and array.flags.c_contiguous and array.flags.writeable):
@@ -250,9 +239,9 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
         )
 
 
-def describe_batch(batch: Any) -> str:
-    """Fields, dtypes and shapes of a batch's arrays, of NumPy, JAX or PyTorch, one per line."""
-    present = {name: array for name, array in batch._asdict().items() if array is not None}
+def describe_batch(self: Any) -> str:
+    """Return the fields with dtypes and shapes as text, one per line."""
+    present = {name: array for name, array in self._asdict().items() if array is not None}
     width = max(map(len, present), default=0)
     return "\n".join(f"{name:<{width}}  {_describe_array(array)}" for name, array in present.items())
 
@@ -263,6 +252,6 @@ def _describe_array(array: Any) -> str:
     return f"{str(array.dtype).removeprefix('torch.'):<8} {tuple(array.shape)}"
 
 
-def batch_repr(batch: Any) -> str:
-    """A batch's type, and its fields with dtypes and shapes in place of the arrays' numbers."""
-    return f"{type(batch).__name__}(\n{indent(describe_batch(batch), '    ')}\n)"
+def batch_repr(self: Any) -> str:
+    """Return a batch's type, and its fields with dtypes and shapes instead of the arrays' numbers."""
+    return f"{type(self).__name__}(\n{indent(describe_batch(self), '    ')}\n)"

@@ -36,6 +36,9 @@ class BatchSource(Protocol[B]):
 class Batches(Iterator[B], Generic[B]):
     """An iterator over `sampler[start]`, `sampler[start + 1]`, .., prefetched by a thread.
 
+    A loop that is left by `break` and started again continues with the next batch; after batch `stop - 1` there are no
+    more. `len(sampler)` batches have as many steps as the selection, which makes one pass over the data on average.
+
     An exception of the thread is raised by `next`. The thread stops at the end of a `with` block, after `close()` and
     at the end of the iterator. A forked process does not have it: make another iterator of the sampler there.
 
@@ -197,12 +200,14 @@ def _make(sampler: BatchSource[B], i: int, buffer: B | None, put: Callable[[B], 
 
 
 def _device_put(device: Any) -> Callable[[Any], Any]:
-    """A function that copies a batch to a device."""
+    """Return a function that copies a batch to a device."""
     try:
         import jax
         import jax.numpy as jnp
     except ImportError as error:
         raise OptionError(f"a device needs JAX: {install_command('jax')}") from error
+    if not isinstance(device, (jax.Device, jax.sharding.Sharding)):
+        raise OptionError(f"device = {device!r}: expected a device or a sharding of JAX, such as jax.devices()[0]")
 
     def one(x: Any) -> Any:
         if getattr(device, "is_fully_addressable", True):

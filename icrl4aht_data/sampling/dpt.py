@@ -58,12 +58,24 @@ class DPTBatch(NamedTuple, Generic[A]):
     context_teammate_actions: A | None = None
     layouts: A | None = None
 
-    def describe(self) -> str:
-        """Return the fields with dtypes and shapes as text, one per line."""
-        return describe_batch(self)
+    describe = describe_batch
+    __repr__ = batch_repr
 
-    def __repr__(self) -> str:
-        return batch_repr(self)
+
+class _Contexts(NamedTuple):
+    """Queries and contexts of a batch.
+
+    Attributes:
+        query: int64 (B,), histories of the queries as positions in the selection.
+        query_steps: int64 (B, Q), their steps.
+        context: int64 (B,), histories of the contexts as positions in the selection.
+        steps: int64 (B, K), the steps of the contexts' transitions.
+    """
+
+    query: np.ndarray
+    query_steps: np.ndarray
+    context: np.ndarray
+    steps: np.ndarray
 
 
 class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
@@ -153,16 +165,17 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         observer, kept_steps = self._observer, self._draws.kept_steps
         query_records = observer.records(batch.query_obs)
         records, next_records = observer.records(batch.context_obs), observer.records(batch.context_next_obs)
-        # Steps one after the other are read as a window; the row after a history's end, which reads as zeros, is
-        # replaced below. Other steps are read one by one, and what follows the history's last step is replaced, too.
         if self.order == "contiguous" and self.dataset.has_states:
+            # One number for each window, which sources copy as a block. The row after a history's end reads as zeros.
             rows, next_rows = steps[:, 0], steps[:, 0] + 1
         else:
+            # Single rows must exist: where a history ends, its last row is read twice and replaced below.
             rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
-        asked, record = query_steps.shape, records.shape[2:]
+        # The axis Q is there while reading, also with one query, whose arrays have none.
+        queries, record = query_steps.shape, records.shape[2:]
         reads = [
-            ReadRequest(f"{self.labels}_actions", query, query_steps, batch.query_target.reshape(asked)),
-            ReadRequest(observer.field, query, query_steps, query_records.reshape(*asked, *record)),
+            ReadRequest(f"{self.labels}_actions", query, query_steps, batch.query_target.reshape(queries)),
+            ReadRequest(observer.field, query, query_steps, query_records.reshape(*queries, *record)),
             ReadRequest("actions", context, rows, batch.context_actions),
             ReadRequest("rewards", context, rows, batch.context_rewards),
             ReadRequest(observer.field, context, rows, records),
@@ -173,7 +186,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         # An episode's last step is followed by the episode's end, never by the next episode's first step.
         episodes = steps // kept_steps
         ends = np.nonzero((steps == episodes * kept_steps + kept_steps - 1) & self.dataset.has_states)
-        end_records = np.empty((len(ends[0]), 1, *next_records.shape[2:]), next_records.dtype)
+        end_records = np.empty((len(ends[0]), 1, *record), next_records.dtype)
         reads.append(ReadRequest("episode_end_state", context[ends[0]], episodes[ends], end_records))
         self.dataset.storage.read(reads)
         next_records[ends] = end_records[:, 0]
@@ -185,34 +198,28 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
             batch.layouts[...] = self.dataset.layout_numbers[query]  # a task, and so a row, has one layout
         return batch
 
-    def _draw(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Histories (B,) and steps (B, Q) of queries, histories (B,) and steps (B, K) of contexts, all int64.
+    def _draw(self, i: int) -> _Contexts:
+        drawn = self.length if self.order == "random" else 1
+        random = self._random(i, 3 + self.queries + drawn)
+        for_task, for_query, for_context = random[:3]
+        # The first query's number precedes those of the context, so that it is the same with any number of queries.
+        for_query_steps = np.concatenate([random[3:4], random[4 + drawn :]]).T
+        for_steps = random[4 : 4 + drawn].T
 
-        Histories are positions in the selection.
-        """
-        drawn_of_context = self.length if self.order == "random" else 1
-        random = self._random(i, 3 + self.queries + drawn_of_context)
-        asked = np.concatenate([random[3:4], random[4 + drawn_of_context :]]).T
         low, high = self._draws.steps(i)
         members, begins, ends = self._tasks
-        task = scale_to_range(random[0], len(begins))
+        task = scale_to_range(for_task, len(begins))
         weights = self._draws.history_weights(low, high)
-        if weights is None:
-            size = ends[task] - begins[task]
-            query, context = (members[begins[task] + scale_to_range(number, size)] for number in random[1:3])
-        else:
-            weights = weights[members]
-            query, context = (
-                members[weighted_choice(number, weights, begins[task], ends[task])] for number in random[1:3]
-            )
-        query_steps = low[query][:, None] + scale_to_range(asked, (high - low)[query][:, None])
-        low, high = self._transitions(low)[context], self._transitions(high)[context]
-        if self.order == "random":
-            drawn = low[:, None] + scale_to_range(random[4 : 4 + drawn_of_context].T, (high - low)[:, None])
-        else:
-            first = low + scale_to_range(random[4], high - low - self.length + 1)
-            drawn = first[:, None] + np.arange(self.length)
-        return query, query_steps, context, self._step_of(drawn)
+        weights = None if weights is None else weights[members]
+        query, context = (
+            members[weighted_choice(number, weights, begins[task], ends[task])] for number in (for_query, for_context)
+        )
+        query_steps = low[query][:, None] + scale_to_range(for_query_steps, (high - low)[query][:, None])
+        # A window of K transitions from each number drawn, or, in random order, one transition.
+        window = self.length // drawn
+        low, high = self._transitions(low)[context][:, None], self._transitions(high)[context][:, None]
+        transitions = low + scale_to_range(for_steps, high - low - window + 1) + np.arange(window)
+        return _Contexts(query, query_steps, context, self._step_of(transitions))
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -227,11 +234,11 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
     # episode's last in one without. They are drawn by number and mapped to steps.
 
     def _transitions(self, steps: np.ndarray) -> np.ndarray:
-        """Number of transitions among a history's first `steps` steps."""
+        """Return the number of transitions among a history's first `steps` steps."""
         return steps if self.dataset.has_states else steps - -(-steps // self._draws.kept_steps)
 
     def _step_of(self, transition: np.ndarray) -> np.ndarray:
-        """Numbers of steps from numbers of transitions, both counted from the first one of the history."""
+        """Return numbers of steps for numbers of transitions, both counted from the first one of the history."""
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)
 
 

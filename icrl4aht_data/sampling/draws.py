@@ -47,8 +47,13 @@ class Curriculum:
     def __post_init__(self) -> None:
         check_int("curriculum batches", self.batches, 1)
         for name, part in (("first", self.first), ("last", self.last)):
-            if len(part) != 2 or not 0 <= part[0] < part[1] <= 1:
-                raise OptionError(f"curriculum {name} = {part}: expected fractions 0 <= low < high <= 1")
+            try:
+                low, high = part
+                valid = 0 <= low < high <= 1
+            except (TypeError, ValueError):
+                valid = False
+            if not valid:
+                raise OptionError(f"curriculum {name} = {part!r}: expected fractions 0 <= low < high <= 1")
 
     def part(self, i: int) -> tuple[float, float]:
         """Return the part at batch i: low and high fraction."""
@@ -58,17 +63,15 @@ class Curriculum:
 
 
 def random_uint32(seed: int, i: int, count: int, batch_size: int) -> np.ndarray:
-    """uint64 (count, batch_size): random integers below 2**32, a function of (seed, i) and the shape.
-
-    Philox's raw output is fixed by its definition, so batches stay the same across NumPy versions.
-    """
+    """Return random integers below 2**32, uint64 (count, batch_size), a function of (seed, i) and the shape."""
     i = check_int("batch", i, 0)
+    # Philox's raw output is fixed by its definition, so batches stay the same across NumPy versions.
     raw = Philox(key=np.array([seed, i], np.uint64)).random_raw(count * batch_size)
     return (raw >> np.uint64(32)).reshape(count, batch_size)
 
 
 def draw_subset(seed: int, total: int, count: int) -> np.ndarray:
-    """int64 (count,): different integers below `total`, ascending; every subset of that size is equally likely.
+    """Return different integers below `total`, int64 (count,), ascending; every subset of that size is equally likely.
 
     This is Floyd's algorithm (Bentley and Floyd 1987): one random integer for each member, whatever the total.
     """
@@ -81,21 +84,26 @@ def draw_subset(seed: int, total: int, count: int) -> np.ndarray:
 
 
 def scale_to_range(random: np.ndarray, n: Any) -> np.ndarray:
-    """int64: random integers below 2**32 scaled to 0..n - 1."""
+    """Return random integers below 2**32 scaled to 0..n - 1, as int64."""
+    # Multiply and shift: exact in integers, and several times faster than a remainder.
     return (random * np.asarray(n).astype(np.uint64) >> np.uint64(32)).astype(np.int64)
 
 
-def weighted_choice(random: np.ndarray, weights: np.ndarray, first: Any = 0, stop: Any = None) -> np.ndarray:
-    """int64: positions first..stop - 1 of `weights`, drawn in proportion to them; one of weight 0 is never drawn.
+def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, stop: Any) -> np.ndarray:
+    """Return positions first..stop - 1, drawn in proportion to their weights; one of weight 0 is never drawn.
 
     Args:
         random: uint64 (B,), integers below 2**32.
-        weights: float64 (N,), not negative.
-        first, stop: the range of each draw, numbers or int (B,); by default all positions.
+        weights: float64 (N,), not negative, with a finite sum; None for equal weights.
+        first, stop: the range of each draw, numbers or int (B,).
+
+    Returns:
+        int64 (B,).
     """
+    if weights is None:
+        return first + scale_to_range(random, stop - first)
     # A weight of 0 makes two equal edges, and searching from the right skips the empty interval between them.
     edges = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
-    stop = len(weights) if stop is None else stop
     low, high = edges[first], edges[stop]
     position = np.searchsorted(edges, low + random.astype(np.float64) / 2**32 * (high - low), side="right") - 1
     return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding may have led out of the range
@@ -127,14 +135,16 @@ class HistoryDraws:
         # Only histories of releases without states may end within an episode.
         if (ended != self._counts).any() or (selection.has_states and cut.any()):
             raise OptionError(f"some history's episodes have not {self.kept_steps} steps; run `icrl4aht-data verify`")
+        if curriculum is not None and not isinstance(curriculum, Curriculum):
+            raise OptionError(f"curriculum = {curriculum!r}: expected a Curriculum, such as Curriculum(batches=1000)")
         self.weights, self.episodes, self.curriculum = _check_weights(weights, len(selection)), episodes, curriculum
         self._range = _episode_range(episodes, self._counts)
 
     def steps(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """First step, and the one after the last, of each history's range at batch i: int64 (H,) each."""
+        """Return the first step, and the one after the last, of each history's range at batch i: int64 (H,) each."""
         first, stop = self._range
         if self.curriculum is not None:
-            low, high = self.curriculum.part(check_int("batch", i, 0))
+            low, high = self.curriculum.part(i)
             count = stop - first
             # Complete episodes, at least one. The small number keeps 0.3 * 10 episodes from being rounded up to 4.
             low = np.minimum(np.floor(low * count + 1e-9).astype(np.int64), count - 1)
@@ -144,13 +154,14 @@ class HistoryDraws:
         return first * self.kept_steps, np.where(stop == self._counts, self.lengths, stop * self.kept_steps)
 
     def history_weights(self, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
-        """float64 (H,): weights of histories with steps low..high to draw from; None for equal weights."""
+        """Return weights of histories with steps low..high to draw from, float64 (H,); None for equal weights."""
         if isinstance(self.weights, str):
             return None if self.weights == "uniform" else (high - low).astype(np.float64)
-        return np.asarray(self.weights)
+        # Sums of weights near 1e308 would be infinite. A power of 2 changes no digit of a weight, and so no draw.
+        return np.ldexp(self.weights, -np.frexp(self.weights.max())[1])
 
     def options(self) -> dict[str, Any]:
-        """The options as JSON."""
+        """Return the options as JSON."""
         curriculum = self.curriculum
         return {
             "weights": self.weights if isinstance(self.weights, str) else self.weights.tolist(),
@@ -160,7 +171,7 @@ class HistoryDraws:
 
 
 def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
-    """The name, or the numbers as float64 (H,).
+    """Return the name, or the numbers as float64 (H,).
 
     Raises:
         UnknownNameError, OptionError: if they are neither a known name nor H numbers of which some is positive.
@@ -182,7 +193,7 @@ def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
 
 
 def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First episode and the one after the last in histories of `counts` episodes: int64 (H,) each.
+    """Return the first episode and the one after the last in histories of `counts` episodes: int64 (H,) each.
 
     Raises:
         OptionError: if the range is malformed, or some history has no episode in it.
@@ -194,6 +205,7 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
             raise TypeError
         first, stop = episodes
         bounds = slice(first, stop)
+        # Most histories have equally many episodes, so that Python resolves few slices.
         distinct, number = np.unique(counts, return_inverse=True)
         first, stop = np.array([bounds.indices(count)[:2] for count in distinct.tolist()], np.int64)[number].T
     except (TypeError, ValueError) as error:

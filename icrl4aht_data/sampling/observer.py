@@ -59,17 +59,17 @@ class Observer:
         self._renders = selection.obs != "state" and (selection.has_states or self._canonical)
 
     def spec(self, *shape: int) -> ArraySpec:
-        """dtype and shape of observations (*shape, 5, 5, C), or of state records (*shape, S) with obs="state"."""
+        """Return dtype and shape of observations (*shape, 5, 5, C), or of state records (*shape, S) for "state"."""
         if self._selection.obs == "state":
             return ArraySpec("uint8", (*shape, *self._record_shape))
         return ArraySpec(self._selection.obs, (*shape, *self._shape))
 
     def record_bytes(self, shape: tuple[int, ...]) -> int:
-        """Bytes of the array that `records` makes for observations of this shape (..., 5, 5, C)."""
+        """Return the bytes of the array that `records` makes for observations of this shape (..., 5, 5, C)."""
         return math.prod((*shape[:-3], *self._record_shape)) if self._renders else 0
 
     def records(self, out: np.ndarray) -> np.ndarray:
-        """Array to read the records of observations `out` into: uint8 (..., *R), or `out` if nothing is rendered."""
+        """Return the array to read records of observations into: uint8 (..., *R), or `out` if nothing is rendered."""
         return np.empty((*out.shape[:-3], *self._record_shape), np.uint8) if self._renders else out
 
     def observe(self, histories: np.ndarray, records: np.ndarray, out: np.ndarray) -> None:

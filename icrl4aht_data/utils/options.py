@@ -31,6 +31,8 @@ def check_int(name: str, value: Any, least: int) -> int:
         OptionError: names the option.
     """
     try:
+        if isinstance(value, bool):
+            raise TypeError
         number = operator.index(value)
     except TypeError as error:
         raise OptionError(f"{name} = {value!r}: expected an integer") from error
@@ -52,6 +54,8 @@ def check_position(sequence: str, position: Any, count: int) -> int:
         PositionError: for a position that the sequence does not have.
     """
     try:
+        if isinstance(position, bool):
+            raise TypeError
         number = operator.index(position)
     except TypeError as error:
         raise PositionTypeError(f"position {position!r} of {sequence}: expected an integer or a slice") from error

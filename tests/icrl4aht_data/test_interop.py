@@ -35,6 +35,52 @@ def test_a_plain_loop_ends_after_as_many_steps_as_the_selection_has(sampler):
     assert_equal(batches[3], sampler[3])
 
 
+class TestPasses:
+    """A second pass had the batches of the first, so that a model trained on one set of windows for ever."""
+
+    def test_each_pass_over_a_torch_loader_continues(self, sampler):
+        loader, n = torch_loader(sampler), len(sampler)
+        for number in range(3):
+            assert len(loader) == n
+            batches = list(loader)
+            assert len(batches) == n
+            for i, batch in enumerate(batches, start=number * n):
+                np.testing.assert_array_equal(batch.obs, sampler[i].obs)
+
+    def test_a_resumed_loader_ends_its_passes_where_the_first_one_did(self, sampler):
+        resumed, n = torch_loader(sampler, start=len(sampler) + 3), len(sampler)
+        assert len(resumed) == n - 3
+        first, second = list(resumed), list(resumed)
+        assert (len(first), len(second)) == (n - 3, n)
+        np.testing.assert_array_equal(first[0].obs, sampler[n + 3].obs)
+        np.testing.assert_array_equal(second[0].obs, sampler[2 * n].obs)
+
+    def test_a_pass_that_is_left_early_is_not_repeated(self, sampler):
+        loader = torch_loader(sampler, start=2, stop=5)
+        found = [next(iter(loader)).obs for _ in range(3)]
+        for i, obs in zip((2, 5, 8), found, strict=True):
+            np.testing.assert_array_equal(obs, sampler[i].obs)
+
+    def test_prefetched_batches_continue_after_a_loop_is_left(self, sampler):
+        with sampler.batches() as batches:
+            for _ in zip(range(3), batches, strict=False):
+                pass
+            state = batches.state_dict()
+            assert_equal(next(batches), sampler[state["next"]])
+
+    def test_grain_continues_and_resumes_over_passes(self, sampler):
+        import grain
+
+        numbers = grain.MapDataset.range(3 * len(sampler)).map(sampler.batch)
+        iterator, n = iter(numbers.to_iter_dataset()), len(sampler)
+        for _ in range(n + 1):
+            next(iterator)
+        state = iterator.get_state()
+        again = iter(numbers.to_iter_dataset())
+        again.set_state(state)
+        assert_equal(next(again), sampler[n + 1])
+
+
 class TestGrain:
     def test_any_number_of_threads_gives_the_same_order(self, sampler):
         import grain
@@ -84,14 +130,14 @@ if __name__ == "__main__":
         sampler[0]  # a forked worker inherits what has been used: threads, locks, open files
         loader = torch_loader(sampler, start=1, stop=6, workers=workers, context=context)
         for epoch in range(2 if context == "fork" else 1):  # workers persist
-            for i, batch in enumerate(loader, start=1):
+            for i, batch in enumerate(loader, start=1 + 5 * epoch):
                 assert type(batch) is type(sampler[i])
                 for name, array in sampler[i]._asdict().items():
                     if array is not None:
                         found = getattr(batch, name)
                         assert isinstance(found, torch.Tensor)
                         np.testing.assert_array_equal(found.numpy(), array)
-            assert i == 5
+            assert i == 5 * epoch + 5
         print(cache, kind, workers, context)
 """
 

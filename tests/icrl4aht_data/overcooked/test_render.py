@@ -234,7 +234,7 @@ def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):
         rf"uint8 \({size},\).*found uint8 \(1, {size}\)": lambda: draw_frame(COORD, records),
         rf"uint8 \({size},\).*found int64 \({size},\)": lambda: draw_frame(COORD, records[0].astype(np.int64)),
         "not reachable floor": lambda: draw_frame(COORD, off_the_floor),
-        "at least 16 pixels, found 8": lambda: draw_frame(COORD, records[0], cell=8),
+        "from 16 to 128 pixels, found 8": lambda: draw_frame(COORD, records[0], cell=8),
         rf"uint8 \(T, {size}\).*found uint8 \({size},\)": lambda: save_episode(path, COORD, records[0]),
         rf"found uint8 \(0, {size}\)": lambda: save_episode(path, COORD, records[:0]),
         r"rewards \(1,\).*found \(2,\)": lambda: save_episode(path, COORD, records, np.zeros(2)),
