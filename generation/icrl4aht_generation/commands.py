@@ -162,9 +162,7 @@ def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) ->
     """
     from icrl4aht_generation.planning.plan import estimate_cost
 
-    with progress_bars() as show:
-        profile = _profile_with_threads(profile_name, None).with_ego(ego)
-        cost = estimate_cost(profile, devices, lambda what, done, total: show("planning", done, total, what))
+    cost = estimate_cost(_profile_with_threads(profile_name, None).with_ego(ego), devices)
     if as_json:
         click.echo(json.dumps(cost.to_json(), indent=2))
     else:

@@ -1,71 +1,63 @@
-"""Cost of a rebuild, estimated before it starts."""
+"""Cost of a rebuild, estimated before it starts: exact counts of steps and bytes, and hours within a factor of about 2.
+
+What takes the time is the network, so its forward pass is measured here. How many passes an update needs follows from
+the hyper-parameters. What has little influence is stored: the speed of the environment, and the time to compile.
+"""
 
 from __future__ import annotations
 
-import tempfile
+import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich import filesize
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.checking.report import NamedProgress
-from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.format.schema import KINDS, TASKS, Kind
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.format.schema import KINDS, Kind
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.system import usable_cores
-from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_generation.collection.noise import noise_bytes
-from icrl4aht_generation.collection.noise_rollout import EPISODES_AT_ONCE, play_noisy_episodes
 from icrl4aht_generation.collection.record import array_shapes
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.ego import Learner
-from icrl4aht_generation.learners.population.fcp import FCP
-from icrl4aht_generation.learners.population.population import Population
+from icrl4aht_generation.learners.encoder import CompactView
+from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.populations.build import population_runs
 from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.learned import build_untrained
 from icrl4aht_generation.teammates.registry import build_teammate
 
-_MEASUREMENTS = 4
-"""Measurements of an estimate: of egos, of noise histories, of teammates, of releases."""
+BYTES: dict[tuple[Kind, str], float] = {
+    ("lite", "ppo"): 1.85,
+    ("full", "ppo"): 9.23,
+    ("lite", "noise"): 2.55,
+    ("full", "noise"): 12.01,
+}
+"""Bytes of a transition in a release, by kind and source, measured on the bundled release."""
 
-_WORTH_MEASURING = 20.0
-"""Seconds: a complete update that should take less is measured itself, not only a share of it."""
+ENVIRONMENT_STEPS_PER_SECOND = 180_000.0
+"""Environment with a scripted teammate, on 2 CPU cores."""
 
+COMPILE_SECONDS = 30.0
+"""Programs of a task or a population, on 2 CPU cores."""
 
-class LearnerSpeed(NamedTuple):
-    """Speed of a learner on this machine.
-
-    Attributes:
-        steps_per_second: environment steps of all its environments.
-        compile_seconds: time to compile `init` and `update`.
-    """
-
-    steps_per_second: float
-    compile_seconds: float
-
-    def seconds(self, steps: int) -> float:
-        """Time for so many environment steps, with compiling."""
-        return steps / self.steps_per_second + self.compile_seconds
+_GRADIENT = 3.1  # time of a gradient step in forward passes: measured with the networks of `smoke` and `paper`
 
 
 @dataclass(frozen=True)
 class RebuildCost:
     """Estimated cost of rebuilding a profile.
 
-    Hours include learning, playing and recording: one process trains the populations one after the other, then
-    `devices` devices share the tasks, one task at a time each. A process compiles noise histories once for all tasks of
-    one teammate family on one layout, but a device of several compiles each of its tasks.
+    Hours are those of learning, playing and recording: one process trains the populations one after the other, then
+    `devices` devices share the tasks, one task at a time each.
 
     Attributes:
         profile: name of the profile.
@@ -80,15 +72,10 @@ class RebuildCost:
         kept_transitions: transitions after the stream filter, at most.
         artefact_bytes: size of the artefacts of all tasks.
         lite_bytes, full_bytes: sizes of a lite and of a full release.
-        device: description of the measured device.
-        teammate_steps_per_second: measured speed of training populations; None without populations.
-        steps_per_second: measured speed of training egos, the mean of all; None without egos.
-        compile_seconds: time to compile an ego's task, the longest; None without egos.
-        noise_steps_per_second: measured speed of playing noise histories; None without any.
-        noise_programs: number of programs to compile for them, one for each layout and teammate family.
-        noise_compile_seconds: time to compile one of them; None without any.
-        teammate_hours_on_one: hours to train all populations on one device.
-        noise_hours_on_one: hours to play all noise histories on one device.
+        device: the device on which the networks were measured.
+        steps_per_second: speed of egos that learn, the mean of all; None without egos.
+        teammate_hours: hours to train all populations on one device.
+        noise_hours: hours to play all noise histories on one device.
         hours_on_one: hours of the complete rebuild on one device.
         devices: number of devices.
         hours_on_devices: hours of the complete rebuild on this number of devices.
@@ -108,276 +95,132 @@ class RebuildCost:
     lite_bytes: int
     full_bytes: int
     device: str
-    teammate_steps_per_second: float | None
     steps_per_second: float | None
-    compile_seconds: float | None
-    noise_steps_per_second: float | None
-    noise_programs: int
-    noise_compile_seconds: float | None
-    teammate_hours_on_one: float
-    noise_hours_on_one: float
+    teammate_hours: float
+    noise_hours: float
     hours_on_one: float
     devices: int
     hours_on_devices: float
 
     def to_json(self) -> dict[str, Any]:
-        """The fields."""
+        """Return the fields."""
         return asdict(self)
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yields (quantity, value) in the order to be printed."""
-        yield "profile", self.profile
-        if self.teammate_steps_per_second:
-            yield "populations of teammates", f"{self.populations:,}"
-            yield "environment steps of them", f"{self.teammate_steps:,}"
-        yield "tasks", f"{self.tasks:,}"
-        if self.steps_per_second:
-            yield "learners", f"{self.learners:,}"
-            yield "environment steps", f"{self.environment_steps:,}"
-        if self.noise_steps_per_second:
-            yield "noise histories", f"{self.noise_histories:,}"
-            yield "transitions of them", f"{self.noise_transitions:,}"
-        yield "recorded transitions", f"{self.recorded_transitions:,}"
-        yield "kept transitions", f"{self.kept_transitions:,}"
-        yield "disk, artefacts", filesize.decimal(self.artefact_bytes)
-        yield "disk, release lite", filesize.decimal(self.lite_bytes)
-        yield "disk, release full", filesize.decimal(self.full_bytes)
-        if self.steps_per_second:
-            yield "measured here", f"{self.steps_per_second:,.0f} steps/s on {self.device}"
-            yield "compiling a task", f"{self.compile_seconds:.0f} s"
-        if self.teammate_steps_per_second:
-            yield "measured, teammates", f"{self.teammate_steps_per_second:,.0f} steps/s"
-            yield "hours, teammates", f"{self.teammate_hours_on_one:,.1f}"
-        if self.noise_steps_per_second:
-            yield "measured, noise", f"{self.noise_steps_per_second:,.0f} steps/s on {self.device}"
-            yield "compiling noise", f"{self.noise_programs} x {self.noise_compile_seconds:.0f} s"
-            yield "hours, noise", f"{self.noise_hours_on_one:,.1f}"
-        yield "hours on one such device", f"{self.hours_on_one:,.1f}"
-        yield f"hours on {self.devices} of them", f"{self.hours_on_devices:,.1f}"
+        """Yield (quantity, value) of what the profile has, in the order to be printed."""
+        for field in fields(self):
+            value, name = getattr(self, field.name), field.name.replace("_", " ")
+            if field.name.endswith("_bytes"):
+                yield f"disk, {name.removesuffix(' bytes')}", filesize.decimal(value)
+            elif field.name == "hours_on_devices":
+                yield f"hours on {self.devices} devices", f"{value:,.1f}"
+            elif value and field.name != "devices":
+                yield name, value if isinstance(value, str) else f"{value:,}"
 
 
-class SourceCost(NamedTuple):
-    """Estimated cost of one source's tasks.
-
-    Attributes:
-        tasks: number of tasks.
-        units: number of learners or of noise histories.
-        steps: environment steps of all units.
-        recorded: transitions of all units.
-        kept: those that a release has at most.
-        artefact_bytes: size of the artefacts.
-        speed: measured speed; None without tasks.
-        programs: number of programs that one process compiles.
-        seconds_on_one: time on one device.
-        seconds_on_devices: time if several devices share the tasks.
-    """
-
-    tasks: int = 0
-    units: int = 0
-    steps: int = 0
-    recorded: int = 0
-    kept: int = 0
-    artefact_bytes: int = 0
-    speed: LearnerSpeed | None = None
-    programs: int = 0
-    seconds_on_one: float = 0.0
-    seconds_on_devices: float = 0.0
-
-
-def estimate_cost(
-    profile: Profile, devices: int, advance: NamedProgress = lambda what, done, total: None
-) -> RebuildCost:
-    """Estimate a rebuild's cost from the profile, short calibration runs, and histories of the bundled release.
+def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
+    """Estimate a rebuild's cost from the profile, the speed of its networks here, and stored figures.
 
     Args:
         profile: the profile.
         devices: number of devices that share the tasks.
-        advance: called before each of the measurements with its name, the number of those done, and their number.
     """
-    advance("measuring how fast egos learn", 0, _MEASUREMENTS)
-    ppo = ppo_cost(profile, devices) if "ppo" in profile.sources else SourceCost()
-    advance("measuring how fast noise histories are played", 1, _MEASUREMENTS)
-    noise = noise_cost(profile, devices) if "noise" in profile.sources else SourceCost()
-    advance("measuring how fast teammates learn", 2, _MEASUREMENTS)
-    populations = [run.steps for run in population_runs(profile, profile.algorithms, 0)]
-    playing = calibrate(profile.teammates.ppo, partial(calibration_population, profile)) if populations else None
-    advance("measuring the size of releases", 3, _MEASUREMENTS)
-    parts = [(source, part.kept) for source, part in (("ppo", ppo), ("noise", noise)) if part.kept]
-    sizes = {kind: round(sum(kept * bytes_per_transition(kind, source) for source, kept in parts)) for kind in KINDS}
-    advance("measured", _MEASUREMENTS, _MEASUREMENTS)
-    teammate_seconds = sum(playing.seconds(steps) for steps in populations) if playing else 0.0
+    layouts = {name: get_layout(name) for name in profile.layouts}
+    tasks = {source: {name: profile.tasks_on(name, source) for name in layouts} for source in profile.sources}
+    egos = [
+        (layouts[name], profile.ego_on(name))
+        for name, count in tasks.get("ppo", {}).items()
+        for _ in range(count * profile.learners)
+    ]
+    noise = [layouts[name] for name, count in tasks.get("noise", {}).items() for _ in range(count)]
+    runs = population_runs(profile, profile.algorithms, 0)
+
+    steps = sum(ego.updates * ego.steps_per_update for _, ego in egos)
+    playing = sum(ego.updates * ego.steps_per_update * step_seconds(ego) for _, ego in egos)
+    noise_transitions = profile.noise.histories * profile.noise.episodes * KEPT_STEPS
+    noise_seconds = noise_transitions / ENVIRONMENT_STEPS_PER_SECOND + COMPILE_SECONDS
+    seconds = [ego.updates * ego.steps_per_update * step_seconds(ego) + COMPILE_SECONDS for _, ego in egos]
+    seconds += [noise_seconds] * len(noise)
+    teammate_seconds = sum(run.steps * step_seconds(run.config) + COMPILE_SECONDS for run in runs)
+    kept = {
+        "ppo": sum(
+            count * profile.keep * profile.ego_on(name).episodes * KEPT_STEPS
+            for name, count in tasks.get("ppo", {}).items()
+        ),
+        "noise": len(noise) * noise_transitions,
+    }
+    sizes = {kind: round(sum(kept[source] * BYTES[kind, source] for source in kept)) for kind in KINDS}
     device = jax.devices()[0]
     return RebuildCost(
         profile=profile.name,
-        populations=len(populations),
-        teammate_steps=sum(populations),
-        tasks=ppo.tasks + noise.tasks,
-        learners=ppo.units,
-        environment_steps=ppo.steps,
-        noise_histories=noise.units,
-        noise_transitions=noise.recorded,
-        recorded_transitions=ppo.recorded + noise.recorded,
-        kept_transitions=ppo.kept + noise.kept,
-        artefact_bytes=ppo.artefact_bytes + noise.artefact_bytes,
-        **{f"{kind}_bytes": size for kind, size in sizes.items()},
+        populations=len(runs),
+        teammate_steps=sum(run.steps for run in runs),
+        tasks=sum(sum(counts.values()) for counts in tasks.values()),
+        learners=len(egos),
+        environment_steps=steps,
+        noise_histories=len(noise) * profile.noise.histories,
+        noise_transitions=kept["noise"],
+        recorded_transitions=sum(ego.environments * ego.episodes * KEPT_STEPS for _, ego in egos) + kept["noise"],
+        kept_transitions=sum(kept.values()),
+        artefact_bytes=artefact_bytes(egos) + sum(noise_bytes(layout, profile.noise) for layout in noise),
+        lite_bytes=sizes["lite"],
+        full_bytes=sizes["full"],
         device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
-        teammate_steps_per_second=round(playing.steps_per_second, 1) if playing else None,
-        steps_per_second=round(ppo.speed.steps_per_second, 1) if ppo.speed else None,
-        compile_seconds=round(ppo.speed.compile_seconds, 1) if ppo.speed else None,
-        noise_steps_per_second=round(noise.speed.steps_per_second, 1) if noise.speed else None,
-        noise_programs=noise.programs,
-        noise_compile_seconds=round(noise.speed.compile_seconds, 1) if noise.speed else None,
-        teammate_hours_on_one=round(teammate_seconds / 3600, 2),
-        noise_hours_on_one=round(noise.seconds_on_one / 3600, 2),
-        hours_on_one=round((teammate_seconds + ppo.seconds_on_one + noise.seconds_on_one) / 3600, 2),
+        steps_per_second=round(steps / playing, 1) if egos else None,
+        teammate_hours=round(teammate_seconds / 3600, 2),
+        noise_hours=round(len(noise) * noise_seconds / 3600, 2),
+        hours_on_one=round((teammate_seconds + sum(seconds)) / 3600, 2),
         devices=devices,
-        hours_on_devices=round((teammate_seconds + ppo.seconds_on_devices + noise.seconds_on_devices) / 3600, 2),
+        # Each round of tasks takes as long as its longest.
+        hours_on_devices=round((teammate_seconds + sum(sorted(seconds, reverse=True)[::devices])) / 3600, 2),
     )
 
 
-def ppo_cost(profile: Profile, devices: int) -> SourceCost:
-    """Estimate the cost of a profile's egos, measuring the speed of one with each of their hyper-parameters."""
-    counts = {layout: profile.tasks_on(layout, "ppo") for layout in profile.layouts}
-    egos = [profile.ego_on(layout) for layout, count in counts.items() for _ in range(count * profile.learners)]
-    if not egos:
-        return SourceCost()
-    histories = {layout: profile.ego_on(layout).episodes * KEPT_STEPS for layout in counts}
-    speeds = {ego: calibrate(ego, partial(task_learner, profile)) for ego in dict.fromkeys(egos)}
-    steps = [ego.updates * ego.steps_per_update for ego in egos]
-    playing = sum(count / speeds[ego].steps_per_second for ego, count in zip(egos, steps, strict=True))
-    seconds = [speeds[ego].seconds(count) for ego, count in zip(egos, steps, strict=True)]
-    speed = LearnerSpeed(sum(steps) / playing, max(found.compile_seconds for found in speeds.values()))
-    return SourceCost(
-        tasks=sum(counts.values()),
-        units=len(egos),
-        steps=sum(steps),
-        recorded=sum(ego.environments * ego.episodes * KEPT_STEPS for ego in egos),
-        kept=sum(count * profile.keep * histories[layout] for layout, count in counts.items()),
-        artefact_bytes=sum(
-            count * profile.learners * artefact_bytes([layout], profile.ego_on(layout))
-            for layout, count in counts.items()
-        ),
-        speed=speed,
-        seconds_on_one=sum(seconds),
-        seconds_on_devices=sum(sorted(seconds, reverse=True)[::devices]),  # each round takes as long as its longest
-    )
+def step_seconds(config: PPOConfig) -> float:
+    """Return the time of one environment step of a learner: acting, the environment, and learning in all epochs."""
+    passes = 1 + _GRADIENT * config.epochs
+    # Layouts differ in the number of channels, which only the first layer of the network depends on.
+    return passes * forward_seconds(get_layout("demo_wide"), config) + 1 / ENVIRONMENT_STEPS_PER_SECOND
 
 
-def noise_cost(profile: Profile, devices: int) -> SourceCost:
-    """Estimate the cost of a profile's noise histories, measuring the speed of one batch of episodes."""
-    counts = {layout: profile.tasks_on(layout, "noise") for layout in profile.layouts}
-    tasks, config = sum(counts.values()), profile.noise
-    if not tasks:
-        return SourceCost()
-    speed = noise_speed(profile)
-    of_task = config.histories * config.episodes * KEPT_STEPS
-    families = {(work.task.layout.name, work.task.teammate["family"]) for work in _noise_works(profile)}
-    programs = len(families | {(layout, "rl") for layout in profile.algorithms})
-    return SourceCost(
-        tasks=tasks,
-        units=tasks * config.histories,
-        recorded=tasks * of_task,
-        kept=tasks * of_task,
-        artefact_bytes=sum(count * noise_bytes(get_layout(layout), config) for layout, count in counts.items()),
-        speed=speed,
-        programs=programs,
-        seconds_on_one=tasks * of_task / speed.steps_per_second + programs * speed.compile_seconds,
-        seconds_on_devices=-(-tasks // devices) * speed.seconds(of_task),
-    )
+@lru_cache(maxsize=16)
+def forward_seconds(layout: Layout, config: PPOConfig) -> float:
+    """Measure the forward pass of a learner's network on one minibatch; return its time per step."""
+    steps, count = config.rollout, config.environments // config.minibatches
+    view = CompactView(config.widths.encoder, (layout,))
+    network = ActorCritic(config.widths, view=view)
+    shapes = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
+    params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    # The same in all environments: encoder `words` computes equal observations once, and in training most are.
+    record = np.random.default_rng(0).integers(0, 256, (steps, 1, record_size(layout)), np.uint8)
+    records = jnp.asarray(np.repeat(record, count, axis=1))
+    reset = jnp.zeros((steps, count), bool)
 
+    @jax.jit
+    def forward(params: Any, records: jax.Array) -> Any:
+        return network.apply(params, network.initial_hidden(count), view(records), reset)
 
-def noise_speed(profile: Profile) -> LearnerSpeed:
-    """Measure how fast episodes of the profile's first noise task are played, without writing them."""
-    layout, works = get_layout(profile.layouts[0]), _noise_works(profile)
-    if works:
-        layout, teammate = works[0].task.layout, build_teammate(works[0].task.layout, works[0].task.teammate)
-    else:
-        teammate = build_untrained(layout, profile.teammates.ppo.widths)
-    zeros = np.zeros(EPISODES_AT_ONCE, np.int32)
-
-    def play() -> float:
+    jax.block_until_ready(forward(params, records))
+    times = []
+    for _ in range(3):  # the fastest of a few: other programs may use the machine
         began = time.perf_counter()
-        episodes = np.arange(EPISODES_AT_ONCE)
-        jax.block_until_ready(play_noisy_episodes(layout, teammate, 0, zeros, episodes, zeros.astype(np.float32)))
-        return time.perf_counter() - began
-
-    first, second = play(), play()
-    return LearnerSpeed(EPISODES_AT_ONCE * KEPT_STEPS / second, max(first - second, 0.0))
+        jax.block_until_ready(forward(params, records))
+        times.append(time.perf_counter() - began)
+    return min(times) / (steps * count)
 
 
-def _noise_works(profile: Profile) -> list[Work]:
-    """The noise tasks with heuristic teammates."""
-    return [work for work in profile.works() if work.source == "noise"]
+def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
+    """Return the uncompressed size of the histories of egos."""
+    shapes = (array_shapes(layout, ego.environments, ego.episodes).values() for layout, ego in egos)
+    return sum(math.prod(shape) * np.dtype(dtype).itemsize for arrays in shapes for shape, dtype in arrays)
 
 
-def task_learner(profile: Profile, ego: PPOConfig, layout_name: str | None = None) -> Learner:
-    """The ego of a task on the profile's first layout or the given one, with a teammate of the profile's kind."""
-    layout = get_layout(layout_name or profile.layouts[0])
+def task_learner(profile: Profile, ego: PPOConfig, layout_name: str) -> Learner:
+    """Return the ego of a task on a layout, with a teammate of the profile's kind."""
+    layout = get_layout(layout_name)
     heuristics = [work.task.teammate for work in profile.works() if work.source == "ppo"]
     if profile.algorithms or not heuristics:
         teammate = build_untrained(layout, profile.teammates.ppo.widths)
     else:
         teammate = build_teammate(layout, heuristics[0])
     return Learner(Environment(layout), teammate, ego)
-
-
-def calibration_population(profile: Profile, config: PPOConfig) -> Population:
-    """A population on the profile's first layout."""
-    return Population(Environment(get_layout(profile.layouts[0])), FCP(profile.teammates.members), config)
-
-
-def calibrate(config: PPOConfig, make: Callable[[PPOConfig], Learner | Population]) -> LearnerSpeed:
-    """Measure the learner that `make` returns for a configuration.
-
-    An update with the environments of one minibatch costs as much per step if it keeps the device busy; if the complete
-    update should then be short, it is measured instead.
-    """
-    share = replace(config, environments=config.environments // config.minibatches, minibatches=1)
-    speed, steps = _measure(make(share))
-    if share != config and steps * config.minibatches / speed.steps_per_second < _WORTH_MEASURING:
-        speed, _ = _measure(make(config))
-    return speed
-
-
-def _measure(learner: Learner | Population) -> tuple[LearnerSpeed, int]:
-    """Speed, and the environment steps of an update."""
-    began = time.perf_counter()
-    state: Any = jax.jit(learner.init)(jax.random.key(0))
-    update = jax.jit(learner.update, donate_argnums=0).lower(state).compile()
-    compiling = time.perf_counter() - began
-    state, *_ = jax.block_until_ready(update(state))
-    began = time.perf_counter()
-    jax.block_until_ready(update(state))
-    steps = learner.steps_per_update
-    return LearnerSpeed(steps / (time.perf_counter() - began), compiling), steps
-
-
-def artefact_bytes(layouts: Sequence[str], ego: PPOConfig) -> int:
-    """Uncompressed size of the histories of one task on each of these layouts."""
-    arrays = (array_shapes(get_layout(layout), ego.environments, ego.episodes).values() for layout in layouts)
-    return sum(int(np.prod(shape)) * np.dtype(dtype).itemsize for task in arrays for shape, dtype in task)
-
-
-def bytes_per_transition(kind: Kind, source: str = "ppo") -> float:
-    """Size per transition of a release of this kind, measured on histories of the bundled release.
-
-    Args:
-        kind: the kind.
-        source: measured is one history of each task of this source, or of each task if the release has none of it.
-    """
-    dataset = load_icrl4aht()
-    tasks = read_tasks(dataset.root / TASKS)
-    of_source = {entry.task_id for entry in dataset.entries if entry.source == source}
-    with tempfile.TemporaryDirectory() as folder:
-        new = [
-            NewTask(task, dataset.provenance[task.task_id], 1, partial(_first_history, task))
-            for task in tasks
-            if not of_source or task.task_id in of_source
-        ]
-        root = write_release(Path(folder) / kind, kind, new, data_version="0.0.0", card="")
-        shards = sum(path.stat().st_size for path in (root / "data").rglob("*.h5"))
-        return shards / sum(entry.T for entry in load_icrl4aht(root).entries)
-
-
-def _first_history(task: Task) -> list[NewHistory]:
-    return [NewHistory.from_history(load_icrl4aht(task_id=task.task_id)[0])]
