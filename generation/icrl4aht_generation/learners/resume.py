@@ -141,8 +141,8 @@ class StateFile:
     """One safetensors file with the state of a training, the settings it belongs to, and its progress.
 
     Arrays are named by their path in the state's pytree ("params/actor/kernel"); typed keys (of JAX's default kind) are
-    stored as their data. Metadata: `format`, `settings` (JSON), `progress` (number of updates). The file is replaced
-    atomically. With several processes, all call `save`, process 0 writes, and every process can `load`.
+    stored as their data. Metadata: `format`, `settings` (JSON), `progress` (number of updates). Equal states and
+    settings give equal bytes. The file is replaced atomically. With several processes, all call `save`, process 0 writes, and every process can `load`.
 
     Args:
         path: the file, which need not exist.
@@ -183,14 +183,10 @@ class StateFile:
         """Write a pytree of arrays and typed keys, sharded or replicated over any devices."""
         arrays = {name: _host_array(leaf) for name, leaf in _named_leaves(state).items()}
         if jax.process_index() == 0:
-            metadata = {
-                "format": _FORMAT,
-                "settings": json.dumps(self.settings if self.settings is not None else {}),
-                "progress": str(progress),
-            }
+            metadata = {"format": _FORMAT, "progress": str(progress), "settings": json.dumps(self.settings or {})}
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(self.path) as partial:
-                partial.write_bytes(to_bytes(arrays, metadata))  # `save_file` has errors of its own for a full disk
+                partial.write_bytes(_file_bytes(arrays, metadata))
         if jax.process_count() > 1:
             multihost_utils.sync_global_devices(f"saved {self.path.name}")
 
@@ -353,6 +349,17 @@ def _named_leaves(tree: Any, part: str = "") -> dict[str, Any]:
     if len(named) < len(leaves):
         raise ValueError("two leaves of the state have the same path")
     return named
+
+
+def _file_bytes(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> bytes:
+    """A safetensors file whose bytes are a function of its content."""
+    # The library writes metadata in a random order, so they are put into the header of a file that has none. And it is
+    # not `save_file`, which has errors of its own for a full disk.
+    content = to_bytes(arrays)
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.dumps({"__metadata__": metadata} | json.loads(content[8:end]), separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)  # the arrays are aligned
+    return b"".join([len(header).to_bytes(8, "little"), header, memoryview(content)[end:]])
 
 
 def _is_key(leaf: Any) -> bool:
