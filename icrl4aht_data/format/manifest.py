@@ -20,6 +20,7 @@ from icrl4aht_data.format.schema import (
     INFO,
     MANIFEST,
     PARQUET_EPISODES,
+    PARQUET_INDEX,
     PROVENANCE,
     TASKS,
     TEAMMATES,
@@ -44,13 +45,13 @@ _NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
 _KNOWN = re.compile(
     "|".join(
         (
-            r"README\.md|LICENSE|CITATION\.cff|croissant\.json",
+            r"README\.md|card\.json|LICENSE|CITATION\.cff|croissant\.json",
             r"meta/(info\.json|histories\.jsonl|tasks\.jsonl|provenance\.json|source_card\.md)",
             rf"data/{_NAME}/{_NAME}/{_NAME}\.h5",
             rf"meta/chunks/{_NAME}/{_NAME}/{_NAME}\.npy",
             rf"({TEAMMATES}|{EXPERTS})/[0-9a-f]{{64}}/(policy\.json|policy\.safetensors|README\.md)",
             rf"figures/{_NAME}\.(png|svg)",
-            rf"(index|{PARQUET_EPISODES})/{_NAME}/{_NAME}\.parquet",
+            rf"({PARQUET_INDEX}|{PARQUET_EPISODES})/{_NAME}/{_NAME}\.parquet",
         )
     )
 )

@@ -45,6 +45,15 @@ TEAMMATES = "teammates"
 EXPERTS = "experts"
 """The folder of the egos' checkpoints whose greedy actions are the labels; a release may be without it."""
 
+RELEASE_CARD, CARD_TABLES = "README.md", "card.json"
+"""The card, and its tables that are too long for people."""
+
+SOURCE_CARD = "meta/source_card.md"
+"""Cards of the releases that a release was combined from, or its own earlier card if this package did not make it."""
+
+PARQUET_INDEX = "index"
+"""The folder of the index as Parquet files, `index/<layout>/<split>.parquet`, in a release built for publication."""
+
 PARQUET_EPISODES = "episodes"
 """The folder of the episodes as Parquet files, `episodes/<layout>/<split>-00000-of-00001.parquet`: a copy of the
 histories for other tools, in a release built for publication that has state records."""

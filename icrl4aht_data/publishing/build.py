@@ -18,7 +18,16 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, ReleaseError, unknown
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
-from icrl4aht_data.format.schema import INFO, MANIFEST, PARQUET_EPISODES, TEAMMATES
+from icrl4aht_data.format.schema import (
+    CARD_TABLES,
+    INFO,
+    MANIFEST,
+    PARQUET_EPISODES,
+    PARQUET_INDEX,
+    RELEASE_CARD,
+    SOURCE_CARD,
+    TEAMMATES,
+)
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import plot_headroom, plot_layout_curves, plot_layouts
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
@@ -26,16 +35,13 @@ from icrl4aht_data.utils.files import files_below, parse_json, read_text, write_
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.templates import card_file, fill_template
-from icrl4aht_data.writing.card_content import PARQUET_INDEX
-from icrl4aht_data.writing.dataset_card import (
+from icrl4aht_data.writing.card import (
     CURVES_FIGURE,
     HEADROOM_FIGURE,
     HEADROOM_PROTOCOL,
     LAYOUTS_FIGURE,
-    RELEASE_CARD,
-    SOURCE_CARD,
-    dataset_card,
     evaluated_on,
+    write_card,
 )
 from icrl4aht_data.writing.parquet import to_parquet, write_episodes
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
@@ -90,7 +96,7 @@ def build_release(
             (folder / RELEASE_CARD).write_text(teammate_card(folder), encoding="utf-8")
         for name in _COPIED_TEXTS:
             shutil.copyfile(card_file(name), root / name)
-        (root / RELEASE_CARD).write_text(dataset_card(root), encoding="utf-8")
+        write_card(root)
         digests = {name: file_hash(root / name) for name in files_below(root)}
         for name, digest in kept.items():
             if digests.get(name) != digest:
@@ -154,7 +160,7 @@ def _is_made_here(name: str) -> bool:
     """Return whether building writes a file, so that the source's version is not copied."""
     top, _, rest = name.partition("/")
     is_teammate_card = top == TEAMMATES and rest.endswith(f"/{RELEASE_CARD}")
-    is_made = name in (RELEASE_CARD, CROISSANT, *_COPIED_TEXTS) or is_teammate_card
+    is_made = name in (RELEASE_CARD, CARD_TABLES, CROISSANT, *_COPIED_TEXTS) or is_teammate_card
     return is_made or top in ("figures", PARQUET_INDEX, PARQUET_EPISODES)
 
 

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import ReleaseInfo, read_info
-from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES
+from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES, PARQUET_INDEX
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, record_width
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.templates import card_file
-from icrl4aht_data.writing.card_content import PARQUET_INDEX
-from icrl4aht_data.writing.card_texts import card_texts, episode_texts
+from icrl4aht_data.writing.card import card_texts, episode_texts
 
 if TYPE_CHECKING:
     import mlcroissant

@@ -12,11 +12,10 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import MANIFEST, PROVENANCE
+from icrl4aht_data.format.schema import MANIFEST, PROVENANCE, RELEASE_CARD, SOURCE_CARD
 from icrl4aht_data.utils.files import read_text
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.writing.dataset_card import SOURCE_CARD
-from icrl4aht_data.writing.release import RELEASE_CARD, NewTask, write_release
+from icrl4aht_data.writing.release import NewTask, write_release
 from icrl4aht_data.writing.release_folder import check_target
 from icrl4aht_data.writing.stored import release_tasks, stored_task
 

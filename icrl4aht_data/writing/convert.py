@@ -8,9 +8,8 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, PROVENANCE, Kind
+from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, PROVENANCE, SOURCE_CARD, Kind
 from icrl4aht_data.utils.files import read_text
-from icrl4aht_data.writing.dataset_card import SOURCE_CARD
 from icrl4aht_data.writing.release import write_release
 from icrl4aht_data.writing.release_folder import check_target
 from icrl4aht_data.writing.stored import HistoryProgress, release_tasks, stored_task

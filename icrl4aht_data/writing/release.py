@@ -27,6 +27,8 @@ from icrl4aht_data.format.schema import (
     KINDS,
     OBSERVATIONS,
     PROVENANCE,
+    RELEASE_CARD,
+    SOURCE_CARD,
     TASKS,
     Entry,
     Kind,
@@ -39,9 +41,8 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.utils.files import files_below, write_json
-from icrl4aht_data.writing.card_content import CardContent
-from icrl4aht_data.writing.dataset_card import RELEASE_CARD, SOURCE_CARD, render_card
+from icrl4aht_data.utils.files import write_json
+from icrl4aht_data.writing.card import write_card
 from icrl4aht_data.writing.release_folder import atomic_folder
 from icrl4aht_data.writing.shard_writer import EncodedChunk, encode_history, write_shard
 from icrl4aht_data.writing.statistics import layout_statistics
@@ -116,7 +117,7 @@ def write_release(
             (no states; an unfinished episode may end a history).
         tasks: the tasks to write; their histories are numbered in this order.
         data_version: version of the data, SemVer.
-        card: README.md of the release; by default `dataset_card.render_card` describes the release.
+        card: README.md of the release; by default `card.write_card` describes the release.
         source_card: cards of the releases that this one is made of, to keep with its own.
         kept_steps: steps of every episode.
         left_out: tasks without histories, to be listed in meta/info.json.
@@ -153,11 +154,13 @@ def write_release(
         for name, source in chain(files.items(), *(one.files.items() for one in new)):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, root / name)
-        content = _write_meta(root, kind, new, writer.entries, data_version, kept_steps, left_out)
+        _write_meta(root, kind, new, writer.entries, data_version, kept_steps, left_out)
         if source_card is not None:
             (root / SOURCE_CARD).write_text(source_card, encoding="utf-8")
-        content = replace(content, files=frozenset(files_below(root)))
-        (root / RELEASE_CARD).write_text(render_card(content) if card is None else card, encoding="utf-8")
+        if card is None:
+            write_card(root)
+        else:
+            (root / RELEASE_CARD).write_text(card, encoding="utf-8")
         write_manifest(root)
     return target
 
@@ -170,8 +173,8 @@ def _write_meta(
     data_version: str,
     kept_steps: int,
     left_out: Sequence[LeftOutTask],
-) -> CardContent:
-    """Write index, tasks, provenance and info; returns them for the card."""
+) -> None:
+    """Write index, tasks, provenance and info."""
     with (root / HISTORIES).open("w", encoding="utf-8") as stream:
         stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
     tasks = [one.task for one in new if not isinstance(one.task, NamedTask)]
@@ -183,7 +186,6 @@ def _write_meta(
     info = describe(kind, data_version, kept_steps, entries)
     info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
     write_json(root / INFO, info.to_json())
-    return CardContent(info, entries, tasks, provenance)
 
 
 class _LoadedHistory(NamedTuple):

@@ -1,4 +1,4 @@
-"""Statistics of a release by layout: the paper's table "Dataset statistics per layout"."""
+"""Statistics of a release by layout: the paper's table "Dataset statistics per layout", and how much histories rise."""
 
 from __future__ import annotations
 
@@ -82,22 +82,43 @@ def _policy(task: Task) -> str:
     return f"{checkpoint.rpartition('/')[0]} {task.teammate.get('base_seed')}"
 
 
-def statistics_rows(statistics: Mapping[str, LayoutStatistics]) -> list[list[str]]:
-    """Return the table's rows as text: the name of a property, and its value on each layout."""
-    return [
-        [label, *(_in_words(name, getattr(of_layout, name)) for of_layout in statistics.values())]
-        for name, label in _ROWS.items()
-    ]
-
-
 def print_statistics(info: ReleaseInfo, console: Console) -> None:
     """Print the statistics in a release's info, one row per property and one column per layout."""
     table = Table("property", box=box.MARKDOWN, title=escape(f"{info.kind} release {info.data_version}"))
     for layout in info.statistics:
         table.add_column(layout, justify="right")
-    for row in statistics_rows(info.statistics):
-        table.add_row(*row)
+    for name, label in _ROWS.items():
+        table.add_row(label, *(_in_words(name, getattr(found, name)) for found in info.statistics.values()))
     console.print(table, width=max(console.width, 30 + 16 * len(info.statistics)), crop=False)
+
+
+def print_learning(content: Mapping[str, Any], console: Console) -> None:
+    """Print how much the histories of a release rise, and what is not in the release.
+
+    Args:
+        content: what `card.facts` says of the release.
+        console: where it is printed.
+    """
+    learning: list[dict[str, Any]] = content["learning"]
+    totals = [
+        row | {"layout": title, "split": "all"} for title, own in content["learning_totals"].items() for row in own
+    ]
+    lines = [list(learning[0]), *([_cell(row[name]) for name in learning[0]] for row in (*learning, *totals))]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    console.print("Learning, by layout and source:")
+    for line in lines:
+        text = "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+    for task in content["left_out"]:
+        source = f" ({task['source']})" if task["source"] else ""
+        text = f"left out: {task['layout']} with {task['teammate']}{source}: {task['reason']}"
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:z.2f}"
+    return " ".join(value) if isinstance(value, list) else f"{value or ''}"
 
 
 def _in_words(name: str, value: Any) -> str:

@@ -15,9 +15,9 @@ from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import process_lock
 from icrl4aht_data.utils.progress import counted, progress_bars
-from icrl4aht_data.writing.card_content import read_content
-from icrl4aht_data.writing.card_tables import print_learning, teammate_name
-from icrl4aht_data.writing.statistics import print_statistics
+from icrl4aht_data.writing.card import facts as release_facts
+from icrl4aht_data.writing.card import teammate_name
+from icrl4aht_data.writing.statistics import print_learning, print_statistics
 from icrl4aht_generation.collection.job import CollectionError
 from icrl4aht_generation.collection.options import CollectOptions
 from icrl4aht_generation.collection.run import collect_tasks
@@ -94,7 +94,7 @@ def build_releases(
                 )
         for release in releases:
             print_statistics(read_info(release), console)
-            print_learning(read_content(release), console)
+            print_learning(release_facts(release), console)
     return releases
 
 

@@ -12,7 +12,7 @@ from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.schema import curve_ends
-from icrl4aht_data.writing.card_tables import teammate_name
+from icrl4aht_data.writing.card import teammate_name
 from icrl4aht_generation.collection.curate import select_streams, stream_returns
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work

@@ -22,7 +22,7 @@ from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSu
 from icrl4aht_data.format.schema import PROVENANCE, Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
-from icrl4aht_data.writing.dataset_card import CURVES_FIGURE
+from icrl4aht_data.writing.card import CURVES_FIGURE
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
 from icrl4aht_generation.collection.curate import filter_report, oracle_labels, plot_filter, relabel

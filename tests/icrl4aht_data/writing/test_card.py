@@ -1,26 +1,43 @@
-"""Tables of the dataset card: learning by source, teammates, labels, and what is left out."""
+"""The card: facts about a release, README.md made of them, and card.json with the long tables."""
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
+from typing import Any
 
 import msgspec
 import pytest
 from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
-from icrl4aht_data.benchmark.tasks import Task, make_task
-from icrl4aht_data.format.info import LeftOutTask
-from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos
-from icrl4aht_data.format.schema import Entry
-from icrl4aht_data.writing import card_tables
-from icrl4aht_data.writing.card_content import CardContent, read_content
-from icrl4aht_data.writing.dataset_card import render_card
+from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
+from icrl4aht_data.dataset import MINI
+from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.format.index import read_index
+from icrl4aht_data.format.info import LeftOutTask, describe
+from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos, TeammateSuite
+from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, HISTORIES, INFO, PROVENANCE, TASKS
+from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
+from icrl4aht_data.utils.files import write_json
+from icrl4aht_data.writing.card import (
+    card_texts,
+    episode_texts,
+    evaluated_on,
+    facts,
+    render_card,
+    size_category,
+    write_card,
+)
+from icrl4aht_data.writing.statistics import print_learning
 
 KINDS_OF = {family: kind for kind, family in HEURISTIC_KINDS.items()}
 LEFT_OUT = LeftOutTask("task", "demo_wide", "H1/t3", "ppo", 2, 128, 1.25, 2.5, "the learners did not learn")
-UNHOSTED = LeftOutTask("", "demo_wide", "H4", "", 0, 0, None, None, "all 32 draws act like a test teammate")
+Tasks = list[tuple[Task, Provenance, list[tuple[int, float, float]]]]
+Change = Callable[[Provenance], Provenance]
 
 
 def drawn(layout: str, family: str, theta_id: int, split: str = "train", seed: int = 0) -> Task:
@@ -41,160 +58,174 @@ def made(
     )
 
 
-@pytest.fixture
-def content(lite) -> CardContent:
-    """Four tasks: two learners with a teammate on demo_wide, noise with it, a validation teammate, and coord_simple."""
-    base = read_content(lite[0])
-    tasks = [
+def four_tasks() -> Tasks:
+    """Two learners with a teammate on demo_wide, noise with it, a validation teammate, and coord_simple."""
+    return [
         (drawn("demo_wide", "H3", 12), made("ppo"), [(0, 0.0, 20.0), (1, 0.0, 4.0)]),
         (drawn("demo_wide", "H3", 12, seed=1), made("noise"), [(0, 1.0, 41.0), (0, 0.0, 45.0)]),
         (drawn("demo_wide", "H3", 7, "validation"), made("noise", 30, 0.02, 4), [(0, 2.0, 30.0)]),
         (drawn("coord_simple", "H1", 0), made("ppo", 1.5, 0.5, None, "H1/t0"), [(0, 10.0, 10.0)]),
     ]
-    entries: list[Entry] = []
-    for task, provenance, histories in tasks:
-        for stream, (learner, start, end) in enumerate(histories):
-            changes = {
-                "history_id": len(entries),
-                "task_id": task.task_id,
-                "env_idx": stream,
-                "layout": task.layout.name,
-                "split": task.split,
-                "teammate_family": task.teammate_family,
-                "teammate_kind": task.teammate_kind,
-                "learner": learner,
-                "source": provenance.source,
-                "return_start": start,
-                "return_end": end,
-                "has_oracle_actions": provenance.source == "noise",
-                **provenance.entry_fields(),
-            }
-            entries.append(msgspec.structs.replace(base.entries[0], **changes))
-    return replace(
-        base,
-        info=replace(base.info, left_out=[LEFT_OUT, UNHOSTED]),
-        entries=entries,
-        tasks=[task for task, _, _ in tasks],
-        provenance={task.task_id: provenance for task, provenance, _ in tasks},
-    )
 
 
-def test_learning_by_layout_and_source(content):
-    table = card_tables.curves_table(content)
-    assert "| demo_wide | ppo | train | H3 | 1 | 2 | 2 | 240 | 0.0 | 12.0 | 50% |" in table
-    assert "| demo_wide | noise | train | H3 | 1 |  | 2 | 240 | 0.5 | 43.0 | 100% |" in table
-    assert "| demo_wide | noise | validation | H3 | 1 |  | 1 | 120 | 2.0 | 30.0 | 100% |" in table
-    assert "| **with headroom** | noise | all | H3 | 2 |  | 3 | 360 | 1.0 | 38.7 | 100% |" in table
-    assert "| **without headroom** | ppo | all | H1 | 1 | 1 | 1 | 120 | 10.0 | 10.0 | 0% |" in table
+@pytest.fixture
+def write(lite, tmp_path) -> Callable[..., dict[str, Any]]:
+    """Write the files of meta/ that a card is made of, and return its facts; `change` changes every provenance."""
+    like = read_index(lite[0]).entries[0]
+
+    def write(tasks: Tasks | None = None, change: Change = lambda of: of, **fields: Any) -> dict[str, Any]:
+        tasks, entries = four_tasks() if tasks is None else tasks, []
+        for task, of_task, histories in tasks:
+            for stream, (learner, start, end) in enumerate(histories):
+                changes = {"history_id": len(entries), "task_id": task.task_id, "env_idx": stream, "learner": learner}
+                changes |= {"layout": task.layout.name, "split": task.split, "obs_shape": task.layout.obs_shape}
+                changes |= {"teammate_family": task.teammate_family, "teammate_kind": task.teammate_kind}
+                changes |= {"shard": f"data/teammate/{task.layout.name}/{task.split}-00000-of-00001.h5"}
+                changes |= {"source": of_task.source, "return_start": start, "return_end": end}
+                changes |= {"has_oracle_actions": of_task.source == "noise", **of_task.entry_fields(), **fields}
+                entries.append(msgspec.structs.replace(like, **changes))
+        (tmp_path / "meta").mkdir(exist_ok=True)
+        info = replace(describe("lite", "1.0.0", 20, entries), left_out=[LEFT_OUT], shards={"data/x.h5": 1})
+        write_json(tmp_path / INFO, info.to_json())
+        (tmp_path / HISTORIES).write_text("".join(json.dumps(entry.to_json()) + "\n" for entry in entries))
+        write_tasks(tmp_path / TASKS, [task for task, _, _ in tasks])
+        write_json(tmp_path / PROVENANCE, {task.task_id: change(of_task).to_json() for task, of_task, _ in tasks})
+        return facts(tmp_path)
+
+    return write
 
 
-def test_totals_of_a_release_whose_headroom_is_unknown(content):
-    unknown = replace(content, provenance={})
-    assert "| **all** | ppo | all | H1 H3 | 2 | 3 | 3 | 360 | 3.3 | 11.3 | 33% |" in card_tables.curves_table(unknown)
-    assert card_tables.teammates_table(unknown) == "How the teammates act was not measured."
+def test_learning_by_layout_source_and_split(write):
+    content = write()
+    rows = [tuple(row.values()) for row in content["learning"]]
+    assert rows == [
+        ("demo_wide", "ppo", "train", ["H3"], 1, 2, 2, 240, 0.0, 12.0, None, 0.5),
+        ("demo_wide", "noise", "train", ["H3"], 1, 0, 2, 240, 0.5, 43.0, None, 1.0),
+        ("demo_wide", "noise", "validation", ["H3"], 1, 0, 1, 120, 2.0, 30.0, None, 1.0),
+        ("coord_simple", "ppo", "train", ["H1"], 1, 1, 1, 120, 10.0, 10.0, None, 0.0),
+    ]
+    card = render_card(content)
+    assert "| demo_wide | noise | 3 | 1.0 | 38.7 | 100% |" in card
+    assert "| **with headroom** | noise | 3 | 1.0 | 38.7 | 100% |" in card
+    assert "| **without headroom** | ppo | 1 | 10.0 | 10.0 | 0% |" in card
+    assert "| **all** | ppo | 3 | 3.3 | 11.3 | 33% |" in render_card(write(change=lambda of: Provenance()))
 
 
-def test_teammates_with_references_distance_and_behaviour(content):
-    table = card_tables.teammates_table(content)
-    assert "| demo_wide | train | H3/t12 | 0 | ppo, noise | 0.0 | 1.5 | 40.0 |  | yes | H3/t1 | 0.250 | 0 |" in table
-    assert "| demo_wide | validation | H3/t7 | 1 | noise | 0.0 | 1.5 | 30.0 |  | yes | H3/t1 | 0.020 | 4 |" in table
-    assert "| coord_simple | train | H1/t0 | 0 | ppo | 0.0 | 1.5 | 1.5 |  | no | H1/t0 | 0.500 |  |" in table
-    assert "Split train: 1 teammate of known behaviour, 1 different behaviour." in table
-    assert "Of the behaviours of validation (1), 0 also occur in training" in table
+def test_tables_that_are_too_long_for_people(write, tmp_path):
+    write()
+    write_card(tmp_path)
+    tables = json.loads((tmp_path / "card.json").read_text())
+    mates = {(row["layout"], row["teammate"]): row for row in tables["teammates"]}
+    assert list(mates) == [("demo_wide", "H3/t12"), ("demo_wide", "H3/t7"), ("coord_simple", "H1/t0")]
+    mate = mates["demo_wide", "H3/t12"]
+    assert (mate["seed"], mate["sources"], mate["matters"]) == (0, ["noise", "ppo"], True)
+    assert mate["references"] == {"stay": 0.0, "random": 1.5, "oracle": 40.0}
+    assert mate["nearest_test"] == {"teammate": "H3/t1", "distance": 0.25, "behaviour": 0}
+    assert [(row["teammate"], row["step"], row["greedy"], row["last"], row["weak"]) for row in tables["labels"]] == [
+        ("H3/t12", None, 40.0, 12.0, False),
+        ("H3/t12", None, 40.0, 43.0, False),
+        ("H3/t7", None, 30.0, 30.0, False),
+        ("H1/t0", None, 1.5, 10.0, True),
+    ]
+    assert tables["left_out"][0]["reason"] == "the learners did not learn"
+    assert len(tables["learning"]) == 4
 
 
-def test_drawn_teammates_that_act_like_another_family_of_the_test_are_named(content):
-    """Only the own family of a drawn teammate excludes it, so the card says which act like another one."""
-    first, own = content.tasks[0], "None acts like a test teammate of its own family"
-    assert own in render_card(content)
-    assert "another family (distance below" not in render_card(content)
-    near = {first.task_id: made("ppo", distance=0.006, nearest="H1/t0")}
-    card = render_card(replace(content, provenance=dict(content.provenance) | near))
-    assert own in card
+def test_what_the_card_says(write):
+    card = render_card(write())
+    for text in (
+        "6 histories of 4 tasks, 720 transitions; each history has 120 steps.",
+        "Sources: `ppo` (3 histories), `noise` (3 histories).",
+        "Labels: expert actions in every history, oracle actions in 3 histories.",
+        "the script knows the full state",
+        "must infer what the script knew",
+        "No headroom: on coord_simple the ego hardly matters",
+        "Left out: 1 task that were planned or collected; `card.json` has the reasons.",
+        "Split train: 1 teammate of known behaviour, 1 different behaviour.",
+        "Of the behaviours of validation (1), 0 also occur in training.",
+        "| demo_wide | `demo_cook_wide` | 11 x 6 | 45 | 5 | 600 | 28.0 | 2 of 2 |",
+        "They earn less than half of the histories' end in 1 task of ppo on coord_simple",
+        'labels="oracle"',
+    ):
+        assert text in card, text
+    assert "the last one, as in the paper" not in card, "no greedy return of the last checkpoint is known"
+    assert "No teammates" not in card and "figures/" not in card and "configs" not in card
+
+
+def test_teammates_that_act_like_the_test_are_named(write):
+    own = "None acts like a test teammate of its own family"
+    card = render_card(write())
+    assert own in card and "another family (distance below" not in card
+    tasks = four_tasks()
+    tasks[0] = (tasks[0][0], made("ppo", distance=0.006, nearest="H1/t0"), tasks[0][2])
+    tasks[3] = (tasks[3][0], made("ppo", 1.5, 0.01, 0, "H1/t3"), tasks[3][2])
+    card = render_card(write(tasks))
     assert "(distance below 0.02): H3 on demo_wide like H1/t0." in card
-
-
-def test_long_tables_are_summarized(content, monkeypatch):
-    monkeypatch.setattr(card_tables, "LONGEST_TABLE", 2)
-    other = drawn("demo_wide", "H3", 13, seed=2)
-    more = replace(
-        content,
-        tasks=[*content.tasks, other],
-        provenance=dict(content.provenance) | {other.task_id: made("noise", 4.0, 0.5, 0, "H3/t2")},
-    )
-    table = card_tables.teammates_table(more)
-    expected = (
-        "| demo_wide | train | H3 | 2 | 1 | 1 of 2 | 0.0 | 1.5 | 4.0 to 40.0 |  | H3/t1, H3/t2 | 0.250 to 0.500 |"
-    )
-    assert expected in table
-    assert "H3/t12" not in table
-    labels = card_tables.labels_table(content)
-    assert "| demo_wide | noise | train | 1 | 40.0 |  | 43.0 | 0 |" in labels
-
-
-def test_labels_of_a_script_have_no_step(content):
-    table = card_tables.labels_table(content)
-    assert "| demo_wide | noise | train | H3/t12 | script | 40.0 |  | 43.0 |" in table
-    assert "| demo_wide | ppo | train | H3/t12 | unknown | 40.0 | unknown | 12.0 |" in table
-
-
-def test_the_card_says_what_is_left_out_and_what_sources_are_not(content):
-    card = render_card(content)
-    assert "| demo_wide | H1/t3 | ppo | 2 | 128 | 1.2 | 2.5 | the learners did not learn |" in card
-    assert "| demo_wide | H4 |  |  |  |  |  | all 32 draws act like a test teammate |" in card
-    assert "Sources: `ppo` (3 histories), `noise` (3 histories)." in card
-    assert "the script knows the full state" in card
-    assert "must infer what the script knew" in card
-    assert "Labels: expert actions in every history, oracle actions in 3 histories." in card
-    assert "It is the last checkpoint" not in card, "no greedy return of the last checkpoint is known"
-    assert "No headroom: on coord_simple the ego hardly matters." in card
-    assert 'labels="oracle"' in card
-
-
-def test_teammates_that_act_like_the_test_are_named(content):
-    near = [task.task_id for task in content.tasks if task.layout.name == "coord_simple"]
-    content = replace(content, provenance=dict(content.provenance) | {near[0]: made("ppo", 1.5, 0.01, 0, "H1/t3")})
-    card = render_card(content)
-    assert "Training and validation teammates of H3 are heuristics whose parameters were drawn" in card
+    assert "Training and validation teammates of H3 are heuristics whose parameters were drawn" in card and own in card
     assert "Its training teammates H1 are heuristics, in place of the learned teammates" in card
 
 
-def test_tasks_that_hardly_rise_are_named(content):
-    flat = [
-        msgspec.structs.replace(entry, return_end=entry.return_start + 9.5) if entry.source == "ppo" else entry
-        for entry in content.entries
-    ]
-    card = render_card(replace(content, entries=flat))
-    assert "In 1 task on layouts with headroom the end exceeds the start by less than 10: demo_wide with H3/t12" in card
-    assert "(ppo, 9.5)" in card
-    assert "coord_simple with" not in card
-
-
-def test_the_schedules_of_noise_are_stated(content):
-    schedules = {"histories": 8, "episodes": 60, "start": [0.9, 1.0], "end": [0.0, 0.0]}
-    noise = schedules | {"begin": [0.0, 0.3], "finish": [0.6, 1.0], "power": [0.5, 2.0]}
-    made_so = {task_id: replace(of_task, noise=noise) for task_id, of_task in content.provenance.items()}
-    card = render_card(replace(content, provenance=made_so))
-    assert "8 histories of 60 episodes a task" in card
-    assert "(0.90 to 1.00) and its last (0.00)" in card.replace("\n", " ")
-
-
-def test_learning_is_printed(content):
-    output = StringIO()
-    card_tables.print_learning(content, Console(file=output, width=80))
-    text = output.getvalue()
-    assert "without headroom  ppo" in text
-    assert "demo_wide         noise   train" in text
-    assert "*" not in text
-    assert "left out: demo_wide with H1/t3 (ppo): the learners did not learn" in text
-    assert "left out: demo_wide with H4: all 32 draws act like a test teammate" in text
-
-
-def test_oracle_labels_that_earn_little_are_named(content):
-    assert "it earns less than half" not in render_card(content)  # noise histories, which end as the oracle does
-    labelled = replace(
-        content, entries=[msgspec.structs.replace(entry, has_oracle_actions=True) for entry in content.entries]
+def test_tasks_that_hardly_rise_and_weak_oracles_are_named(write):
+    tasks = four_tasks()
+    tasks[0] = (*tasks[0][:2], [(0, 0.0, 9.5), (1, 2.0, 11.5)])
+    card = render_card(write(tasks))
+    said = (
+        "In 1 task on layouts with headroom the end exceeds the start by less than 10: demo_wide with H3/t12 (ppo, 9.5)"
     )
-    text = render_card(labelled)
-    assert "in 1 task of ppo on coord_simple it earns less than half of what the histories earn at their end" in text
-    assert "on demo_wide it earns less" not in text
+    assert said in card, re.findall(r".*the end exceeds.*", card)
+    assert "its actions are no good targets" not in card, "noise histories end as the oracle does"
+    weak = write(has_oracle_actions=True)["weak_oracle"]
+    assert weak == {("coord_simple", "ppo"): 1}
+
+
+def test_how_histories_were_made(write):
+    noise = {"histories": 8, "episodes": 60, "start": [0.9, 1.0], "end": [0, 0], "begin": [0, 0.3], "finish": [0.6, 1]}
+    suite = TeammateSuite(algorithms={"demo_wide": ["fcp"]}, members=2, train=3, total_steps=10**6, threshold=20.0)
+    card = render_card(write(change=lambda of: replace(of, noise=noise | {"power": [0.5, 2.0]}, suite=suite)))
+    assert "8 histories of 60 episodes a task. The chance of a random action falls from 0.9-1.0 to 0" in card
+    assert "Learned teammates: populations of 2, 1,000,000 steps per member, by fcp on demo_wide." in card
+    assert "* No learned teammates on coord_simple: all training teammates there are heuristics." in card
+    assert "fewer training teammates than its profile asks for: fcp on demo_wide (0 of 3)." in card
+    assert "Not recorded" in render_card(write(change=lambda of: Provenance()))
+
+
+def test_learning_is_printed(write):
+    output = StringIO()
+    print_learning(write(), Console(file=output, width=80))
+    lines = [line.split() for line in output.getvalue().splitlines()]
+    assert ["demo_wide", "noise", "train", "H3", "1", "2", "240", "0.50", "43.00", "1.00"] in lines
+    assert ["with", "headroom", "ppo", "all", "H3", "1", "2", "2", "240", "0.00", "12.00", "0.50"] in lines
+    assert "left out: demo_wide with H1/t3 (ppo): the learners did not learn" in output.getvalue()
+
+
+def test_the_bundled_card_is_short_and_current(monkeypatch):
+    content = facts(MINI)
+    assert (MINI / "README.md").read_text() == render_card(content)
+    assert len((MINI / "README.md").read_text().split()) <= 2500
+    snippet = re.search(r"```python\n(.*?)```", render_card(content), re.DOTALL)
+    assert snippet is not None
+    exec(snippet[1].replace("path/of/this/folder", str(MINI)), {})
+
+
+@pytest.mark.parametrize(
+    "provenance",
+    ['{"a": 1}', '{"a": {"ego": 3}}', "[]", '{"a": {"ego": {"total_steps": "many", "environments": 2}}}'],
+)
+def test_malformed_provenance_is_named(damaged, provenance):
+    (damaged / PROVENANCE).write_text(provenance)
+    with pytest.raises(IndexFormatError, match=r"provenance\.json: not as `generation` writes it"):
+        write_card(damaged)
+
+
+def test_names_of_the_hub_and_of_the_benchmark():
+    names = [size_category(rows) for rows in (0, 999, 1000, 10**6 - 1, 10**6, 10**12)]
+    assert names == ["n<1K", "n<1K", "1K<n<10K", "100K<n<1M", "1M<n<10M", "n>1T"]
+    assert evaluated_on(["demo_wide", "asymm_both"]) == ["demo_wide", "asymm_right", "cramped_down"]
+    assert evaluated_on(["cramped_up", "cramped_down"]) == ["cramped_down"]
+
+
+def test_every_field_is_described():
+    assert list(card_texts("arrays")) == list(FIELDS)
+    assert list(card_texts("index")) == list(ENTRY_HINTS)
+    assert list(episode_texts()) == list(EPISODE_COLUMNS)
+    assert card_texts("episodes").keys() <= EPISODE_COLUMNS.keys()

@@ -1,0 +1,515 @@
+"""The card of a release: facts about it, README.md for people, and the tables that are too long for it as card.json."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import (
+    ALGORITHMS,
+    LEAST_HEADROOM,
+    PAPER_EGO_STEPS,
+    PAPER_TEAMMATE_STEPS,
+    PAPER_TEAMMATES,
+    SAME_BEHAVIOUR,
+    SOURCES,
+    SPLITS,
+    TRACKS,
+    family_order,
+    track_of,
+)
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_headroom
+from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.format.index import read_index
+from icrl4aht_data.format.info import ReleaseInfo
+from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.schema import (
+    CARD_TABLES,
+    FIELDS,
+    KINDS,
+    PARQUET_EPISODES,
+    PARQUET_INDEX,
+    PROVENANCE,
+    RELEASE_CARD,
+    TASKS,
+    Entry,
+    are_labels_weak,
+)
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
+from icrl4aht_data.utils.files import files_below, write_json
+from icrl4aht_data.utils.templates import card_file, markdown_table
+from icrl4aht_data.utils.text import counted_noun
+
+HEADROOM_PROTOCOL = "published"
+"""The evaluation protocol whose headroom is shown: that of the paper's numbers."""
+
+CURVES_FIGURE, LAYOUTS_FIGURE, HEADROOM_FIGURE = (
+    f"figures/{name}.png" for name in ("learning_curves", "layouts", "headroom")
+)
+"""Figures of a release that is built for publication."""
+
+LEAST_RISE = 5.0
+"""What the end of a history must exceed its start by to count as learning: a quarter of a delivery."""
+
+CLEAR_RISE = 10
+"""What the end of a task's histories should exceed their start by where the ego matters: half a delivery."""
+
+_SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
+_NO_SHARED_ROOM = ("coord_simple", "test_simple")
+_SCHEDULE = {"histories", "episodes", "start", "end", "begin", "finish", "power"}
+_VERSIONS = {
+    "profile": "profile",
+    "code_version": "icrl4aht-data",
+    "jax_version": "JAX",
+    "platform": "platform",
+    "xla_threads": "XLA threads of the egos",
+}
+
+
+@cache
+def card_texts(section: str) -> dict[str, str]:
+    """Return a section of `cards/dataset_texts.toml`, name -> text.
+
+    Args:
+        section: "sources" (of histories), "kinds" (of release), "arrays" (`schema.FIELDS`), "index" (fields of
+            `schema.Entry`) or "episodes" (columns that differ from both, see `episode_texts`).
+    """
+    return tomllib.loads(card_file("dataset_texts.toml").read_text(encoding="utf-8"))[section]
+
+
+def episode_texts() -> dict[str, str]:
+    """Return a description of each column of `EPISODE_COLUMNS`, name -> text."""
+    texts = card_texts("index") | card_texts("arrays") | card_texts("episodes")
+    return {name: texts[name] for name in EPISODE_COLUMNS}
+
+
+def write_card(root: Path) -> None:
+    """Write README.md and card.json of a release folder, which needs no manifest yet.
+
+    Raises:
+        ReleaseError: if the release cannot be read.
+    """
+    content = facts(root)
+    (root / RELEASE_CARD).write_text(render_card(content), encoding="utf-8")
+    write_json(root / CARD_TABLES, {name: content[name] for name in ("learning", "teammates", "labels", "left_out")})
+
+
+def render_card(content: Mapping[str, Any]) -> str:
+    """Return README.md of a release from its `facts`."""
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined, keep_trailing_newline=True
+    )
+    environment.filters |= {"table": markdown_table, "counted": counted_noun, "span": _span}
+    template = environment.from_string(card_file("dataset.md").read_text(encoding="utf-8"))
+    return template.render(content)
+
+
+def teammate_name(task: Task) -> str:
+    """Family of a task's heuristic, or its algorithm, and number of the parameters, such as "H3/t12"."""
+    family = task.teammate_kind if task.teammate_family == "rl" else task.teammate_family
+    return f"{family}/t{task.teammate.get('theta_id', 0)}"
+
+
+def evaluated_on(layouts: Iterable[str]) -> list[str]:
+    """Return the layouts on which the benchmark tests models that were trained on `layouts`."""
+    names = list(layouts)
+    tested: list[str] = []
+    for track, splits in TRACKS.items():
+        own = [name for name in names if track_of(name) == track]
+        tested += [name for name in own if name in splits["test"]] or (list(splits["test"]) if own else [])
+    return tested
+
+
+def size_category(rows: int) -> str:
+    """Return the Hub's name for a number of rows, here transitions: n<1K, 1K<n<10K, ..., n>1T."""
+    number = len(str(rows)) - len("1000")
+    if number < 0:
+        return f"n<{_SIZES[0]}"
+    return f"{_SIZES[number]}<n<{_SIZES[number + 1]}" if number < len(_SIZES) - 1 else f"n>{_SIZES[-1]}"
+
+
+@dataclass(frozen=True)
+class _TaskFacts:
+    """One task of a release with its histories, which agree in all fields of the index but numbers and returns."""
+
+    first: Entry
+    histories: Sequence[Entry]
+    task: Task | None
+    made: Provenance
+
+    @property
+    def name(self) -> str:
+        return teammate_name(self.task) if self.task else self.first.teammate_kind
+
+    @property
+    def last(self) -> float:
+        """Mean return of the last episodes."""
+        return _mean(entry.return_end for entry in self.histories)
+
+    @property
+    def rise(self) -> float:
+        """What the last episodes earn more than the first, on average."""
+        return _mean(entry.return_end - entry.return_start for entry in self.histories)
+
+    @property
+    def has_weak_labels(self) -> bool:
+        return bool(are_labels_weak(self.first.expert_return, self.last))
+
+    @property
+    def has_weak_oracle(self) -> bool:
+        known = self.made.references if self.first.has(FIELDS["oracle_actions"]) else None
+        return known is not None and bool(are_labels_weak(known.oracle, self.last))
+
+
+def facts(root: Path) -> dict[str, Any]:
+    """Return what the card of a release says about it: plain values, and lists of rows for its tables.
+
+    Args:
+        root: a release folder; needs no card and no manifest yet.
+
+    Raises:
+        ReleaseError: if the release cannot be read.
+    """
+    index, provenance, files = read_index(root), read_provenance(root / PROVENANCE), set(files_below(root))
+    info, entries = index.info, list(index.entries)
+    by_id, members = {task.task_id: task for task in read_tasks(root / TASKS)}, defaultdict[str, list[Entry]](list)
+    for entry in entries:
+        members[entry.task_id].append(entry)
+    tasks = [
+        _TaskFacts(own[0], own, by_id.get(name), provenance.get(name, Provenance())) for name, own in members.items()
+    ]
+    teammates = _teammates(tasks, list(info.layouts))
+    headroom: dict[str, bool] = {}
+    for row in (row for row in teammates if row["matters"] is not None):
+        headroom[row["layout"]] = headroom.get(row["layout"], False) or row["matters"]
+    first = min(entries, key=lambda entry: (entry.split != "train", entry.history_id))
+    length = min(500, *(entry.T for entry in entries if (entry.split, entry.layout) == (first.split, first.layout)))
+    tested = evaluated_on(info.layouts)
+    return {
+        "info": info,
+        "files": files,
+        "size": size_category(info.transitions),
+        "configs": _viewer_configs(entries, files),
+        "has_states": info.kind in KINDS,
+        "tasks": len(tasks),
+        "lengths": [entry.T for entry in entries],
+        "sources": Counter(entry.source for entry in entries),
+        "kinds": dict(sorted({(e.teammate_family, e.teammate_kind) for e in entries if e.teammate_family != "rl"})),
+        "algorithms": [name for name in ALGORITHMS if name in {entry.teammate_kind for entry in entries}],
+        "labelled": {name: sum(e.has(FIELDS[f"{name}_actions"]) for e in entries) for name in ("expert", "oracle")},
+        "example": {"split": first.split, "layout": first.layout, "length": length},
+        "layouts": _layouts(info, teammates),
+        "learning": _learning(tasks, "layout", "source", "split"),
+        "learning_by_layout": _learning(tasks, "layout", "source"),
+        "learning_totals": {
+            title: _learning([task for task in tasks if task.first.layout in names], "source")
+            for title, names in _headroom_groups(headroom, info).items()
+        },
+        "teammates": teammates,
+        **_behaviours(teammates),
+        "labels": _labels(tasks),
+        "weak": _counts(task for task in tasks if task.has_weak_labels),
+        "weak_oracle": _counts(task for task in tasks if task.has_weak_oracle),
+        "left_out": [asdict(task) for task in info.left_out],
+        "headroom": headroom,
+        "test_layouts": tested,
+        "test_headroom": _test_headroom(tested),
+        "splits": _splits(tasks),
+        "arrays": _arrays(info),
+        "no_shared_room": [name for name in _NO_SHARED_ROOM if name in info.layouts],
+        "flat": [
+            f"{task.first.layout} with {task.name} ({task.first.source}, {task.rise:z.1f})"
+            for task in tasks
+            if headroom.get(task.first.layout) and task.rise < CLEAR_RISE
+        ],
+        **_known_families(tasks),
+        **_populations(tasks, info),
+        **_making(tasks),
+        "least": {"rise": LEAST_RISE, "clear_rise": CLEAR_RISE, "headroom": LEAST_HEADROOM, "same": SAME_BEHAVIOUR},
+        "texts": {section: card_texts(section) for section in ("sources", "kinds", "arrays")},
+        "episode_texts": episode_texts(),
+        "paper": {"ego": PAPER_EGO_STEPS, "teammate": PAPER_TEAMMATE_STEPS, "teammates": PAPER_TEAMMATES * 4},
+        "citation": card_file("citation.bib").read_text(encoding="utf-8").strip(),
+    }
+
+
+def _mean(values: Iterable[float]) -> float:
+    return float(np.mean(list(values)))
+
+
+def _span(values: Iterable[float], digits: int = 0) -> str:
+    """Return a number, "least to most" of several that differ, or nothing for none."""
+    found = list(values)
+    ends = [f"{end:z,.{digits}f}" for end in (min(found), max(found))] if found else []
+    return " to ".join(dict.fromkeys(ends))
+
+
+def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return configurations of the Hub's viewer, name -> split -> files: all histories, each layout's, all episodes."""
+    patterns = {"default": f"{PARQUET_INDEX}/*/{{}}.parquet"}
+    patterns |= {entry.layout: f"{PARQUET_INDEX}/{entry.layout}/{{}}.parquet" for entry in entries}
+    patterns |= {PARQUET_EPISODES: f"{PARQUET_EPISODES}/*/{{}}-*.parquet"}
+    folders, configs = {name.split("/")[0] for name in files}, {}
+    for name, pattern in patterns.items():
+        if pattern.split("/")[0] in folders:
+            splits = {entry.split for entry in entries if name in ("default", entry.layout, PARQUET_EPISODES)}
+            configs[name] = {split: pattern.format(split) for split in SPLITS if split in splits}
+    return configs
+
+
+def _grouped(tasks: Iterable[_TaskFacts], *names: str) -> dict[tuple[str, ...], list[_TaskFacts]]:
+    """Return the tasks by the values of some index fields, ordered by layout as in the release, source and split."""
+    groups: dict[tuple[str, ...], list[_TaskFacts]] = {}
+    for task in tasks:
+        groups.setdefault(tuple(getattr(task.first, name) for name in names), []).append(task)
+    orders: list[dict[str, int]] = []
+    for name, values in zip(names, zip(*groups, strict=True), strict=True):
+        known = {"source": SOURCES, "split": SPLITS}.get(name, ())  # other fields are ordered by first appearance
+        orders.append({value: number for number, value in enumerate(dict.fromkeys([*known, *values]))})
+    return {
+        key: groups[key]
+        for key in sorted(groups, key=lambda key: [order[value] for order, value in zip(orders, key, strict=True)])
+    }
+
+
+def _learning(tasks: Iterable[_TaskFacts], *names: str) -> list[dict[str, Any]]:
+    """Return how much histories rise, a row for each combination of some index fields."""
+    rows = []
+    for key, own in _grouped(tasks, *names).items():
+        entries = [entry for task in own for entry in task.histories]
+        filters = [task.made.filter for task in own]
+        row = dict(zip(names, key, strict=True)) | {
+            "teammates": sorted({entry.teammate_family for entry in entries}, key=_learned_last),
+            "tasks": len(own),
+            "learners": len({(entry.task_id, entry.learner) for entry in entries if entry.source == "ppo"}),
+            "histories": len(entries),
+            "transitions": sum(entry.T for entry in entries),
+            "first": _mean(entry.return_start for entry in entries),
+            "last": _mean(entry.return_end for entry in entries),
+            "last_before_filter": _mean(found.before.return_end for found in filters if found)
+            if all(filters)
+            else None,
+            "rising": _mean(entry.return_end - entry.return_start >= LEAST_RISE for entry in entries),
+        }
+        rows.append(row)
+    return rows
+
+
+def _learned_last(family: str) -> tuple[bool, tuple[int, str]]:
+    return family == "rl", family_order(family)
+
+
+def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the teammates of a release, each once, by layout, split and family."""
+    rows: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for one in (one for one in tasks if one.task is not None):
+        task, made = one.task, one.made
+        row = rows.setdefault(
+            (*task.teammate_key, task.split),
+            {
+                "layout": task.layout.name,
+                "split": task.split,
+                "family": task.teammate_family,
+                "teammate": one.name,
+                "seed": task.teammate.get("base_seed"),
+                "sources": [],
+                "references": None,
+                "matters": None,
+                "nearest_test": None,
+            },
+        )
+        row["sources"] = sorted({*row["sources"], one.first.source})
+        if made.references is not None:
+            row |= {"references": made.references.returns, "matters": made.references.matters}
+        row["nearest_test"] = row["nearest_test"] or (made.nearest_test and asdict(made.nearest_test))
+    return sorted(
+        rows.values(),
+        key=lambda row: (layouts.index(row["layout"]), SPLITS.index(row["split"]), _learned_last(row["family"])),
+    )
+
+
+def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return for each split how many teammates of known behaviour there are, and how many different behaviours."""
+    found: dict[str, list[tuple[Any, ...]]] = {}
+    for row in teammates:
+        if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None:
+            behaviour = row["layout"], row["family"], row["nearest_test"]["behaviour"]
+            found.setdefault(row["split"], []).append(behaviour)
+    counts = {split: (len(found[split]), len(set(found[split]))) for split in SPLITS if split in found}
+    shared = set(found.get("train", ())) & set(found.get("validation", ()))
+    return {"behaviours": counts, "shared_behaviours": len(shared)}
+
+
+def _labels(tasks: Iterable[_TaskFacts]) -> list[dict[str, Any]]:
+    """Return what the policies behind the expert actions earn, a row for each task where it was measured."""
+    return [
+        {
+            **{name: getattr(task.first, name) for name in ("task_id", "layout", "source", "split")},
+            "teammate": task.name,
+            "step": task.first.expert_step,
+            "greedy": task.first.expert_return,
+            "sampled": task.first.expert_return_sampled,
+            "last": task.last,
+            "weak": task.has_weak_labels,
+            "weak_oracle": task.has_weak_oracle,
+        }
+        for task in tasks
+        if task.first.expert_return is not None
+    ]
+
+
+def _test_headroom(layouts: Sequence[str]) -> list[list[str]]:
+    """Return the rows of the card's table of what the oracle earns more than `stay`: bold with headroom."""
+    cells, rows = read_headroom(HEADROOM_PROTOCOL), []
+    for family in HEURISTICS:
+        known = [cells.get((layout, family)) for layout in layouts]
+        gains = ["" if found is None else f"{found['oracle'] - found['stay']:z.1f}" for found in known]
+        bold = [found is not None and has_headroom(found) for found in known]
+        rows.append([family, *(f"**{gain}**" if has else gain for gain, has in zip(gains, bold, strict=True))])
+    return rows
+
+
+def _headroom_groups(headroom: Mapping[str, bool], info: ReleaseInfo) -> dict[str, list[str]]:
+    """Return title -> layouts of the rows of totals; all layouts are one group where the headroom of one is unknown."""
+    if len(headroom) < len(info.layouts):
+        return {"all": list(info.layouts)}
+    groups: dict[str, list[str]] = {}
+    for layout in sorted(headroom, key=lambda layout: not headroom[layout]):
+        groups.setdefault("with headroom" if headroom[layout] else "without headroom", []).append(layout)
+    return groups
+
+
+def _counts(tasks: Iterable[_TaskFacts]) -> dict[tuple[str, str], int]:
+    """Return the number of tasks of each layout and source."""
+    return Counter((task.first.layout, task.first.source) for task in tasks)
+
+
+def _layouts(info: ReleaseInfo, teammates: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the rows of the card's table of layouts."""
+    rows = []
+    for name, found in info.layouts.items():
+        layout, own = get_layout(name), [row for row in teammates if row["layout"] == name]
+        known = [row["matters"] for row in own if row["matters"] is not None]
+        rows.append(
+            [
+                *(name, f"`{layout.alias}`", f"{layout.width} x {layout.height}", str(layout.obs_shape[-1])),
+                *(f"{found.histories:,}", f"{found.transitions:,}", f"{found.mean_final_return:z.1f}"),
+                f"{sum(known)} of {len(known)}" if known else "unknown",
+            ]
+        )
+    return rows
+
+
+def _splits(tasks: Iterable[_TaskFacts]) -> list[list[str]]:
+    """Return the rows of the card's table of splits."""
+    rows = []
+    for (track, split), own in _grouped(tasks, "track", "split").items():
+        histories = [entry for task in own for entry in task.histories]
+        counts = len(own), len(histories), sum(entry.T for entry in histories)
+        layouts = ", ".join(dict.fromkeys(task.first.layout for task in own))
+        rows.append([track, split, layouts, *(f"{count:,}" for count in counts)])
+    return rows
+
+
+def _arrays(info: ReleaseInfo) -> list[list[str]]:
+    """Return the rows of the card's table of arrays."""
+    layout, shapes, rows = get_layout(next(iter(info.layouts))), {"scalar": ",", "state": ", S", "obs": ", 5, 5, C"}, []
+    for name, array in FIELDS.items():
+        is_stored = info.kind not in array.absent
+        if is_stored or name == "obs":
+            stored = str(array.element(layout, info.kind).base) if is_stored else "rendered"
+            shape = f"({array.axis}{shapes[array.row]})"
+            rows.append([f"`{name}`", shape, array.dtype, stored, card_texts("arrays")[name]])
+    return rows
+
+
+def _known_families(tasks: Iterable[_TaskFacts]) -> dict[str, list[str]]:
+    """Return heuristic families among the teammates that models are trained on.
+
+    Returns:
+        `tested`: families with test teammates, or teammates that act like those of their own family; `drawn`: families
+        whose teammates do not; `alike`: those of them that act like a test teammate of another family.
+    """
+    tested, drawn, alike = set(), set(), set()
+    for task in tasks:
+        family, near = task.first.teammate_family, task.made.nearest_test
+        if task.first.split == "test" or family == "rl":
+            continue
+        is_same = near is not None and near.distance < SAME_BEHAVIOUR
+        if near is None or (is_same and near.teammate.split("/")[0] == family):
+            tested.add(family)
+            continue
+        drawn.add(family)
+        if is_same:
+            alike.add(f"{family} on {task.first.layout} like {near.teammate}")
+    return {"tested": sorted(tested), "drawn": sorted(drawn), "alike": sorted(alike)}
+
+
+def _distinct(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
+    """Return the values of a field of the tasks' provenance, each once."""
+    values = (getattr(task.made, name) for task in tasks)
+    found = {json.dumps(value, default=asdict): value for value in values if value is not None}
+    return [found[text] for text in sorted(found)]
+
+
+def _populations(tasks: Sequence[_TaskFacts], info: ReleaseInfo) -> dict[str, Any]:
+    """Return how learned teammates were trained, and where there are none, or fewer than their profile asks for."""
+    own = {task.task.teammate_key: task.first for task in tasks if task.task and task.first.split == "train"}
+    found = Counter((entry.layout, entry.teammate_kind) for entry in own.values())
+    wanted: Counter[tuple[str, str]] = Counter()
+    suites: dict[tuple[int, int, float], dict[str, list[str]]] = {}
+    for suite in _distinct(tasks, "suite"):
+        for layout, names in suite.algorithms.items():
+            wanted |= Counter({(layout, name): suite.train for name in names})
+            populations = suites.setdefault((suite.members, suite.total_steps, suite.threshold), {})
+            populations.setdefault(", ".join(names), []).append(layout)
+    learned = {layout for layout, _ in wanted}
+    return {
+        "suites": suites,
+        "no_learned": [layout for layout in info.layouts if wanted and layout not in learned],
+        "few_learned": [
+            f"{algorithm} on {layout} ({found[layout, algorithm]} of {count})"
+            for (layout, algorithm), count in wanted.items()
+            if layout in info.layouts and found[layout, algorithm] < count
+        ],
+        "teammate_steps": sorted({steps for _, steps, _ in suites}),
+    }
+
+
+def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
+    """Return how the histories were made: learners, kept streams, schedules of noise, labellers, versions."""
+    streams: dict[tuple[int, float | None], list[int]] = {}
+    for made in (task.made for task in tasks if task.made.filter and task.made.streams_kept):
+        key = made.streams_recorded or 0, made.filter.least_improvement
+        streams.setdefault(key, []).append(made.streams_kept)
+    noise = {json.dumps([task.made.source, task.made.noise]): task.made for task in tasks if task.made.noise}
+    experts = [task.made.expert for task in tasks if task.made.expert is not None]
+    measured = [
+        expert
+        for expert in experts
+        if expert.policy_sha256 and None not in (expert.return_greedy, expert.last_return_greedy)
+    ]
+    versions = {label: ", ".join(map(str, _distinct(tasks, name))) for name, label in _VERSIONS.items()}
+    return {
+        "egos": _distinct(tasks, "ego"),
+        "ego_steps": sorted({ego["total_steps"] for ego in _distinct(tasks, "ego")}),
+        "learners": [task.made.learners or 1 for task in tasks if task.made.ego],
+        "streams": streams,
+        "schedules": [made for made in noise.values() if (made.noise or {}).keys() >= _SCHEDULE],
+        "student_labels": {t.made.expert.action for t in tasks if t.made.source == "student" and t.made.expert},
+        "policies": sum(expert.policy_sha256 is not None for expert in experts),
+        "measured": len(measured),
+        "earlier": sum(expert.return_greedy != expert.last_return_greedy for expert in measured),
+        "versions": "; ".join(f"{label} {values}" for label, values in versions.items() if values),
+    }
