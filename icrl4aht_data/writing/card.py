@@ -288,7 +288,7 @@ def _learning(tasks: Iterable[_TaskFacts], *names: str) -> list[dict[str, Any]]:
     rows = []
     for key, own in _grouped(tasks, *names).items():
         entries = [entry for task in own for entry in task.histories]
-        filters = [task.made.filter for task in own]
+        before = [task.made.filter.before.return_end for task in own if task.made.filter]
         row = dict(zip(names, key, strict=True)) | {
             "teammates": sorted({entry.teammate_family for entry in entries}, key=_learned_last),
             "tasks": len(own),
@@ -297,9 +297,7 @@ def _learning(tasks: Iterable[_TaskFacts], *names: str) -> list[dict[str, Any]]:
             "transitions": sum(entry.T for entry in entries),
             "first": _mean(entry.return_start for entry in entries),
             "last": _mean(entry.return_end for entry in entries),
-            "last_before_filter": _mean(found.before.return_end for found in filters if found)
-            if all(filters)
-            else None,
+            "last_before_filter": _mean(before) if len(before) == len(own) else None,
             "rising": _mean(entry.return_end - entry.return_start >= LEAST_RISE for entry in entries),
         }
         rows.append(row)
@@ -312,31 +310,28 @@ def _learned_last(family: str) -> tuple[bool, tuple[int, str]]:
 
 def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict[str, Any]]:
     """Return the teammates of a release, each once, by layout, split and family."""
-    rows: dict[tuple[str, str, str], dict[str, Any]] = {}
-    for one in (one for one in tasks if one.task is not None):
-        task, made = one.task, one.made
-        row = rows.setdefault(
-            (*task.teammate_key, task.split),
+    groups = defaultdict[tuple[str, str, str], list[_TaskFacts]](list)
+    for one in tasks:
+        if one.task is not None:
+            groups[*one.task.teammate_key, one.task.split].append(one)
+    rows = []
+    for own in groups.values():
+        first, task = own[0].first, own[0].task
+        references = next((one.made.references for one in own if one.made.references), None)
+        nearest = next((one.made.nearest_test for one in own if one.made.nearest_test), None)
+        rows.append(
             {
-                "layout": task.layout.name,
-                "split": task.split,
-                "family": task.teammate_family,
-                "teammate": one.name,
-                "seed": task.teammate.get("base_seed"),
-                "sources": [],
-                "references": None,
-                "matters": None,
-                "nearest_test": None,
-            },
+                **{"layout": first.layout, "split": first.split, "family": first.teammate_family},
+                "teammate": own[0].name,
+                "seed": task and task.teammate.get("base_seed"),
+                "sources": sorted({one.first.source for one in own}),
+                "references": references and references.returns,
+                "matters": references and references.matters,
+                "nearest_test": nearest and asdict(nearest),
+            }
         )
-        row["sources"] = sorted({*row["sources"], one.first.source})
-        if made.references is not None:
-            row |= {"references": made.references.returns, "matters": made.references.matters}
-        row["nearest_test"] = row["nearest_test"] or (made.nearest_test and asdict(made.nearest_test))
-    return sorted(
-        rows.values(),
-        key=lambda row: (layouts.index(row["layout"]), SPLITS.index(row["split"]), _learned_last(row["family"])),
-    )
+    order = {name: number for number, name in enumerate((*layouts, *SPLITS))}
+    return sorted(rows, key=lambda row: (order[row["layout"]], order[row["split"]], _learned_last(row["family"])))
 
 
 def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
@@ -490,9 +485,10 @@ def _populations(tasks: Sequence[_TaskFacts], info: ReleaseInfo) -> dict[str, An
 def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
     """Return how the histories were made: learners, kept streams, schedules of noise, labellers, versions."""
     streams: dict[tuple[int, float | None], list[int]] = {}
-    for made in (task.made for task in tasks if task.made.filter and task.made.streams_kept):
-        key = made.streams_recorded or 0, made.filter.least_improvement
-        streams.setdefault(key, []).append(made.streams_kept)
+    for made in (task.made for task in tasks):
+        if made.filter and made.streams_kept:
+            key = made.streams_recorded or 0, made.filter.least_improvement
+            streams.setdefault(key, []).append(made.streams_kept)
     noise = {json.dumps([task.made.source, task.made.noise]): task.made for task in tasks if task.made.noise}
     experts = [task.made.expert for task in tasks if task.made.expert is not None]
     measured = [

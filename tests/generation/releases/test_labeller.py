@@ -178,7 +178,9 @@ def test_index_provenance_and_card_state_the_labeller(built):
     assert expert.policy_sha256 == file_hash(artefact(built / "a") / f"checkpoints/c{number}/policy.safetensors")
     card = (root / "README.md").read_text()
     assert "## Labels" in card
-    assert f"| demo_wide | ppo | train | H4/t0 | {step:,} | {greedy[number]:.1f} |" in card
+    (row,) = json.loads((root / "card.json").read_text())["labels"]
+    assert (row["layout"], row["teammate"], row["step"]) == ("demo_wide", "H4/t0", step)
+    assert row["greedy"] == pytest.approx(greedy[number])
 
 
 def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
@@ -208,7 +210,7 @@ def test_the_card_marks_labels_that_earn_less_than_half_of_the_end(task, tmp_pat
     with_returns(folder, [ends * share] * 5)
     root = package_release(folder.parent, tmp_path / "lite", [Work(chosen)], profile, tmp_path, "lite")
     card = (root / "README.md").read_text()
-    assert ("| **demo_wide** | **ppo** | **train** |" in card) == weak
+    assert ("histories' end in 1 task of ppo on demo_wide" in card) == weak
     assert ("The labels of 1 task earn less than half" in card) == weak
     assert ("No labels earn less than half" in card) != weak
 
