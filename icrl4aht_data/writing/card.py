@@ -57,22 +57,10 @@ CURVES_FIGURE, LAYOUTS_FIGURE, HEADROOM_FIGURE = (
 )
 """Figures of a release that is built for publication."""
 
-LEAST_RISE = 5.0
-"""What the end of a history must exceed its start by to count as learning: a quarter of a delivery."""
-
-CLEAR_RISE = 10
-"""What the end of a task's histories should exceed their start by where the ego matters: half a delivery."""
-
+_LEAST_RISE, _CLEAR_RISE = 5.0, 10  # what ends should exceed starts by: a quarter of a delivery, and a half
 _SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
 _NO_SHARED_ROOM = ("coord_simple", "test_simple")
 _SCHEDULE = {"histories", "episodes", "start", "end", "begin", "finish", "power"}
-_VERSIONS = {
-    "profile": "profile",
-    "code_version": "icrl4aht-data",
-    "jax_version": "JAX",
-    "platform": "platform",
-    "xla_threads": "XLA threads of the egos",
-}
 
 
 @cache
@@ -111,8 +99,7 @@ def render_card(content: Mapping[str, Any]) -> str:
         trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined, keep_trailing_newline=True
     )
     environment.filters |= {"table": markdown_table, "counted": counted_noun, "span": _span}
-    template = environment.from_string(card_file("dataset.md").read_text(encoding="utf-8"))
-    return template.render(content)
+    return environment.from_string(card_file("dataset.md").read_text(encoding="utf-8")).render(content)
 
 
 def teammate_name(task: Task) -> str:
@@ -123,8 +110,7 @@ def teammate_name(task: Task) -> str:
 
 def evaluated_on(layouts: Iterable[str]) -> list[str]:
     """Return the layouts on which the benchmark tests models that were trained on `layouts`."""
-    names = list(layouts)
-    tested: list[str] = []
+    names, tested = list(layouts), list[str]()
     for track, splits in TRACKS.items():
         own = [name for name in names if track_of(name) == track]
         tested += [name for name in own if name in splits["test"]] or (list(splits["test"]) if own else [])
@@ -231,14 +217,13 @@ def facts(root: Path) -> dict[str, Any]:
         "flat": [
             f"{task.first.layout} with {task.name} ({task.first.source}, {task.rise:z.1f})"
             for task in tasks
-            if headroom.get(task.first.layout) and task.rise < CLEAR_RISE
+            if headroom.get(task.first.layout) and task.rise < _CLEAR_RISE
         ],
         **_known_families(tasks),
         **_populations(tasks, info),
         **_making(tasks),
-        "least": {"rise": LEAST_RISE, "clear_rise": CLEAR_RISE, "headroom": LEAST_HEADROOM, "same": SAME_BEHAVIOUR},
+        "least": {"rise": _LEAST_RISE, "clear_rise": _CLEAR_RISE, "headroom": LEAST_HEADROOM, "same": SAME_BEHAVIOUR},
         "texts": {section: card_texts(section) for section in ("sources", "kinds", "arrays")},
-        "episode_texts": episode_texts(),
         "paper": {"ego": PAPER_EGO_STEPS, "teammate": PAPER_TEAMMATE_STEPS, "teammates": PAPER_TEAMMATES * 4},
         "citation": card_file("citation.bib").read_text(encoding="utf-8").strip(),
     }
@@ -298,7 +283,7 @@ def _learning(tasks: Iterable[_TaskFacts], *names: str) -> list[dict[str, Any]]:
             "first": _mean(entry.return_start for entry in entries),
             "last": _mean(entry.return_end for entry in entries),
             "last_before_filter": _mean(before) if len(before) == len(own) else None,
-            "rising": _mean(entry.return_end - entry.return_start >= LEAST_RISE for entry in entries),
+            "rising": _mean(entry.return_end - entry.return_start >= _LEAST_RISE for entry in entries),
         }
         rows.append(row)
     return rows
@@ -321,7 +306,9 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
         nearest = next((one.made.nearest_test for one in own if one.made.nearest_test), None)
         rows.append(
             {
-                **{"layout": first.layout, "split": first.split, "family": first.teammate_family},
+                "layout": first.layout,
+                "split": first.split,
+                "family": first.teammate_family,
                 "teammate": own[0].name,
                 "seed": task and task.teammate.get("base_seed"),
                 "sources": sorted({one.first.source for one in own}),
@@ -496,7 +483,8 @@ def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
         for expert in experts
         if expert.policy_sha256 and None not in (expert.return_greedy, expert.last_return_greedy)
     ]
-    versions = {label: ", ".join(map(str, _distinct(tasks, name))) for name, label in _VERSIONS.items()}
+    labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
+    versions = {label: ", ".join(map(str, _distinct(tasks, name))) for name, label in labels.items()}
     return {
         "egos": _distinct(tasks, "ego"),
         "ego_steps": sorted({ego["total_steps"] for ego in _distinct(tasks, "ego")}),
