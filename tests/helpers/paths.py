@@ -1,8 +1,16 @@
-"""Paths of the repository."""
+"""Folders of the repository that tests read."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-"""The root of the repository."""
+
+PACKAGES = {
+    "icrl4aht_data": ROOT / "icrl4aht_data",
+    "icrl4aht_generation": ROOT / "generation" / "icrl4aht_generation",
+    "icrl4aht_baselines": ROOT / "baselines" / "icrl4aht_baselines",
+    "benchmarks": ROOT / "benchmarks",
+    "tests": ROOT / "tests",
+}
+"""Import name -> folder of each package."""

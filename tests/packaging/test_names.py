@@ -6,62 +6,55 @@ import ast
 import re
 from collections import defaultdict
 from collections.abc import Iterator
-from pathlib import Path
 
-import pytest
+from tests.helpers.paths import PACKAGES, ROOT
 
-from tests.helpers.paths import ROOT
+LONGEST = 500
+"""Most lines of a source file, as CONTRIBUTING.md says."""
 
-PACKAGES = ("icrl4aht_data", "generation", "baselines", "benchmarks")
-ENTRY_POINTS = {"main"}
-"""Names that several command lines have."""
 OPENING = re.compile(r"(Of|The same|By|Its)\b")
 """Openings of sentences that only the previous docstring explains."""
 
 
-def parsed(*packages: str) -> Iterator[tuple[Path, ast.Module]]:
-    """Paths relative to the repository, and syntax trees."""
-    for path in sorted(path for package in packages for path in (ROOT / package).rglob("*.py")):
-        yield path.relative_to(ROOT), ast.parse(path.read_text(encoding="utf-8"))
+def sources(*names: str) -> Iterator[tuple[str, str]]:
+    """Yield the path in the repository and the text of each source file of some packages."""
+    for path in sorted(path for name in names for path in PACKAGES[name].rglob("*.py")):
+        yield path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
 
 
-def public_names(tree: ast.Module) -> set[str]:
-    """Names that a module defines at the top level, without commands, type variables and the names it imports."""
-    found: set[str] = set()
+def public_names(tree: ast.Module) -> Iterator[str]:
+    """Yield the classes, functions and constants that a module defines, without click's commands and type variables."""
     for node in tree.body:
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
             decorators = " ".join(map(ast.unparse, node.decorator_list))
-            found |= set() if ".command(" in decorators or ".group(" in decorators else {node.name}
+            names = [] if ".command(" in decorators or ".group(" in decorators else [node.name]
         elif isinstance(node, ast.Assign | ast.AnnAssign) and "TypeVar(" not in ast.unparse(node):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            found |= {name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)}
-    return {name for name in found if not name.startswith("_")}
-
-
-def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Line and text of docstrings, also of those below a constant or field."""
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        for statement in body if isinstance(body, list) else []:
-            if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
-                yield statement.lineno, str(statement.value.value)
+            names = [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+        else:
+            names = []
+        yield from (name for name in names if not name.startswith("_"))
 
 
 def test_public_names_are_unique():
-    modules: dict[str, list[str]] = defaultdict(list)
-    for path, tree in parsed(*PACKAGES):
-        for name in public_names(tree) - ENTRY_POINTS:
-            modules[name].append(str(path))
-    shared = [f"{name}: {', '.join(paths)}" for name, paths in sorted(modules.items()) if len(paths) > 1]
-    assert not shared, "\n".join(shared)
+    modules: dict[str, set[str]] = defaultdict(set)
+    for path, text in sources(*(name for name in PACKAGES if name != "tests")):
+        for name in public_names(ast.parse(text)):
+            modules[name].add(path)
+    assert {name: paths for name, paths in modules.items() if len(paths) > 1 and name not in ("main", "VERBS")} == {}
 
 
-@pytest.mark.parametrize("package", [*PACKAGES, "tests"])
-def test_docstrings_make_sense_alone(package):
-    found = [
-        f"{path}:{line}: {text.splitlines()[0]}"
-        for path, tree in parsed(package)
-        for line, text in docstrings(tree)
-        if OPENING.match(text)
+def test_docstrings_make_sense_alone():
+    strings = [
+        (path, statement.lineno, statement.value.value)
+        for path, text in sources(*PACKAGES)
+        for node in ast.walk(ast.parse(text))
+        for statement in (node.body if isinstance(getattr(node, "body", None), list) else [])  # type: ignore[attr-defined]
+        if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
     ]
-    assert not found, "\n".join(found)
+    assert [found for found in strings if OPENING.match(str(found[2]))] == []
+
+
+def test_source_files_are_short():
+    lines = {path: text.count("\n") for path, text in sources(*(name for name in PACKAGES if name != "tests"))}
+    assert {path: count for path, count in lines.items() if count > LONGEST} == {}

@@ -16,7 +16,7 @@ import pytest
 from gymnasium.envs import registration
 from gymnasium.error import NamespaceNotFound
 
-from tests.helpers.paths import ROOT
+from tests.helpers.paths import PACKAGES, ROOT
 from tests.packaging.test_docs import DOCS, PAGES, rows
 
 FILES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(DOCS / f"{page}.md" for page in PAGES)]
@@ -73,13 +73,6 @@ def test_no_command_installs_the_package_from_an_index(path):
     assert not found, "no index has the package"
 
 
-def test_files_of_the_packages_are_as_short_as_contributing_says():
-    (limit,) = re.findall(r"have at most (\d+) lines", TEXTS[ROOT / "CONTRIBUTING.md"])
-    files = [path for name in ("icrl4aht_data", "generation", "baselines") for path in (ROOT / name).rglob("*.py")]
-    lines = {path.relative_to(ROOT).as_posix(): len(path.read_text(encoding="utf-8").splitlines()) for path in files}
-    assert not {name: count for name, count in lines.items() if count > int(limit)}
-
-
 def message_of_gymnasium() -> str:
     """Return what Gymnasium says about the id of a task where `icrl4aht_data` is not imported."""
     with mock.patch.dict(registration.registry, clear=True), pytest.raises(NamespaceNotFound) as caught:
@@ -92,8 +85,8 @@ def test_messages_of_the_faq_are_those_of_the_code():
 
     The message about Gymnasium's ids is Gymnasium's.
     """
-    packages = ("icrl4aht_data", "generation", "baselines")
-    sources = "".join(path.read_text(encoding="utf-8") for name in packages for path in (ROOT / name).rglob("*.py"))
+    folders = [folder for name, folder in PACKAGES.items() if name.startswith("icrl4aht")]
+    sources = "".join(path.read_text(encoding="utf-8") for folder in folders for path in folder.rglob("*.py"))
     joined = re.sub(r"[\"']\s*f?[\"']", "", sources + message_of_gymnasium()).lower()
     messages = [title for title in re.findall(r"^### (.*)$", PAGES["faq"], re.MULTILINE) if not title.endswith("?")]
     assert len(messages) > 20
