@@ -31,7 +31,6 @@ from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.installation import install_command
-from icrl4aht_data.utils.new_file import MARK
 from icrl4aht_data.utils.text import counted_noun
 
 if TYPE_CHECKING:
@@ -469,6 +468,5 @@ def _saved(figure: Figure, path: Path | None, dpi: int) -> Figure:
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
     """Write a figure in the format that the path's suffix names; an existing file is replaced at once."""
     kind = path.suffix.removeprefix(".")
-    key = {"png": "Software", "svg": "Creator", "pdf": "Creator"}.get(kind.lower())
     with atomic_write(path) as partial:
-        figure.savefig(partial, dpi=dpi, format=kind, metadata={key: MARK} if key else None)
+        figure.savefig(partial, dpi=dpi, format=kind)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 
 import click
@@ -30,7 +31,7 @@ from icrl4aht_data.commands.options import (
     wanted_filters,
 )
 from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
@@ -91,7 +92,9 @@ def browse(
     if out is None and overwrite:
         raise click.UsageError("--overwrite replaces a file: give --out FILE with it")
     if out is not None:
-        check_new_file(out, overwrite, PAGE_START)
+        with suppress(OSError), out.open("rb") as stream:  # a page of this command is written again
+            overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
+        check_output(out, overwrite)
     matching = load_icrl4aht(root, **wanted_filters(filters))
     check_drawable(matching)
     chosen = matching.select(list(dict.fromkeys(wanted)) or spread_histories(matching, histories))

@@ -122,7 +122,7 @@ COUNT_OR_NONE = click.IntRange(min=0)
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace what exists, if it carries this package's mark and nothing was added."
+    "--overwrite", is_flag=True, help="Replace what exists: files, or a release folder, which has a manifest."
 )
 family_map_option = click.option(
     "--family-map",

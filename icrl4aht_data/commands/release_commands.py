@@ -47,7 +47,7 @@ from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
 from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.remote.download import repair as repair_files
-from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_data.writing.combine import combine_releases
@@ -121,7 +121,7 @@ def show(
     if overwrite and plot is None:
         raise click.UsageError("--overwrite replaces a picture: give --plot FILE with it")
     if plot is not None:
-        check_new_file(plot, overwrite)
+        check_output(plot, overwrite)
     dataset = _load(root, filters)
     if history_id is None:
         facts = summarize_selection(dataset)

@@ -21,7 +21,6 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import faults, record_size
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.installation import install_command
-from icrl4aht_data.utils.new_file import MARK
 from icrl4aht_data.utils.options import check_int
 
 if TYPE_CHECKING:
@@ -107,7 +106,7 @@ def encode_episode(
         earned += reward
     colours, dither = _shared_palette(frames), _pillow()[0].Dither.NONE
     first, *rest = (frame.quantize(palette=colours, dither=dither) for frame in frames)
-    other = {"duration": round(1000 / fps), "loop": 0, "comment": MARK.encode()}
+    other = {"duration": round(1000 / fps), "loop": 0}
     palette = bytes(colours.getpalette() or [])  # passed explicitly, it is written once instead of once per frame
     content = BytesIO()
     first.save(content, format="GIF", save_all=True, append_images=rest, palette=palette, optimize=True, **other)

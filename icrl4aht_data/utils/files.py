@@ -12,14 +12,14 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
 from filelock import FileLock
 
-from icrl4aht_data.errors import DiskFullError, IndexFormatError, UnsafePathError
+from icrl4aht_data.errors import DiskFullError, IndexFormatError, OptionError, UnsafePathError
 
 TEXT_BYTES = 64 * 2**20
 """Most bytes of a file that is read at once: six times the largest, the provenance of ten thousand tasks."""
@@ -188,6 +188,31 @@ def atomic_write(path: Path) -> Iterator[Path]:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None) -> None:
+    """Check that a command may write a file, or files into a folder: what exists is replaced with `overwrite` only.
+
+    Folders and links are never replaced.
+
+    Args:
+        path: the file to write; with `names` the folder.
+        overwrite: replace these files. Other files of a folder stay.
+        names: names of the files to write into the folder.
+
+    Raises:
+        OptionError: names the file or folder that may not be written.
+    """
+    if names is not None and os.path.lexists(path):
+        if not path.is_dir():
+            raise OptionError(f"{path}: a file is where a folder is needed; give another folder")
+        if not overwrite and any(path.iterdir()):
+            raise OptionError(f"{path}: exists; give another folder, or replace its files by --overwrite")
+    for file in [path] if names is None else [path / name for name in names]:
+        if file.is_symlink() or (file.exists() and not file.is_file()):
+            raise OptionError(f"{file}: a folder or a link is where a file is needed; give another name")
+        if file.exists() and not overwrite:
+            raise OptionError(f"{file}: exists; give another name, or replace it by --overwrite")
 
 
 T = TypeVar("T")

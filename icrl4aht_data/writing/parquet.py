@@ -11,8 +11,7 @@ import numpy as np
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.reading.arrow_tables import episode_schema, episode_table, import_pyarrow, index_schema
-from icrl4aht_data.utils.files import atomic_write, explain_full_disk
-from icrl4aht_data.utils.new_file import MARK, check_new_file
+from icrl4aht_data.utils.files import atomic_write, check_output, explain_full_disk
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -30,19 +29,19 @@ def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path
     Args:
         dataset: a release, or a part of one.
         path: the file to write.
-        overwrite: replace a Parquet file of this function at `path`.
+        overwrite: replace a file at `path`.
 
     Raises:
-        OptionError: if pyarrow is not installed, or `path` may not be written, see `new_file.check_new_file`, or
+        OptionError: if pyarrow is not installed, or `path` may not be written, see `utils.files.check_output`, or
             is inside the release.
     """
     arrow = import_pyarrow()
     import pyarrow.parquet as pq
 
-    check_new_file(path, overwrite)
+    check_output(path, overwrite)
     if path.resolve().is_relative_to(dataset.root.resolve()):
         raise OptionError(f"{path}: is inside {dataset.root}, which is read; give another path")
-    schema = index_schema().with_metadata({MARK: "index"})
+    schema = index_schema().with_metadata({"icrl4aht-data": "index"})
     rows = arrow.Table.from_pylist([entry.to_json() for entry in dataset.entries], schema)
     with explain_full_disk(path), atomic_write(path) as partial, partial.open("wb") as stream:
         pq.write_table(rows, stream)  # which would leave a file open where it fails

@@ -166,7 +166,7 @@ def evaluate_command(
 )
 @click.option(
     "--html",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=NewFile(".html", ".htm"),
     metavar="FILE",
     help="Also write one HTML page: the summary, curves, episodes, tables.",
 )

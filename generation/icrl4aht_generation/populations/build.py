@@ -22,7 +22,7 @@ from icrl4aht_data.benchmark.facts import (
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.plotting import check_can_draw
-from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_generation.learners.resume import BusyError
 from icrl4aht_generation.plotting import plot_matrix
@@ -165,7 +165,7 @@ def report_diversity(
 
     Raises:
         OptionError: if a population is not finished, or no layout has all of them; if a picture may not be written, see
-            `new_file.check_new_file`; if matplotlib is not installed.
+            `utils.files.check_output`; if matplotlib is not installed.
     """
     check_can_draw()
     out = out or suite
@@ -179,7 +179,7 @@ def report_diversity(
         )
     for name in names:
         for picture in (_distances_picture(out, name), *(_cross_play_picture(out, name, each) for each in algorithms)):
-            check_new_file(picture, overwrite)
+            check_output(picture, overwrite)
     for name in names:
         layout = get_layout(name)
         for algorithm in algorithms:

@@ -165,7 +165,7 @@ class TestCommand:
     def test_it_writes_a_page(self, release, tmp_path):
         out = tmp_path / "page.html"
         assert browse(release, "--out", out).startswith(f"{out}: 12 of 12 histories, all 96 episodes to watch, ")
-        facts = json.loads(browse(release, "--out", out, "--overwrite", "--histories", 4, "--json"))
+        facts = json.loads(browse(release, "--out", out, "--histories", 4, "--json"))
         assert facts == {
             "page": str(out),
             "address": None,
@@ -189,13 +189,14 @@ class TestCommand:
             browse(tmp_path / "obs", "--out", tmp_path / "page.html")
         assert not (tmp_path / "page.html").exists()
 
-    def test_only_pages_are_overwritten(self, release, tmp_path):
-        out = tmp_path / "page.html"
-        out.write_text("<!doctype html>\n<html><title>mine</title>")
-        for overwrite in ((), ("--overwrite",)):
-            with pytest.raises(OptionError, match=f"{out}: (exists|is not a file as this command writes it)"):
-                browse(release, "--out", out, *overwrite)
-        assert out.read_text().endswith("<title>mine</title>")
+    def test_a_page_is_written_again_and_other_files_are_kept(self, release, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        for _ in range(2):
+            assert browse(release).startswith("browse.html: 12 of 12 histories")
+        (tmp_path / "browse.html").write_text("<!doctype html>\n<html><title>mine</title>")
+        with pytest.raises(OptionError, match=r"browse\.html: exists; give another name, or replace it by --overwrite"):
+            browse(release)
+        assert (tmp_path / "browse.html").read_text().endswith("<title>mine</title>")
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

@@ -194,10 +194,9 @@ def test_commands_destroy_nothing(lite, full, tmp_path):
         *(("release", "build", ca, "--out", target) for target in (ca, cb, mine)),
         *(("convert", ca, "--to", form, "--out", cb) for form in ("full", "published", "parquet")),
         *(("convert", ca, "--to", form, "--out", mine, "--overwrite") for form in ("full", "published", "parquet")),
-        ("convert", ca, "--to", "parquet", "--out", f"{mine}/index.parquet", "--overwrite"),
+        ("convert", ca, "--to", "parquet", "--out", f"{mine}/index.parquet"),
         ("convert", ca, "--to", "parquet", "--out", f"{ca}/index.parquet"),
         ("show", ca, "--plot", f"{mine}/curves.png"),
-        ("show", ca, "--plot", f"{mine}/curves.png", "--overwrite"),
     ]
     commands.remove(("combine", ca, "--out", cb, "--overwrite"))  # `cb` is a release: replaced as demanded
     for command in commands:
@@ -232,7 +231,7 @@ def test_output_that_was_closed_from_the_start_is_dropped(lite, monkeypatch, arg
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", ["icrl4aht_data list", "icrl4aht_data show --json", "generation --help"])
+@pytest.mark.parametrize("program", ["icrl4aht_data list", "icrl4aht_data show --json", "icrl4aht_data --help"])
 def test_a_reader_that_has_gone_stops_a_command_quietly(program):
     reader, writer = os.pipe()
     os.close(reader)
