@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -10,18 +11,19 @@ import numpy as np
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Finding, NamedProgress, Report
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files, expert_folder
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import INFO, MANIFEST, PROVENANCE, TEAMMATES
+from icrl4aht_data.format.schema import EXPERTS, INFO, MANIFEST, PROVENANCE, TEAMMATES
 from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.utils.files import LARGEST, files_below, plain_size, resolve_inside
 from icrl4aht_data.utils.hashes import file_hash
 
 _HUB_FILES = (".gitattributes", ".cache/huggingface/")
 """Files that the Hub and its client add to a repository's."""
+
+_META = re.compile(r"meta/[^/]+")  # `load_icrl4aht` compares these files with the manifest, so every level does
 
 
 def check_files(
@@ -59,7 +61,7 @@ def check_files(
             if right is not None and size != right:
                 report.add(name, f"expected {right:,} bytes, found {size:,}")
                 continue
-            found = listed[name] if quick else file_hash(path)
+            found = listed[name] if quick and not _META.fullmatch(name) else file_hash(path)
         except (Icrl4ahtError, OSError) as error:
             report.add(name, str(error))
             continue
@@ -84,24 +86,42 @@ def _covered_size(root: Path, name: str) -> int:
     return int(read_table(resolve_inside(root, chunk_table_name(name)))["size"].sum(dtype=np.int64))
 
 
-def check_references(listed: Iterable[str], index: Index, tasks: Iterable[Task], report: Report) -> None:
+def check_references(
+    listed: Mapping[str, str],
+    index: Index,
+    tasks: Iterable[Task],
+    provenance: Mapping[str, Provenance] | None,
+    report: Report,
+) -> None:
     """Check that shards, chunk tables and policies in the manifest are those of a history or a task.
 
+    A policy's folder is named by the SHA-256 of its weights. A release may be without the policies.
+
     Args:
-        listed: the files of the manifest.
+        listed: the manifest, file -> SHA-256.
         index: the release's index.
         tasks: its tasks.
+        provenance: task id -> how its histories were made; None if unknown.
         report: receives the problems.
     """
     shards = index.values("shard")
     known = {*shards, *map(chunk_table_name, shards)}
-    teammates = {task.teammate["theta"]["sha256"] for task in tasks if task.teammate.get("kind") == "rl"}
+    learned = [task.teammate["theta"]["sha256"] for task in tasks if task.teammate.get("kind") == "rl"]
+    labellers = {made.expert.policy_sha256 for made in (provenance or {}).values() if made.expert}
     for name in sorted(listed):
-        top, folder = name.split("/")[0], name.split("/")[1:2]
+        top, folder, *_ = *name.split("/"), ""
         if (top == "data" or name.startswith("meta/chunks/")) and name not in known:
             report.add(name, "no history of the index is in this shard")
-        if top == TEAMMATES and folder and folder[0] not in teammates:
+        elif top == TEAMMATES and folder not in learned:
             report.add(name, "no task has this teammate")
+        elif top == EXPERTS and provenance is not None and folder not in labellers:
+            report.add(name, f"{PROVENANCE} names no such policy")
+        elif name.endswith(".safetensors") and listed[name] != folder:
+            report.add(name, f"sha256 {listed[name]}, expected {folder}, the name of its folder")
+    with_weights = {name.split("/")[1] for name in listed if name.startswith(f"{TEAMMATES}/")}
+    without = sum(sha256 not in with_weights for sha256 in learned)
+    if without and report.level != "quick":
+        report.notes.append(f"{without} tasks have learned teammates whose checkpoints this release does not have")
 
 
 def check_shard_sizes(origin: ReleaseLocation, index: Index, shards: list[str], report: Report) -> None:
@@ -125,41 +145,3 @@ def check_shard_sizes(origin: ReleaseLocation, index: Index, shards: list[str], 
         )
         if Finding(name, problem) not in known:
             report.add(name, problem)
-
-
-def check_checkpoints(root: Path, tasks: list[Task], report: Report) -> None:
-    """Check that the weights of learned teammates are those that the tasks name; a release may omit them."""
-    without = 0
-    for task in tasks:
-        try:
-            files = checkpoint_files(root / TEAMMATES, task, root)
-        except Icrl4ahtError as error:
-            report.add(f"{TEAMMATES}/{task.teammate['theta']['sha256']}", str(error))
-            continue
-        without += task.teammate_family == "rl" and not files
-        for name, path in files.items():
-            found, expected = file_hash(path), task.teammate["theta"]["sha256"]
-            if path.suffix == ".safetensors" and found != expected:
-                report.add(name, f"sha256 {found}, expected {expected} as task {task.task_id!r} says")
-    if without:
-        report.notes.append(f"{without} tasks have learned teammates whose checkpoints this release does not have")
-
-
-def check_experts(root: Path, provenance: Mapping[str, Provenance], report: Report) -> None:
-    """Check the policies behind the expert actions, in folder EXPERTS, against meta/provenance.json.
-
-    A release may omit the policies.
-    """
-    for task_id, of_task in provenance.items():
-        if of_task.expert is None or (expected := of_task.expert.policy_sha256) is None:
-            continue
-        name = expert_folder(expected)
-        try:
-            files = expert_files(resolve_inside(root, name), expected, root)
-        except Icrl4ahtError as error:
-            report.add(name, str(error))
-            continue
-        for name, path in files.items():
-            found = file_hash(path)
-            if path.suffix == ".safetensors" and found != expected:
-                report.add(name, f"sha256 {found}, expected {expected} as {PROVENANCE} says of task {task_id!r}")

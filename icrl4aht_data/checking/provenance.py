@@ -11,22 +11,19 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.provenance import Provenance, StreamReturns
-from icrl4aht_data.format.schema import EXPERTS, HISTORIES, PROVENANCE, Entry
+from icrl4aht_data.format.schema import HISTORIES, PROVENANCE, Entry
 from icrl4aht_data.utils.files import json_hash
 
 _ROUNDING = 1e-3  # of the means that a stream filter records
 
 
-def check_provenance(
-    index: Index, tasks: Sequence[Task], provenance: Mapping[str, Provenance], listed: Iterable[str], report: Report
-) -> None:
-    """Check what provenance says of each task's learner, its streams and their filter; see also `files.check_experts`.
+def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[str, Provenance], report: Report) -> None:
+    """Check what provenance says of each task's learner, its streams and their filter.
 
     Args:
         index: the release's index.
         tasks: its tasks; none in a release that knows them by name only.
         provenance: task id -> how its histories were made.
-        listed: the files of the manifest.
         report: receives the problems.
     """
     members: dict[str, list[Entry]] = defaultdict(list)
@@ -35,10 +32,6 @@ def check_provenance(
     seeds = {task.task_id: task.seed for task in tasks}
     for task_id in provenance.keys() - members.keys():
         report.add(PROVENANCE, f"task {task_id!r}: has no history")
-    labellers = {of_task.expert.policy_sha256 for of_task in provenance.values() if of_task.expert} - {None}
-    for name in listed:
-        if name.startswith(f"{EXPERTS}/") and name.split("/")[1] not in labellers:
-            report.add(name, f"{PROVENANCE} names no such policy")
     for task_id, entries in members.items():
         if task_id not in provenance:
             report.add(PROVENANCE, f"task {task_id!r}: missing")

@@ -13,13 +13,7 @@ from typing import get_args
 import numpy as np
 
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.checking.files import (
-    check_checkpoints,
-    check_experts,
-    check_files,
-    check_references,
-    check_shard_sizes,
-)
+from icrl4aht_data.checking.files import check_files, check_references, check_shard_sizes
 from icrl4aht_data.checking.histories import check_chunks, check_history
 from icrl4aht_data.checking.index import check_index
 from icrl4aht_data.checking.provenance import check_provenance
@@ -127,12 +121,12 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     report.replayed = report.level == "deep" and index.info.kind in KINDS
     if report.level == "deep" and not report.replayed:
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")
-    check_references(listed, index, tasks, report)
     provenance = _read_provenance(origin, report)
+    check_references(listed, index, tasks, provenance, report)
     if report.level == "deep":
         _note_what_is_believed(index, provenance or {}, report)
     if provenance is not None:
-        check_provenance(index, tasks, provenance, listed, report)
+        check_provenance(index, tasks, provenance, report)
     check_index(index, tasks, provenance, report)
     shards = [name for name in index.values("shard") if name in chosen]
     skipped = len(index.values("shard")) - len(shards)
@@ -141,8 +135,6 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     if report.level == "quick":
         check_shard_sizes(origin, index, shards, report)
     else:
-        check_checkpoints(origin.folder, tasks, report)
-        check_experts(origin.folder, provenance or {}, report)
         _check_shards(index, shards, report, advance)
 
 

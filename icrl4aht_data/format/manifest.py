@@ -72,7 +72,7 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         path: its path or address, for errors.
 
     Raises:
-        IndexFormatError: names the line.
+        IndexFormatError: if it lists nothing, or a line is wrong, which it names.
         UnsafePathError: for a path that leads out of the release, or is not that of a file which releases have.
     """
     if text and not text.endswith("\n"):
@@ -99,6 +99,8 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         if twin != name:
             raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are one file on some systems")
         listed[name] = digest
+    if not listed:
+        raise IndexFormatError(f"{path}: lists no file; fetch the release again")
     return listed
 
 

@@ -33,7 +33,7 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.installation import install_command
-from icrl4aht_data.writing.release_folder import atomic_folder, write_listing
+from icrl4aht_data.writing.release_folder import atomic_folder
 from icrl4aht_data.writing.stored import HistoryProgress, with_source
 
 _NAME = re.compile(r"[\w.-]+-v\d+")
@@ -101,7 +101,6 @@ def to_minari(
             numbers += [{**facts, "episode": episode} for episode in range(history.entry.episodes)]
             advance(number + 1, len(dataset))
         storage.update_episode_metadata(numbers)
-        write_listing(folder)
     return target
 
 

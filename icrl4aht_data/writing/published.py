@@ -2,9 +2,9 @@
 
 The published code keeps all histories in `histories.h5`, one group each, with observations as float32 in gzip-6 chunks
 of 4096 steps and action ids in its own order, and an index `histories_index.jsonl` of the paper's 14 fields (App. D.3).
-Files written here also have each group's `state` and `episode_end_state`, `tasks.jsonl`, `provenance.json` and
-`files.sha256`, which the published readers ignore; converted back they lose only checkpoints and oracle actions. The
-published index does not have learners: streams of several learners of a task are numbered consecutively in it.
+Files written here also have each group's `state` and `episode_end_state`, `tasks.jsonl` and `provenance.json`, which
+the published readers ignore; converted back they lose only checkpoints and oracle actions. The published index does not
+have learners: streams of several learners of a task are numbered consecutively in it.
 Files without states, which observations do not determine, become a release of observations; files without tasks one
 that knows its tasks by name.
 """
@@ -48,13 +48,7 @@ from icrl4aht_data.writing.hdf5_sink import new_hdf5
 from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
 from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.release_folder import (
-    HISTORIES_H5,
-    HISTORIES_INDEX,
-    atomic_folder,
-    check_target,
-    write_listing,
-)
+from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, atomic_folder, check_target
 from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays, with_source
 
 PUBLISHED_CHUNK = 4096
@@ -83,8 +77,7 @@ def to_published(
         chunk: steps per chunk.
         states: also store the state records, if there are any: without them `from_published` makes a release of
             observations.
-        overwrite: replace a folder that was written by this function, or a release. One with the files that would be
-            written, as after an interruption, is accepted in any case.
+        overwrite: replace a folder that was written by this function, or a release.
         advance: progress.
 
     Raises:
@@ -94,7 +87,7 @@ def to_published(
     sources = {entry.task_id: entry.source for entry in dataset.entries}
     recorded = read_provenance(dataset.origin.file(PROVENANCE))
     provenance = {name: with_source(of_task, sources[name]) for name, of_task in recorded.items() if name in sources}
-    with atomic_folder(target, overwrite=overwrite, sources=[dataset.root], keep_equal=True) as folder:
+    with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
         with new_hdf5(folder / HISTORIES_H5) as new, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
                 group = new.file.create_group(f"/{number}")
@@ -109,7 +102,6 @@ def to_published(
         if tasks:
             write_tasks(folder / "tasks.jsonl", tasks)
         write_json(folder / "provenance.json", {name: of_task.to_json() for name, of_task in provenance.items()})
-        write_listing(folder)
     return target
 
 

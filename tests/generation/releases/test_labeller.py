@@ -267,7 +267,7 @@ def test_verify_compares_policies_and_index_with_the_provenance(with_policies):
     write_manifest(root)
     problems = sorted((finding.file, finding.problem) for finding in verify_release(root).findings)
     assert problems[0][0] == weights.relative_to(root).as_posix()
-    assert f"expected {weights.parent.name} as meta/provenance.json says of task" in problems[0][1]
+    assert f"expected {weights.parent.name}, the name of its folder" in problems[0][1]
     assert [file for file, _ in problems[1:]] == ["meta/histories.jsonl"] * 3
     assert "but meta/provenance.json has 99.0 of its task" in problems[1][1]
 

@@ -13,6 +13,8 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.checking.report import Level
 from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.dataset import MINI
+from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance
@@ -75,6 +77,27 @@ def test_missing_and_extra_files(damaged):
         "meta/provenance.json: listed in the manifest, but missing",
         "data/notes.txt: not listed in the manifest",
     ]
+
+
+@pytest.mark.parametrize("name", ["meta/info.json", HISTORIES, "meta/tasks.jsonl", "meta/provenance.json"])
+def test_quick_refuses_what_loading_refuses(damaged, name):
+    """A bit of meta/ that changes no value that other checks compare."""
+    path = damaged / name
+    path.write_text(path.read_text() + " ")
+    with pytest.raises(ReleaseError, match=f"{name}: expected sha256"):
+        load_icrl4aht(damaged)
+    assert name in verify_release(damaged, level="quick").files_at_fault
+
+
+def test_weights_are_in_the_folder_of_their_hash(tmp_path):
+    """Other weights in place of a policy's are found although the manifest lists them."""
+    root = shutil.copytree(MINI, tmp_path / "release")
+    weights = next(root.glob("teammates/*/policy.safetensors"))
+    weights.write_bytes(weights.read_bytes()[:-1] + b"?")
+    write_manifest(root)
+    found = verify_release(root, level="quick")
+    assert found.files_at_fault == {weights.relative_to(root).as_posix()}
+    assert f"expected {weights.parent.name}, the name of its folder" in found.findings[0].problem
 
 
 def test_no_folder(tmp_path):

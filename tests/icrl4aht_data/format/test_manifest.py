@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from icrl4aht_generation.teammates.registry import recover_teammate
 
-from icrl4aht_data import load_icrl4aht
+from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import ChunkTableError, IndexFormatError, ReleaseError, RootNotFoundError
 from icrl4aht_data.format.chunks import chunk_table_name
@@ -70,6 +70,15 @@ def test_a_release_without_its_manifest(damaged):
     (damaged / MANIFEST).unlink()
     with pytest.raises(IndexFormatError, match=rf"{MANIFEST}: missing; fetch the release again"):
         load_icrl4aht(damaged)
+
+
+def test_an_empty_manifest_is_refused(damaged):
+    (damaged / MANIFEST).write_text("")
+    with pytest.raises(IndexFormatError, match=rf"{MANIFEST}: lists no file; fetch the release again"):
+        load_icrl4aht(damaged)
+    for level in ("quick", "full"):
+        report = verify_release(damaged, level=level)
+        assert any(finding.file == MANIFEST and "lists no file" in finding.problem for finding in report.findings)
 
 
 def test_a_file_of_meta_that_the_manifest_does_not_list(damaged):

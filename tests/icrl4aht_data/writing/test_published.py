@@ -22,6 +22,7 @@ from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, record_size
 from icrl4aht_data.writing.published import from_published, to_published
 from icrl4aht_data.writing.published_views import complete_views
+from tests.helpers.damages import contents
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import random_release
 
@@ -102,7 +103,6 @@ def short_views(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]
             group["obs"] = complete[int(name)][:, :4].astype("f4")
     path = folder / "files" / "histories_index.jsonl"
     path.write_text(path.read_text().replace("[5, 5, 35]", "[4, 5, 35]"))
-    (folder / "files" / "files.sha256").unlink()
     return folder / "files", written, complete
 
 
@@ -193,24 +193,19 @@ def test_a_history_twice_is_refused(lite, tmp_path, link):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_rerun_of_an_interrupted_conversion(lite, tmp_path):
+def test_converting_again(lite, tmp_path):
     dataset, out = load_icrl4aht(lite[0]), tmp_path / "out"
     to_published(dataset, out)
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
-    to_published(dataset, out)  # interrupted after its end
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
-    with pytest.raises(OptionError, match="exists with other files; give another folder, or replace it by --overwrite"):
-        to_published(dataset.filter(layout="demo_wide"), out)
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
-    shutil.rmtree(out)
-    partial = tmp_path / ".out.partial"  # interrupted in the middle, by this version or by one without locks
-    partial.mkdir()
-    (partial / "histories.h5").write_bytes(before["histories.h5"][:1000])
-    to_published(dataset, out)
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    before = contents(out)
+    assert before.keys() == {"histories.h5", "histories_index.jsonl", "tasks.jsonl", "provenance.json"}
+    with pytest.raises(OptionError, match="exists; give another folder, or replace it by --overwrite"):
+        to_published(dataset, out)
+    assert contents(out) == before
+    (tmp_path / ".out.partial").mkdir()  # an interrupted conversion
+    (tmp_path / ".out.partial" / "histories.h5").write_bytes(before["histories.h5"][:1000])
     to_published(dataset.filter(layout="demo_wide"), out, overwrite=True)
-    assert (out / "histories_index.jsonl").read_bytes() != before["histories_index.jsonl"]
+    assert contents(out)["histories_index.jsonl"] != before["histories_index.jsonl"]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
     (out / "notes.txt").write_text("mine")
-    with pytest.raises(OptionError, match=r"has notes\.txt, which its files\.sha256 does not list"):
+    with pytest.raises(OptionError, match=r"is not a release: it has no MANIFEST\.sha256"):
         to_published(dataset, out, overwrite=True)
