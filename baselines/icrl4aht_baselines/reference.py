@@ -114,14 +114,6 @@ OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
 
 RECIPES = {
     "rl2": Recipe("rl2", "tasks", RL2_SETTINGS["model"], _TEACHER, mode=PlayMode(greedy=False)),
-    "rl2-oracle": Recipe(
-        "rl2",
-        "tasks",
-        RL2_SETTINGS["model"],
-        _TEACHER,
-        play={"oracle_teammate": True},
-        mode=PlayMode(greedy=False),
-    ),
     "rl2-tests": Recipe(
         "rl2",
         "tasks",

@@ -164,7 +164,7 @@ def reference_command(
 
     Rebuilds a release of noise histories, trains, records histories of trained agents where a model learns from them,
     and evaluates. One model for each track. The same command resumes a stopped one. rl2 learns by playing with training
-    teammates, rl2-oracle with the scripted oracle, too, and rl2-tests with test teammates. The other names are a method
+    teammates, rl2-tests with test teammates. The other names are a method
     and its data. ad-noise, dpt-noise: noise histories. ad-ppo, dpt-ppo: PPO histories of the bundled release. ad-both,
     dpt-both: both kinds. ad-learned: histories of the bundled release with learned teammates. ad-student, dpt-student:
     histories of rl2, labelled with its choices. ad-rising: histories of rl2 that begin at random, imitated with their

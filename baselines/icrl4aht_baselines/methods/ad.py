@@ -28,7 +28,6 @@ from icrl4aht_baselines.methods.method import (
 )
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.tokens import RingBuffer, StepInput, StepTokens, batch_steps
-from icrl4aht_data.benchmark.facts import all_families
 from icrl4aht_data.sampling.ad import ADBatch
 
 
@@ -39,13 +38,11 @@ class StepOutput(NamedTuple):
         head: the head's output, float (B, L, ..).
         next_obs: float (B, L, N), predicted observation after taking the action; None without +next_obs.
         teammate: float (B, L, A), logits of the teammate's action at the same step; None if they are not predicted.
-        family: float (B, L, F), logits of the teammate's family; None if it is not predicted.
     """
 
     head: Any
     next_obs: Float[Array, "B L N"] | None
     teammate: Float[Array, "B L A"] | None = None
-    family: Float[Array, "B L F"] | None = None
 
 
 class WindowMemory(NamedTuple):
@@ -75,7 +72,6 @@ class StepModel(nn.Module):
     head: nn.Module
     next_obs: nn.Module | None = None
     teammate: nn.Module | None = None
-    family: nn.Module | None = None
 
     def __call__(
         self,
@@ -89,8 +85,7 @@ class StepModel(nn.Module):
         features_BxLxD = trunk(tokens_BxLxD, deterministic=deterministic)
         predicted = None if self.next_obs is None or actions is None else self.next_obs(features_BxLxD, actions)
         mate = None if self.teammate is None or actions is None else self.teammate(features_BxLxD)
-        family = None if self.family is None or actions is None else self.family(features_BxLxD)
-        return StepOutput(self.head(features_BxLxD), predicted, mate, family)
+        return StepOutput(self.head(features_BxLxD), predicted, mate)
 
     def start(self, context: int, cached: bool) -> Any:
         """Return the memory of an ego before its first step."""
@@ -142,9 +137,8 @@ def dropped_steps(context: int) -> int:
 def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
     """Return a model of steps with the given trunk and head."""
     teammate = nn.Dense(world.actions) if options.teammate_loss else None
-    family = nn.Dense(len(all_families())) if options.family_loss else None
     next_obs = make_next_obs_head(options, world)
-    return StepModel(make_tokens(StepTokens, options, world), trunk, head, next_obs, teammate, family)
+    return StepModel(make_tokens(StepTokens, options, world), trunk, head, next_obs, teammate)
 
 
 def example_step(world: World) -> StepInput:
@@ -186,10 +180,6 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
         if output.teammate is not None:
             log["teammate_loss"] = teammate_loss(output.teammate, batch)
             total += log["teammate_loss"]
-        if output.family is not None:
-            families = jnp.broadcast_to(jnp.asarray(batch.families)[:, None], mask.shape)
-            log["family_loss"] = mean_of_rows(cross_entropy(output.family, families, 0.0), mask)
-            total += log["family_loss"]
         return total, {"loss": total, **log, **encoding_log(steps.obs)}
 
     return loss

@@ -142,9 +142,8 @@ def check_no_teammate_loss(name: str, options: ModelOptions) -> None:
     Raises:
         OptionError: if it is.
     """
-    for option, what in (("teammate_loss", "action"), ("family_loss", "family")):
-        if getattr(options, option):
-            raise OptionError(f"{option} = True: {name} does not predict the teammate's {what}; leave it out")
+    if options.teammate_loss:
+        raise OptionError(f"teammate_loss = True: {name} does not predict the teammate's action; leave it out")
 
 
 def squared_error(predicted: Float[Array, "*B N"], obs: Num[Array, "*B ..."]) -> Float[Array, "*B"]:

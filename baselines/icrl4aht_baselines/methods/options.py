@@ -97,7 +97,6 @@ class ModelOptions:
     reward_scale: float = option_field(1.0, "Factor of the rewards in tokens; a delivery earns 20.", above=0)
     next_obs: bool = option_field(False, "+next_obs: also learn to predict the next observation.")
     teammate_loss: bool = option_field(False, "With --ta: also learn to predict the teammate's action (ad, hybrid_ad).")
-    family_loss: bool = option_field(False, "Also learn to predict the teammate's family (ad, hybrid_ad).")
     label_smoothing: float = option_field(0.0, "Label smoothing of the action loss.", at_least=0, below=1)
     discounts: tuple[float, ...] = option_field(
         (0.9, 0.95, 0.99, 0.995),
@@ -120,12 +119,12 @@ _UNUSED_WITHOUT_TRANSFORMER = {"layers", "heads", "positions", "remat"}
 
 UNUSED_OPTIONS: dict[str, set[str]] = {
     "ad": {"recurrent_layers", "discounts"},
-    "dpt": {"recurrent_layers", "discounts", "teammate_loss", "family_loss"},
+    "dpt": {"recurrent_layers", "discounts", "teammate_loss"},
     "hybrid_ad": {"discounts", *_UNUSED_WITHOUT_TRANSFORMER},
-    "amago_offline": {"recurrent_layers", "teammate_loss", "family_loss"},
+    "amago_offline": {"recurrent_layers", "teammate_loss"},
     "rl2": {
         *_UNUSED_WITHOUT_TRANSFORMER,
-        *("discounts", "dropout", "next_obs", "teammate_loss", "family_loss", "label_smoothing", "bfloat16"),
+        *("discounts", "dropout", "next_obs", "teammate_loss", "label_smoothing", "bfloat16"),
         *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),
     },
 }

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from icrl4aht_generation.experts.oracle_teammate import oracle_teammate
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.draws import find_draw
 from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate
@@ -19,7 +18,7 @@ from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.layouts import rearranged_layouts, with_four_recipes
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup, chosen_teammates, make_groups
-from icrl4aht_baselines.online.teammates import check_heuristics, mixed_chances, with_manners
+from icrl4aht_baselines.online.teammates import check_heuristics, mixed_chances, with_behaviours
 from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cells
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import TASKS_SOURCE
@@ -36,20 +35,13 @@ from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.files import json_hash
 
 FLAT_SHARE = 0.3
-"""Number of tasks on a layout where the ego matters with no teammate, as a share of that on other layouts."""
+"""Number of tasks on a layout on which no ego earns more than `stay` does, as a share of that on other layouts."""
 
 FOUR_RECIPES_SHARE = 0.2
 """Number of tasks on a layout with four recipes, as a share of that on others."""
 
 REARRANGED_SHARE = 1.5
 """Number of tasks on all rearranged versions of a layout, as a share of that on the layout."""
-
-ORACLE = "oracle"
-"""Kind and family of the oracle as a teammate."""
-
-ORACLE_IDLES = (0.0, 0.2, 0.4, 0.6, 0.8)
-"""Chances that oracles as teammates idle in a step."""
-
 
 class PlayJob(NamedTuple):
     """Arguments of `trainer.train`, except for a folder.
@@ -71,7 +63,7 @@ class _Teammate(NamedTuple):
     """A training teammate on one layout.
 
     Attributes:
-        entry: as in a task.
+        entry: its kind, family and parameters, as in a task.
         policy: how it plays.
     """
 
@@ -80,7 +72,7 @@ class _Teammate(NamedTuple):
 
 
 _Teammates = dict[tuple[Layout, str], dict[str, _Teammate]]
-"""Layout and family -> task id -> teammate."""
+"""(layout, kind of the teammates) -> task id -> teammate."""
 
 
 def prepare_play(
@@ -96,9 +88,9 @@ def prepare_play(
     Args:
         name: of the method.
         model: its architecture.
-        options: of the training; `batch_size` is the number of tasks.
+        options: of the training; `batch_size` is the number of tasks that are played at once.
         play: hyper-parameters of playing and learning.
-        histories: whose teammates to play with, on which layouts.
+        histories: the histories whose teammates and layouts are played.
         tasks: tasks with more teammates, heuristics. Those on other layouts are left out.
 
     Raises:
@@ -109,14 +101,12 @@ def prepare_play(
     _check_unused(name, histories)
     release, dataset, layouts = _chosen_histories(histories, tasks)
     tasks = _tasks_on(layouts, tasks)
-    method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
-    hidden = [get_layout(one).name for one in histories.hide_recipe]
     teammates = _teammates(dataset, tasks)
     _check_layouts(layouts, teammates)
-    if play.oracle_teammate:
-        teammates |= _oracles(layouts)
-    shares = _shares(dataset, tasks)
-    groups, played = _groups(teammates, shares, hidden, play, options.batch_size)
+    # Canonical channels, because one network plays all of the layouts.
+    method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
+    hidden = [get_layout(one).name for one in histories.hide_recipe]
+    groups, played = _groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
@@ -136,22 +126,30 @@ def prepare_play(
     return PlayJob(method, trainer, TrainingData(None, {}), about)
 
 
-def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple[Dataset, Dataset | None, list[Layout]]:
-    """Return the release, the histories on the chosen layouts, and these layouts.
+def _check_unused(name: str, histories: HistoryOptions) -> None:
+    default = HistoryOptions(histories.layouts)
+    for field in ("order", "queries", "labels", "every", "weights", "curriculum", "held_out", "obs"):
+        found = getattr(histories, field)
+        if found != getattr(default, field):
+            raise OptionError(f"{field} = {found}: {name} learns by playing, not from histories; leave it out")
+    if histories.channels == "own":
+        raise OptionError(f"channels = own: {name} takes canonical channels; leave it out")
 
-    Where tasks are played as well, layouts need no histories.
-    """
+
+def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple[Dataset, Dataset | None, list[Layout]]:
+    """Return the release, the histories on the chosen layouts, None if there are none, and these layouts."""
     release = load_icrl4aht(histories.root)
-    if ALL_LAYOUTS in histories.layouts:
-        dataset = filter_histories(release.filter(split=histories.split), histories.filters)
-        return release, dataset, list(dataset.layouts)
-    layouts = list(dict.fromkeys(get_layout(one) for one in histories.layouts))
-    stored = {get_layout(layout.name) for layout in release.layouts}
-    names = [layout.name for layout in layouts if not tasks or layout in stored]
-    if not names:
-        return release, None, layouts
+    names: list[str] | None = None
+    layouts: list[Layout] = []
+    if ALL_LAYOUTS not in histories.layouts:
+        layouts = list(dict.fromkeys(get_layout(one) for one in histories.layouts))
+        stored = {get_layout(layout.name) for layout in release.layouts}
+        # A layout without histories is an error of the filter below, unless tasks may have teammates for it.
+        names = [layout.name for layout in layouts if not tasks or layout in stored]
+        if not names:
+            return release, None, layouts
     dataset = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
-    return release, dataset, layouts
+    return release, dataset, layouts or list(dataset.layouts)
 
 
 def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
@@ -164,46 +162,20 @@ def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
     return found
 
 
-def _check_unused(name: str, histories: HistoryOptions) -> None:
-    default = HistoryOptions(histories.layouts)
-    for field in ("order", "queries", "labels", "every", "weights", "curriculum", "held_out", "obs"):
-        found = getattr(histories, field)
-        if found != getattr(default, field):
-            raise OptionError(f"{field} = {found}: {name} learns by playing, not from histories; leave it out")
-    if histories.channels == "own":
-        raise OptionError(f"channels = own: {name} takes canonical channels; leave it out")
-
-
 def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
-    """Return the teammates of all tasks of a selection of histories, and of some more."""
+    """Return the teammates of all tasks of a selection of histories, and of further tasks."""
     found: _Teammates = {}
     if dataset is not None:
+        # Histories of one task have one teammate: any of them recovers it.
         history_of = dict(zip(dataset.column("task_id").tolist(), dataset.ids.tolist(), strict=True))
         for task_id, history_id in history_of.items():
             entry = dataset.index.entry(history_id)
-            key = get_layout(entry.layout), entry.teammate_kind
             mate = _Teammate(dataset.recover_teammate(history_id), recover_teammate(dataset, history_id))
-            found.setdefault(key, {})[task_id] = mate
+            found.setdefault((get_layout(entry.layout), entry.teammate_kind), {})[task_id] = mate
     for task in tasks:
         mate = _Teammate(task.teammate, build_teammate(task.layout, task.teammate))
         found.setdefault((task.layout, task.teammate_kind), {})[task.task_id] = mate
     return found
-
-
-def _oracles(layouts: Sequence[Layout]) -> _Teammates:
-    """Return the oracle as a teammate of several speeds on each layout."""
-    entries = {f"{ORACLE} that idles in {idle:.0%}": {"kind": ORACLE, "idle": idle} for idle in ORACLE_IDLES}
-    return {
-        (layout, ORACLE): {name: _Teammate(entry, _build(layout, entry)) for name, entry in entries.items()}
-        for layout in layouts
-    }
-
-
-def _build(layout: Layout, entry: dict[str, Any]) -> Policy:
-    """Return the policy of a teammate's entry, as in a task or of `_oracles`."""
-    if entry["kind"] == ORACLE:
-        return oracle_teammate(layout)._replace(params=jnp.float32(entry["idle"]))
-    return build_teammate(layout, entry)
 
 
 def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
@@ -219,18 +191,31 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
 def _groups(
     teammates: _Teammates, shares: Mapping[str, float], hidden: Sequence[str], play: PlayOptions, tasks: int
 ) -> tuple[list[TaskGroup], set[str]]:
-    """Return the groups of tasks, and the ids of the tasks whose teammates they play with; with few tasks not all are.
+    """Return the groups of tasks, and the ids of the tasks whose teammates play in them.
+
+    With few tasks, some teammates play in no group: the record of training data must not name them.
+
+    Args:
+        teammates: the training teammates.
+        shares: name of each layout -> its share of the tasks.
+        hidden: names of the layouts whose recipe indicators the model does not see.
+        play: says which other versions of the layouts are played.
+        tasks: number of all tasks.
 
     Raises:
-        OptionError: if other layouts are wanted and a layout has learned teammates alone, which play on it only.
+        OptionError: if other versions are wanted and a layout has learned teammates alone, which play on it only.
     """
-    heuristics = _heuristic_families(teammates) if play.four_recipes or play.rearranged else {}
-    everywhere = dict(teammates)
-    for layout, families in heuristics.items() if play.four_recipes else ():
-        other, family = with_four_recipes(layout), next(iter(families))
-        everywhere[other, family] = _rebuilt(families[family], other)
-        shares = {**shares, other.name: FOUR_RECIPES_SHARE}
-        hidden = [*hidden, *[other.name] * (layout.name in hidden)]
+    heuristics = _heuristics(teammates) if play.four_recipes or play.rearranged else {}
+    everywhere, shares, hidden = dict(teammates), dict(shares), list(hidden)
+    if play.four_recipes:
+        for layout, kinds in heuristics.items():
+            other, (kind, mates) = with_four_recipes(layout), next(iter(kinds.items()))
+            everywhere[other, kind] = {
+                task_id: mate._replace(policy=build_teammate(other, mate.entry)) for task_id, mate in mates.items()
+            }
+            shares[other.name] = FOUR_RECIPES_SHARE
+            hidden += [other.name] * (layout.name in hidden)
+    # Rearranged versions get their own part of the tasks; the other layouts divide the rest by their shares.
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
     rearranged = {layout: REARRANGED_SHARE * shares[layout.name] for layout in heuristics if play.rearranged}
     fixed = round(tasks * total / (total + sum(rearranged.values())))
@@ -238,26 +223,25 @@ def _groups(
     groups = make_groups(policies, fixed, shares, hidden)
     played: set[str] = set()
     for group in groups:
-        names = list(everywhere[group.layouts[0], group.family])
-        played |= {names[number] for number in chosen_teammates(len(names), len(group.teammates))}
+        ids = list(everywhere[group.layouts[0], group.family])
+        played |= {ids[number] for number in chosen_teammates(len(ids), len(group.teammates))}
     for layout, share in rearranged.items():
         count = round((tasks - fixed) * share / sum(rearranged.values()))
-        for group, names in _rearranged_groups(
-            layout, heuristics[layout], count, play.rearranged, layout.name in hidden
-        ):
+        kinds = heuristics[layout]
+        for group, ids in _rearranged_groups(layout, kinds, count, play.rearranged, layout.name in hidden):
             groups.append(group)
-            played |= names
+            played |= ids
     return groups, played
 
 
-def _heuristic_families(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Teammate]]]:
-    """Return the families of each layout that are heuristics, which can play on other layouts as well."""
+def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Teammate]]]:
+    """Return the heuristic teammates of each layout by kind: they can be built on other layouts as well."""
     found: dict[Layout, dict[str, dict[str, _Teammate]]] = {layout: {} for layout, _ in teammates}
-    for (layout, family), mates in teammates.items():
-        if all(mate.entry["kind"] in ("heuristic", ORACLE) for mate in mates.values()):
-            found[layout][family] = mates
-    for layout, families in found.items():
-        if not families:
+    for (layout, kind), mates in teammates.items():
+        if all(mate.entry["kind"] == "heuristic" for mate in mates.values()):
+            found[layout][kind] = mates
+    for layout, kinds in found.items():
+        if not kinds:
             raise OptionError(
                 f"{layout.name}: rearranged layouts and four recipes need heuristic teammates, this layout has learned "
                 f"ones alone; leave out --rearranged and --four-recipes, or give a manifest with heuristics"
@@ -266,48 +250,40 @@ def _heuristic_families(teammates: _Teammates) -> dict[Layout, dict[str, dict[st
 
 
 def _rearranged_groups(
-    layout: Layout, families: Mapping[str, dict[str, _Teammate]], tasks: int, versions: int, hidden: bool
-) -> list[tuple[TaskGroup, set[str]]]:
-    """Return a group of each family on rearranged versions of a layout, and the tasks that its teammates are of.
+    layout: Layout, kinds: Mapping[str, dict[str, _Teammate]], tasks: int, versions: int, hidden: bool
+) -> Iterator[tuple[TaskGroup, set[str]]]:
+    """Yield a group of each kind of teammates on rearranged versions of a layout, and the tasks of its teammates.
 
-    The versions are divided equally among the families, and the tasks of a family among its versions, at
-    least one each.
+    The versions are divided equally among the kinds, and the tasks of a kind among its versions, at least one each.
     """
     layouts = rearranged_layouts(layout, versions)
-    ends = [round(versions * k / len(families)) for k in range(len(families) + 1)]
-    found = []
-    for (family, mates), first, end in zip(families.items(), ends, ends[1:], strict=False):
+    ends = [round(versions * k / len(kinds)) for k in range(len(kinds) + 1)]
+    for (kind, mates), first, end in zip(kinds.items(), ends, ends[1:], strict=False):
         own = layouts[first:end]
-        if not own:
+        if not own:  # fewer versions than kinds
             continue
         count = max(len(own), round(tasks * len(own) / versions))
         where = [own[task % len(own)] for task in range(count)]
-        chosen = [list(mates)[k] for k in chosen_teammates(len(mates), count)]
-        policies = [_build(one, mates[name].entry) for one, name in zip(where, chosen, strict=True)]
-        manners = [
-            with_manners([policy], chances[None])[0]
-            for policy, chances in zip(policies, mixed_chances(count), strict=True)
+        chosen = [list(mates)[number] for number in chosen_teammates(len(mates), count)]
+        # Policies on different layouts have different functions, so that each is wrapped by itself.
+        policies = [
+            with_behaviours([build_teammate(one, mates[task_id].entry)], chances[None])[0]
+            for one, task_id, chances in zip(where, chosen, mixed_chances(count), strict=True)
         ]
-        found.append((TaskGroup(where, family, manners, hidden, f"{layout.name} rearranged"), set(chosen)))
-    return found
-
-
-def _rebuilt(mates: Mapping[str, _Teammate], layout: Layout) -> dict[str, _Teammate]:
-    """Return heuristics on another layout."""
-    return {task_id: mate._replace(policy=_build(layout, mate.entry)) for task_id, mate in mates.items()}
+        yield TaskGroup(where, kind, policies, hidden, f"{layout.name} rearranged"), set(chosen)
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
-    """Return the share of the tasks on each layout, in units of those on layouts where the ego matters.
+    """Return the share of the tasks on each layout: 1, or `FLAT_SHARE` where the ego matters with no teammate.
 
-    With a drawn teammate it matters if the oracle earns more than an ego that does nothing. Teammates without
-    measurements count as ones with which it matters.
+    The ego matters with a teammate with which the oracle earns more than `stay`, as measured for drawn teammates and
+    for those of releases. With a teammate that was not measured it counts as mattering.
     """
     matters: dict[str, bool] = {}
     for task in tasks:
         draw = find_draw(task.layout.name, task.teammate)
-        helps = draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
-        matters[task.layout.name] = matters.get(task.layout.name, False) or helps
+        own = draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
+        matters[task.layout.name] = matters.get(task.layout.name, False) or own
     if dataset is not None:
         path = Path(dataset.root) / PROVENANCE
         provenance = read_provenance(path) if path.is_file() else {}
@@ -321,21 +297,19 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
 def _played_cells(
     dataset: Dataset | None, tasks: Sequence[Task], played: set[str], labels: Labels | None
 ) -> list[dict[str, Any]]:
-    """Return the record of training data of the tasks that are played, see `training_cells`."""
-    cells = []
+    """Return the record of training data of the tasks that are played, see `training_cells`.
+
+    Tasks without histories have cells of their own, with the source `TASKS_SOURCE`.
+    """
+    found = []
     if dataset is not None:
         of_played = np.isin(dataset.column("task_id"), sorted(played))
-        cells = training_cells(dataset.select(of_played), labels) if of_played.any() else []
-    return cells + _task_cells([task for task in tasks if task.task_id in played], labels)
-
-
-def _task_cells(tasks: Sequence[Task], labels: Labels | None) -> list[dict[str, Any]]:
-    """Return what playing tasks without histories adds to the record of training data, see `training_cells`."""
-    cells: dict[tuple[str, str, str, str], list[Task]] = {}
+        found = training_cells(dataset.select(of_played), labels) if of_played.any() else []
+    cells: dict[tuple[str, str, str, str], list[Task]] = defaultdict(list)
     for task in tasks:
-        key = task.layout.name, task.split, task.teammate_family, task.teammate_kind
-        cells.setdefault(key, []).append(task)
-    return [
+        if task.task_id in played:
+            cells[task.layout.name, task.split, task.teammate_family, task.teammate_kind].append(task)
+    return found + [
         {
             "layout": layout,
             "split": split,
@@ -343,10 +317,10 @@ def _task_cells(tasks: Sequence[Task], labels: Labels | None) -> list[dict[str, 
             "algorithm": kind,
             "source": TASKS_SOURCE,
             "labels": labels,
-            "tasks": len(found),
+            "tasks": len(of_cell),
             "histories": 0,
-            "tasks_hash": json_hash(sorted(task.task_id for task in found)),
-            "teammates": sorted({teammate_id(task.teammate) for task in found}),
+            "tasks_hash": json_hash(sorted(task.task_id for task in of_cell)),
+            "teammates": sorted({teammate_id(task.teammate) for task in of_cell}),
         }
-        for (layout, split, family, kind), found in cells.items()
+        for (layout, split, family, kind), of_cell in cells.items()
     ]

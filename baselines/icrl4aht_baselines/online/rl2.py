@@ -35,7 +35,7 @@ from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.tokens import StepInput, percept_step
 from icrl4aht_baselines.methods.view_change import ViewChange, no_change
 from icrl4aht_baselines.online.programs import SharedProgram, run_all, shared_programs
-from icrl4aht_baselines.online.teammates import mixed_chances, with_manners
+from icrl4aht_baselines.online.teammates import mixed_chances, with_behaviours
 from icrl4aht_baselines.training.options import PlayOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.errors import OptionError
@@ -124,7 +124,7 @@ def make_groups(
     for (layout, family), policies in teammates.items():
         count = max(1, round(tasks * shares[layout.name] / total / families[layout.name]))
         chosen = [policies[number] for number in chosen_teammates(len(policies), count)]
-        mates = with_manners(chosen, mixed_chances(count))
+        mates = with_behaviours(chosen, mixed_chances(count))
         groups.append(TaskGroup([layout], family, mates, layout.name in hidden, layout.name))
     return groups
 
@@ -133,7 +133,7 @@ def chosen_teammates(teammates: int, tasks: int) -> np.ndarray:
     """Return the number of the teammate of each task of a group, int (tasks,).
 
     Every teammate has as many tasks as the others, or one more. If there are fewer tasks than teammates, some teammates
-    have none. The order is random, because the manners of teammates follow the order of the tasks.
+    have none. The order is random, because the behaviours of teammates follow the order of the tasks.
     """
     numbers = np.arange(max(tasks, teammates)) % teammates
     return np.random.default_rng(0).permutation(numbers)[:tasks]

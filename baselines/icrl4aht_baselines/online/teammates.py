@@ -1,8 +1,8 @@
 """Training teammates that do not always follow their script, so that a student learns to do without their help.
 
-A teammate has four manners: it follows its script, does nothing, acts at random, or follows its script except for some
-random actions. Each episode draws one by the teammate's own chances: a teammate with one manner keeps it for a task,
-one with several switches between episodes.
+A teammate has four behaviours: it follows its script, does nothing, acts at random, or follows its script except for
+some random actions. Each episode draws one by the teammate's own chances: a teammate with one behaviour keeps it for a
+task, one with several switches between episodes.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import STAY
 
-MANNERS = ("script", "stay", "random", "noisy")
-"""Manners of a teammate, in the order of its chances."""
+BEHAVIOURS = ("script", "stay", "random", "noisy")
+"""Behaviours of a teammate, in the order of its chances."""
 
 NOISY_SHARE = 0.3
-"""Share of random actions in the manner "noisy"."""
+"""Share of random actions in the behaviour "noisy"."""
 
 MIXTURE: tuple[tuple[float, tuple[float, ...]], ...] = (
     (0.60, (1.0, 0.0, 0.0, 0.0)),
@@ -32,7 +32,7 @@ MIXTURE: tuple[tuple[float, tuple[float, ...]], ...] = (
     (0.10, (0.0, 0.0, 0.0, 1.0)),
     (0.10, (0.25, 0.25, 0.25, 0.25)),
 )
-"""Share of the tasks -> chances of `MANNERS` of their teammates."""
+"""Share of the tasks -> chances of `BEHAVIOURS` of their teammates."""
 
 
 def check_heuristics(tasks: Iterable[Task]) -> None:
@@ -50,37 +50,37 @@ def check_heuristics(tasks: Iterable[Task]) -> None:
 
 
 def mixed_chances(tasks: int) -> np.ndarray:
-    """Return the chances of the manners of each of some tasks, float32 (tasks, 4), in the shares of `MIXTURE`."""
+    """Return the chances of the behaviours of each of some tasks, float32 (tasks, 4), in the shares of `MIXTURE`."""
     shares = np.cumsum([share for share, _ in MIXTURE])
     kind = np.searchsorted(shares, (np.arange(tasks) + 0.5) / tasks * shares[-1])
     return np.array([chances for _, chances in MIXTURE], np.float32)[kind]
 
 
-def with_manners(teammates: Sequence[Policy], chances: np.ndarray) -> list[Policy]:
-    """Return teammates of one family with manners.
+def with_behaviours(teammates: Sequence[Policy], chances: np.ndarray) -> list[Policy]:
+    """Return teammates of one family with behaviours.
 
     Args:
         teammates: policies that share their functions.
-        chances: float32 (len(teammates), 4), chances of `MANNERS`.
+        chances: float32 (len(teammates), 4), chances of `BEHAVIOURS`.
     """
-    functions = _with_manners(teammates[0])
+    functions = _with_behaviours(teammates[0])
     return [
         functions._replace(params={"script": mate.params, "chances": jnp.asarray(of_mate)})
         for mate, of_mate in zip(teammates, chances, strict=True)
     ]
 
 
-def _with_manners(policy: Policy) -> Policy:
-    noise = jnp.array([0.0, 0.0, 1.0, NOISY_SHARE])
+def _with_behaviours(policy: Policy) -> Policy:
+    noise = jnp.array([0.0, 0.0, 1.0, NOISY_SHARE])  # share of random actions in each behaviour
 
     def init(params: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        manner = jax.random.categorical(jax.random.fold_in(key, 1), jnp.log(params["chances"]))
-        return manner, policy.init(params["script"], key)
+        behaviour = jax.random.categorical(jax.random.fold_in(key, 1), jnp.log(params["chances"]))
+        return behaviour, policy.init(params["script"], key)
 
     def act(params: Any, memory: tuple[jax.Array, Any], view: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
-        manner, script = memory
+        behaviour, script = memory
         action, script = policy.act(params["script"], script, view, key)
-        action = sometimes_random(jax.random.fold_in(key, 1), noise[manner], action)
-        return jnp.where(manner == MANNERS.index("stay"), STAY, action).astype(jnp.int32), (manner, script)
+        action = sometimes_random(jax.random.fold_in(key, 1), noise[behaviour], action)
+        return jnp.where(behaviour == BEHAVIOURS.index("stay"), STAY, action).astype(jnp.int32), (behaviour, script)
 
     return Policy({}, init, act, policy.sees)

@@ -76,7 +76,6 @@ WINDOW_ENTRIES = (
     _ablated("no-ta", "without the teammate's actions", {"teammate_actions": False}),
     _ablated("next_obs", "predicts the next observation, too", {"next_obs": True}),
     _ablated("teammate", "predicts the teammate's action, too", {"teammate_loss": True}),
-    _ablated("family", "predicts the teammate's family, too", {"family_loss": True}),
     _ablated("no-positions", "without rope", {"positions": "none"}),
     _ablated("smoothing", "label smoothing of 0.1", {"label_smoothing": 0.1}),
     _ablated("rewards", "rewards as they are, 20 a delivery", {"reward_scale": 1.0}),

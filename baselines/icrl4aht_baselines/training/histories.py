@@ -270,7 +270,7 @@ def _sampler(
             raise OptionError(
                 f"queries = {histories.queries}: {method.name} learns from windows without queries; leave it out"
             )
-        return dataset.ad(length=options.context, every=every, labels=labels, families=model.family_loss, **shared)
+        return dataset.ad(length=options.context, every=every, labels=labels, **shared)
     if every > 1:
         raise OptionError(f"every = {every}: {method.name} learns from contexts of one part of a history; leave it out")
     assert labels is not None
@@ -425,8 +425,9 @@ def read_trained(folder: Path) -> TrainedModel:
     config = read_config(folder)
     try:
         histories, train = config["histories"], config["train"]
-        options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config["model"].items()}
-        model = ModelOptions(**options)
+        # An option that no longer exists is an error only if the run used it.
+        given = {k: v for k, v in config["model"].items() if v or hasattr(ModelOptions(), k)}
+        model = ModelOptions(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
         layouts = [get_layout(name) for name in histories["layouts"]]
         channels, obs_shape = histories["channels"], tuple(histories["obs_shape"])
         expected = observation_shape(layouts[0], channels == "canonical")
@@ -442,7 +443,7 @@ def read_trained(folder: Path) -> TrainedModel:
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
-    label += "+teammate" * model.teammate_loss + "+family" * model.family_loss
+    label += "+teammate" * model.teammate_loss
     label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # words is the network of paper
     names = tuple(layout.name for layout in layouts)
     digest = json_hash(config)

@@ -68,9 +68,6 @@ class PlayOptions:
     four_recipes: bool = option_field(
         False, "Also play on each layout with the four recipes of the protocol published, with teammates of one family."
     )
-    oracle_teammate: bool = option_field(
-        False, "Also play with the oracle as the teammate, which does all of the work alone, at several speeds."
-    )
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from icrl4aht_generation.learners.resume import differing_settings
+from icrl4aht_generation.learners.resume import METRICS, TIMING, Checkpoints, differing_settings
 
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
@@ -24,6 +24,7 @@ RUN_FORMAT = 4
 `trained_on`, 4 since it has `channels`."""
 
 CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD = "config.json", "curves.png", "checkpoints", "tensorboard"
+_FILES = {CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD, METRICS, TIMING}
 
 
 def format_versions() -> dict[str, Any]:
@@ -60,37 +61,46 @@ _DEFAULTS = {"model": ModelOptions(), "play": PlayOptions(), "histories": Histor
 def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
     """Start a run in a folder, or check that the run in it has the same settings. Return the settings in the folder.
 
-    An option that the folder does not state is one that came after the run: the run has its default.
+    Without a checkpoint there is nothing to resume: settings that a refused or killed training left are replaced.
 
     Args:
         folder: created if it is missing.
         config: all settings of the run; JSON values.
 
     Raises:
-        OptionError: if the folder holds a run of other settings; names each one that differs.
+        OptionError: if the folder has the checkpoints of a run of other settings, and names each one that differs; or
+            if it has files that are no run's.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / CONFIG).exists():
-        if jax.process_index() == 0:
-            with atomic_write(folder / CONFIG) as partial:
-                write_json(partial, config)
-        return config
-    found = read_config(folder)
-    different = differing_settings(_with_defaults(found, config), config)
-    if different:
-        listed = "; ".join(f"{name}: the run has {one!r}, expected {two!r}" for name, (one, two) in different.items())
-        raise OptionError(f"{folder}: holds a run of other settings ({listed}); give another --out")
-    return found
+    if (folder / CONFIG).exists() and Checkpoints(folder / CHECKPOINTS).latest is not None:
+        found = read_config(folder)
+        different = differing_settings(_with_defaults(found, config), config)
+        if different:
+            listed = "; ".join(f"{name}: the run has {a!r}, expected {b!r}" for name, (a, b) in different.items())
+            raise OptionError(f"{folder}: holds a run of other settings ({listed}); give another --out")
+        return found
+    foreign = sorted(path.name for path in folder.iterdir() if path.name.lstrip(".").split(".tmp")[0] not in _FILES)
+    if foreign:
+        raise OptionError(
+            f"{folder}: has files of something else ({', '.join(foreign[:3])}), expected a run, or an empty or new "
+            f"folder; give another --out"
+        )
+    if jax.process_index() == 0:
+        with atomic_write(folder / CONFIG) as partial:
+            write_json(partial, config)
+    return config
 
 
 def _with_defaults(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a run with the defaults of those options of a new one that it does not state."""
-    parts = {
-        part: asdict(options)
-        for part, options in _DEFAULTS.items()
-        if isinstance(found.get(part), dict) and part in config
-    }
-    return {**found} | {
-        part: {name: value for name, value in options.items() if name in config[part]} | found[part]
-        for part, options in parts.items()
-    }
+    """Return the settings of a run as this version of the package would state them.
+
+    Options that are newer than the run get their defaults. Options that no longer exist are left out if the run did not
+    use them.
+    """
+    completed = dict(found)
+    for part, options in _DEFAULTS.items():
+        if isinstance(found.get(part), dict) and part in config:
+            known, own = config[part], found[part]
+            defaults = {name: value for name, value in asdict(options).items() if name in known}
+            completed[part] = defaults | {name: value for name, value in own.items() if name in known or value}
+    return completed

@@ -315,19 +315,6 @@ def test_the_teammates_action_is_predicted_from_the_steps_before_it():
         ModelOptions(teammate_loss=True)
 
 
-def test_the_teammates_family_is_predicted_at_every_step():
-    method, params = tiny("ad", layers=1, family_loss=True)
-    batch = ad_batch()._replace(families=np.array([1, 4], np.int32))
-    loss = jax.jit(lambda b: method.loss(params, params, b, None)[1])
-    log, other = loss(batch), loss(batch._replace(families=np.array([1, 2], np.int32)))
-    total = log["action_loss"] + log["next_obs_loss"] + log["family_loss"]
-    np.testing.assert_allclose(log["loss"], total, rtol=1e-5)
-    assert log["family_loss"] != other["family_loss"] and log["action_loss"] == other["action_loss"]
-    for name in ("dpt", "amago_offline"):
-        with pytest.raises(OptionError, match=f"family_loss = True: {name} does not predict the teammate's family"):
-            tiny(name, layers=1, family_loss=True)
-
-
 def percepts(steps: int, episode: int, seed=0) -> Percept:
     """Input of an ego over some steps."""
     rng = np.random.default_rng(seed)

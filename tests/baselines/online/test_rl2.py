@@ -21,7 +21,7 @@ from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.methods.tokens import StepInput
 from icrl4aht_baselines.methods.view_change import ViewChange
 from icrl4aht_baselines.online.layouts import rearranged_layouts
-from icrl4aht_baselines.online.prepare import FLAT_SHARE, ORACLE, ORACLE_IDLES, REARRANGED_SHARE, _shares, prepare_play
+from icrl4aht_baselines.online.prepare import FLAT_SHARE, REARRANGED_SHARE, _shares, prepare_play
 from icrl4aht_baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTrainer,
@@ -33,7 +33,7 @@ from icrl4aht_baselines.online.rl2 import (
     make_groups,
     seen_steps,
 )
-from icrl4aht_baselines.online.teammates import MANNERS, MIXTURE, mixed_chances, with_manners
+from icrl4aht_baselines.online.teammates import BEHAVIOURS, MIXTURE, mixed_chances, with_behaviours
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import read_trained_on
@@ -224,13 +224,13 @@ class TestGroups:
             ("demo_wide a", 8, True),
         ]
 
-    def test_every_teammate_has_several_manners(self):
+    def test_every_teammate_has_several_behaviours(self):
         group = make_groups({(LAYOUT, "a"): teammates(3)}, 60, {LAYOUT.name: 1.0})[0]
         found: dict[bytes, set[bytes]] = {}
         for mate in group.teammates:
             theta = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(mate.params["script"]))
             found.setdefault(theta, set()).add(np.asarray(mate.params["chances"]).tobytes())
-        assert all(len(manners) >= 3 for manners in found.values())
+        assert all(len(behaviours) >= 3 for behaviours in found.values())
 
     def test_teammates_of_tasks(self):
         assert sorted(np.bincount(chosen_teammates(3, 8)).tolist()) == [2, 3, 3]
@@ -244,20 +244,20 @@ class TestGroups:
 
     def test_mixture(self):
         chances = mixed_chances(100)
-        assert chances.shape == (100, len(MANNERS)) and np.allclose(chances.sum(axis=1), 1)
+        assert chances.shape == (100, len(BEHAVIOURS)) and np.allclose(chances.sum(axis=1), 1)
         assert (chances[:, 0] == 1).sum() == 100 * MIXTURE[0][0]
         assert mixed_chances(1)[0].tolist() == [1.0, 0.0, 0.0, 0.0]
 
-    @pytest.mark.parametrize("manner", MANNERS)
-    def test_manners(self, manner):
-        """With the manner `stay` the teammate never moves, with `script` it plays as without manners."""
+    @pytest.mark.parametrize("behaviour", BEHAVIOURS)
+    def test_behaviours(self, behaviour):
+        """With the behaviour `stay` the teammate never moves, with `script` it plays as without behaviours."""
         base = teammates(1)[0]
-        chances = np.eye(len(MANNERS), dtype=np.float32)[[MANNERS.index(manner)]]
-        (mate,) = with_manners([base], chances)
+        chances = np.eye(len(BEHAVIOURS), dtype=np.float32)[[BEHAVIOURS.index(behaviour)]]
+        (mate,) = with_behaviours([base], chances)
         taken, plain = played_actions(mate), played_actions(base)
-        if manner == "stay":
+        if behaviour == "stay":
             assert (taken == STAY).all()
-        elif manner == "script":
+        elif behaviour == "script":
             np.testing.assert_array_equal(taken, plain)
         else:
             assert 0.05 < (taken != plain).mean() < 1.0
@@ -314,17 +314,6 @@ class TestPreparing:
         played = collections.Counter(layout for group in rearranged for layout in group.layouts)
         assert {one.rows for one in played} == {one.rows for one in rearranged_layouts(LAYOUT, 6)}
         assert max(played.values()) - min(played.values()) <= 1
-
-    def test_the_oracle_is_a_teammate_on_all_layouts(self):
-        """It plays in other tasks than the teammates of histories, and is none of those on record."""
-        plain, job = self.prepare(PlayOptions()), self.prepare(PlayOptions(oracle_teammate=True, rearranged=6))
-        groups = [one.group for one in job.trainer.players if one.group.family == ORACLE]
-        assert {group.label for group in groups} == {"cramped_up", "cramped_up rearranged"}
-        idles = {float(mate.params["script"]) for group in groups for mate in group.teammates}
-        assert idles <= {float(np.float32(idle)) for idle in ORACLE_IDLES} and len(idles) > 1
-        assert {cell["algorithm"] for cell in job.about["trained_on"]} == {
-            cell["algorithm"] for cell in plain.about["trained_on"]
-        }
 
     def test_layouts_without_histories_need_tasks(self):
         choice = HistoryOptions(("cramped_down",))

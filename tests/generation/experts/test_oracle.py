@@ -13,15 +13,13 @@ import pytest
 from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.evaluate.evaluator import play_tasks
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
-from icrl4aht_baselines.evaluate.rollout import EvaluationRollout
-from icrl4aht_generation.experts.oracle_teammate import oracle_teammate
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_tasks, published_thetas
 from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
-from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
-from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, Layout, get_layout
+from icrl4aht_data.overcooked.actions import EGO, STAY
+from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, Layout
 from icrl4aht_data.overcooked.rules import CORRECT, PRESSED, WRONG, step
 from icrl4aht_data.overcooked.state import ingredient_count, unpack
 
@@ -114,18 +112,3 @@ def test_it_is_deterministic():
 
 def test_families_are_all_met():
     assert set(FAMILY_ON.values()) == set(HEURISTIC_KINDS.values())
-
-
-class TestTeammate:
-    """The oracle as agent 1."""
-
-    @pytest.mark.parametrize("name", ["asymm_both", "coord_ring"])
-    def test_does_all_of_the_work_alone(self, name: str):
-        layout = get_layout(name)
-        mates = [oracle_teammate(layout)._replace(params=jnp.float32(idle)) for idle in (0.0, 0.5, 1.0)]
-        rollout = EvaluationRollout(layout, AGENTS["stay"](layout), mates, PROTOCOLS["seeded"])
-        state = rollout.start(jax.random.split(jax.random.key(0), len(mates)))
-        _, played = jax.jit(rollout.episode)(rollout.ego.params, rollout.teammate_params, state)
-        fast, slow, idle = np.asarray(played.reward).sum(axis=-1)
-        assert fast >= 40 and idle == 0 <= slow <= fast
-        assert (np.asarray(played.actions)[2, :, TEAMMATE] == STAY).all()
