@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -213,6 +213,28 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
             raise OptionError(f"{file}: a folder or a link is where a file is needed; give another name")
         if file.exists() and not overwrite:
             raise OptionError(f"{file}: exists; give another name, or replace it by --overwrite")
+
+
+def check_own_folder(folder: Path, names: Collection[str], what: str) -> None:
+    """Check that a folder may receive files with these names: it is missing, or has no others.
+
+    Args:
+        folder: the folder to write to.
+        names: names of files and folders that the writer makes in it.
+        what: what it holds then, such as "a run", for the message.
+
+    Raises:
+        OptionError: if it is no folder, or has files with other names; lists some of them.
+    """
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise OptionError(f"{folder}: a file is where a folder is needed; give another folder")
+    found = (final_name(path.name) for path in folder.iterdir()) if folder.is_dir() else ()
+    foreign = sorted(name for name in found if name not in names)
+    if foreign:
+        raise OptionError(
+            f"{folder}: has other files ({', '.join(foreign[:3])}), expected {what}, or an empty or new folder; give "
+            f"another folder"
+        )
 
 
 T = TypeVar("T")

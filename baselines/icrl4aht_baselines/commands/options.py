@@ -24,7 +24,7 @@ from icrl4aht_baselines.training.options import (
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
-from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, Folder, Names, Root
+from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, SEED, Folder, Names, Root
 from icrl4aht_data.errors import UnknownNameError
 
 
@@ -111,9 +111,14 @@ _experiment_split_option = click.option(
     help=_SPLIT_HELP,
     show_default="test; diverse in `ablate windows` and `contexts`",
 )
-tasks_option = click.option("--tasks", type=COUNT, help="Most tasks of each teammate family and layout.")
+tasks_option = click.option(
+    "--tasks", type=COUNT, help="Most tasks of each cell, a layout with a teammate family: 2 are two a cell."
+)
 episodes_option = click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
-seeds_option = click.option("--seeds", type=COUNT, default=1, help="Times that every task is played.")
+seeds_option = click.option("--seeds", type=COUNT, default=1, help="Play every task with the seeds 0 to N - 1.")
+seed_option = click.option(
+    "--seed", "chosen_seeds", type=SEED, multiple=True, help="Play every task with this seed, not with --seeds; repeat."
+)
 suite_option = click.option(
     "--suite", type=Folder("`icrl4aht-data teammates`"), metavar="FOLDER", help="Folder of learned teammates."
 )

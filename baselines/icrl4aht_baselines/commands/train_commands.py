@@ -14,6 +14,7 @@ from icrl4aht_baselines.commands.options import (
     METHOD_NAME,
     TRAINING_LAYOUT,
     acting_option,
+    check_alone,
     episodes_option,
     evaluation_split_option,
     find_ego,
@@ -32,6 +33,7 @@ from icrl4aht_baselines.commands.options import (
     protocol_option,
     root_option,
     save_minutes_option,
+    seed_option,
     seeds_option,
     size_option,
     suite_option,
@@ -57,7 +59,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import check_new_file, check_new_files
-from icrl4aht_data.utils.progress import counted, progress_bars
+from icrl4aht_data.utils.progress import progress_bars
 
 _console = Console(soft_wrap=True)
 
@@ -96,6 +98,7 @@ _console = Console(soft_wrap=True)
 @episodes_option
 @suite_option
 @seeds_option
+@seed_option
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the results here.")
 def evaluate_command(
     agent: str,
@@ -111,6 +114,7 @@ def evaluate_command(
     episodes: int | None,
     suite: Path | None,
     seeds: int,
+    chosen_seeds: tuple[int, ...],
     out: Path,
 ) -> None:
     """Evaluate an agent on test tasks, or on validation tasks.
@@ -139,19 +143,10 @@ def evaluate_command(
         )
     for name in {task.layout.name for task in chosen}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
-    played = get_protocol(protocol, episodes)
-    with progress_bars(unit="episodes") as show:
-        evaluate(
-            ego.name,
-            ego.make,
-            chosen,
-            played,
-            seeds=range(seeds),
-            suite=suite,
-            out=out,
-            details=ego.details,
-            played=counted(show, f"{ego.name}, {protocol}", len(chosen) * played.episodes * seeds),
-        )
+    if chosen_seeds:
+        check_alone("--seed", "seeds")
+    rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
+    evaluate(ego.name, ego.make, chosen, rules, seeds=seeds_of_tasks, suite=suite, out=out, details=ego.details)
     note_results(out, ego.run, chosen if manifest or split != "test" else ())
     for line in summary_lines([read_run(out)]):
         click.echo(line)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -23,13 +24,15 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.registry import build_teammate, check_theta
 
 from icrl4aht_baselines.agents.host import HostPolicy
-from icrl4aht_baselines.evaluate.protocols import Protocol
-from icrl4aht_baselines.evaluate.results import Result, find_result, write_result
+from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
+from icrl4aht_baselines.evaluate.results import Result, find_results, write_result
 from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutState, task_key
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.options import check_int
+from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.system import usable_cores
 
 MakeEgo = Callable[[Layout], Policy | HostPolicy]
@@ -40,23 +43,25 @@ def evaluate(
     agent: str,
     make_ego: MakeEgo,
     tasks: Sequence[Task],
-    protocol: Protocol,
+    protocol: Protocol | str = "seeded",
     *,
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
     out: Path | None = None,
     details: dict[str, Any] | None = None,
-    done: Callable[[int], None] = lambda tasks: None,
-    played: Callable[[int], None] = lambda episodes: None,
+    done: Callable[[int], None] | None = None,
+    played: Callable[[int], None] | None = None,
 ) -> list[Result]:
     """Evaluate an ego and return one result per task, in the order of `tasks`.
 
+    Shows progress, unless `done` or `played` is given: a bar, or a line a minute where stderr is no terminal.
+
     Args:
         agent: name of the ego in results and reports.
-        make_ego: layout -> ego, such as `icrl4aht_baselines.agents.from_host(my_agent)`.
-        tasks: the tasks, such as those of `icrl4aht_generation.teammates.instances.published_tasks`.
-        protocol: rules of the evaluation, from `get_protocol`.
-        seeds: seeds of the episodes; the ego plays every task once per seed.
+        make_ego: layout -> ego, such as `icrl4aht_baselines.from_host(my_agent)`.
+        tasks: the tasks, such as `icrl4aht_baselines.test_tasks("teammate")`.
+        protocol: rules of the evaluation, "seeded" or "published", or with fewer episodes those of `get_protocol`.
+        seeds: seeds of the episodes, such as (0, 1, 2); the ego plays every task once with each of them.
         suite: folder with the checkpoints of learned teammates, if tasks have any.
         out: folder for one JSON file per task. Results found there under the same settings are not computed again.
         details: further settings that the results depend on, as JSON; stored and compared with the results.
@@ -66,49 +71,78 @@ def evaluate(
         played: called with the number of episodes played since the last call, or found in `out`; by several threads.
 
     Raises:
-        OptionError: if `out` has results of other settings, or the ego's actions are not integers in 0..5.
+        OptionError: if `out` has results of other settings or other files, seeds are not different integers from 0,
+            or the ego's actions are not integers in 0..5.
+        UnknownNameError: if there is no such protocol.
         TaskFormatError: if a teammate's parameters are impossible; names the task.
     """
     for task in tasks:
         _check_teammate(task, suite)
+    rules, seeds = get_protocol(protocol) if isinstance(protocol, str) else protocol, _checked_seeds(seeds)
     settings = {
         "agent": agent,
-        "seeds": list(seeds),
-        "protocol": asdict(protocol),
+        "seeds": seeds,
+        "protocol": asdict(rules),
         "code_version": version("icrl4aht-data"),
     } | ({"details": details} if details else {})
-    stored = {task.task_id: find_result(out, task.task_id, settings) for task in tasks} if out else {}
-    results = {task_id: result for task_id, result in stored.items() if result}
-    done(len(results))
-    played(len(results) * len(seeds) * protocol.episodes)
+    results = {} if out is None else find_results(out, tasks, settings)
+    missing = [task for task in tasks if task.task_id not in results]
+    with ExitStack() as stack:
+        if played is None and done is None:
+            show = stack.enter_context(progress_bars(unit="episodes"))
+            played = counted(show, f"{agent}, {rules.name}", len(tasks) * len(seeds) * rules.episodes)
+        count_tasks, count_episodes = (count or (lambda number: None) for count in (done, played))
+        count_tasks(len(results))
+        count_episodes(len(results) * len(seeds) * rules.episodes)
+        for found in _evaluate_groups(make_ego, missing, rules, seeds, suite, settings, count_episodes):
+            for result in found:
+                results[result.task_id] = result
+                if out is not None:
+                    write_result(out, result)
+            count_tasks(len(found))
+    return [results[task.task_id] for task in tasks]
+
+
+def _checked_seeds(seeds: Sequence[int]) -> list[int]:
+    if not isinstance(seeds, Sequence) or isinstance(seeds, str) or not seeds:
+        raise OptionError(f"seeds = {seeds!r}: expected a sequence of integers, such as (0, 1, 2)")
+    found = [check_int("seeds", seed, 0) for seed in seeds]
+    if len(set(found)) < len(found):
+        raise OptionError(f"seeds = {found}: expected different ones; with equal seeds the ego plays equal episodes")
+    return found
+
+
+def _evaluate_groups(
+    make_ego: MakeEgo,
+    tasks: Sequence[Task],
+    protocol: Protocol,
+    seeds: Sequence[int],
+    suite: Path | None,
+    settings: dict[str, Any],
+    played: Callable[[int], None],
+) -> Iterator[list[Result]]:
+    """Yield the results of tasks of one layout and teammate family after another, in the order in which they finish."""
     groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
     for task in tasks:
-        if task.task_id not in results:
-            groups[task.layout_name, task.teammate_kind].append(task)
-
+        groups[task.layout_name, task.teammate_kind].append(task)
     layouts = {group[0].layout.name: group[0].layout for group in groups.values()}
     egos = {name: make_ego(layout) for name, layout in layouts.items()}
 
-    def run(group: list[Task], stopped: Event) -> list[Result]:
+    def run(group: list[Task]) -> list[Result]:
         prepared = prepare_rollout(lambda layout: egos[layout.name], group, protocol, seeds, suite)
         return _evaluate_group(group, prepared, len(seeds), settings, stopped, played)
 
-    # Groups run side by side: one compiles while another plays, and one alone does not use all cores. An ego outside
-    # JAX gets a single thread, since its `reset` must come right before its episodes.
+    # Groups run at the same time: one compiles while another plays, and one alone does not use all cores. An ego
+    # outside JAX gets a single thread, since its `reset` must come right before its episodes.
     outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
     stopped = Event()
     with ThreadPoolExecutor(1 if outside else min(4, usable_cores())) as pool:
         try:
-            for future in as_completed([pool.submit(run, group, stopped) for group in groups.values()]):
-                for result in future.result():
-                    results[result.task_id] = result
-                    if out:
-                        write_result(out, result)
-                done(len(future.result()))
+            for future in as_completed([pool.submit(run, group) for group in groups.values()]):
+                yield future.result()
         finally:
             stopped.set()
             pool.shutdown(cancel_futures=True)
-    return [results[task.task_id] for task in tasks]
 
 
 def _check_teammate(task: Task, suite: Path | None) -> None:
@@ -132,7 +166,7 @@ def _evaluate_group(
 ) -> list[Result]:
     """Return the results of tasks of one layout and teammate family; none if it was stopped."""
     returns = []
-    for episode in play_episodes(prepared, prepared.rollout.protocol.episodes):
+    for episode in play_episodes(prepared):
         if stopped.is_set():
             return []
         ego = episode.actions[..., EGO]
@@ -209,11 +243,11 @@ def play_tasks(
     Yields:
         One `EpisodeBatch` after another with B = tasks x seeds; seeds vary fastest.
     """
-    yield from play_episodes(prepare_rollout(make_ego, tasks, protocol, seeds, suite), protocol.episodes)
+    yield from play_episodes(prepare_rollout(make_ego, tasks, protocol, seeds, suite))
 
 
-def play_episodes(prepared: PreparedRollout, episodes: int) -> Iterator[EpisodeBatch]:
-    """Play episodes of prepared tasks.
+def play_episodes(prepared: PreparedRollout) -> Iterator[EpisodeBatch]:
+    """Play all episodes of prepared tasks.
 
     Yields:
         One `EpisodeBatch` after another.
@@ -223,7 +257,7 @@ def play_episodes(prepared: PreparedRollout, episodes: int) -> Iterator[EpisodeB
     """
     rollout, state, episode = prepared
     params = rollout.teammate_params
-    for _ in range(episodes):
+    for _ in range(rollout.protocol.episodes):
         try:
             state, played = jax.block_until_ready(episode(rollout.ego.params, params, state))
         except jax.errors.JaxRuntimeError as error:  # an exception of an agent outside JAX arrives wrapped

@@ -107,7 +107,9 @@ def get_protocol(name: str, episodes: int | None = None) -> Protocol:
 
 
 def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
-    """Return the first `count` tasks of each layout and teammate kind, in order; all tasks for None.
+    """Return the first `count` tasks of each cell, a layout with a teammate kind, in order; all tasks for None.
+
+    A count of 2 chooses up to 2 tasks in each of the cells, not 2 tasks in all.
 
     Raises:
         OptionError: if `count` is not positive.

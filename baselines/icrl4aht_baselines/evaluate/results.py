@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from icrl4aht_generation.learners.resume import differing_settings
 
+from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write, json_hash
+from icrl4aht_data.utils.files import atomic_write, check_own_folder, json_hash
 
 
 @dataclass(frozen=True)
@@ -32,26 +34,33 @@ class Result:
         return {"settings_hash": json_hash(self.settings), **asdict(self)}
 
 
+RESULTS = "tasks"
+"""Name of the folder with the JSON files, in a folder of results."""
+
+
 def result_path(out: Path, task_id: str) -> Path:
     """Return the path of a task's result in a folder of results."""
-    return out / "tasks" / f"{task_id}.json"
+    return out / RESULTS / f"{task_id}.json"
 
 
-def find_result(out: Path, task_id: str, settings: dict[str, Any]) -> Result | None:
-    """Return a task's result from a folder of results, or None if there is none yet.
+def find_results(out: Path, tasks: Iterable[Task], settings: dict[str, Any]) -> dict[str, Result]:
+    """Return the results of tasks that a folder of results has, by task id.
 
     Raises:
-        OptionError: if the result was made under other settings, or its file is damaged.
+        OptionError: if a result was made under other settings or its file is damaged, or if the folder is no folder of
+            results and has other files.
     """
-    path = result_path(out, task_id)
-    if not path.exists():
-        return None
-    result = read_result(path)
-    different = differing_settings(result.settings, settings)
-    if different:
-        listed = "; ".join(f"{name}: it has {one!r}, expected {two!r}" for name, (one, two) in different.items())
-        raise OptionError(f"{path}: holds a result of other settings ({listed}); give another --out")
-    return result
+    if not (out / RESULTS).is_dir():
+        check_own_folder(out, (), "results of `evaluate`")
+    paths = [result_path(out, task.task_id) for task in tasks]
+    found = {result.task_id: result for result in map(read_result, filter(Path.exists, paths))}
+    for result in found.values():
+        different = differing_settings(result.settings, settings)
+        if different:
+            listed = "; ".join(f"{name}: it has {one!r}, expected {two!r}" for name, (one, two) in different.items())
+            path = result_path(out, result.task_id)
+            raise OptionError(f"{path}: holds a result of other settings ({listed}); give another --out")
+    return found
 
 
 def read_result(path: Path) -> Result:

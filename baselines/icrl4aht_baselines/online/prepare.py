@@ -43,6 +43,7 @@ FOUR_RECIPES_SHARE = 0.2
 REARRANGED_SHARE = 1.5
 """Number of tasks on all rearranged versions of a layout, as a share of that on the layout."""
 
+
 class PlayJob(NamedTuple):
     """Arguments of `trainer.train`, except for a folder.
 

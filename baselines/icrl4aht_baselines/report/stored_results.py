@@ -224,7 +224,9 @@ def add_ablation(stored: StoredResults, name: str, folder: Path) -> StoredResult
         if found:
             cells[entry.name, name] = found
     if first not in cells:
-        raise OptionError(f"{folder}: no results of {first[0]}; expected a folder that `icrl4aht-data research {name}` made")
+        raise OptionError(
+            f"{folder}: no results of {first[0]}; expected a folder that `icrl4aht-data research {name}` made"
+        )
     same = first in stored.cells and _numbers(stored.cells[first]) == _numbers(cells[first])
     kept = {key: found for key, found in stored.cells.items() if key[1] != name or same}
     return StoredResults(kept | cells, stored.about)

@@ -17,7 +17,7 @@ from icrl4aht_generation.learners.resume import METRICS, TIMING, Checkpoints, di
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_data.errors import IndexFormatError, OptionError
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import atomic_write, check_own_folder, parse_json, read_text, write_json
 
 RUN_FORMAT = 4
 """Version of the layout of run folders: 2 since checkpoints are safetensors files, 3 since config.json has
@@ -71,7 +71,6 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
         OptionError: if the folder has the checkpoints of a run of other settings, and names each one that differs; or
             if it has files that are no run's.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     if (folder / CONFIG).exists() and Checkpoints(folder / CHECKPOINTS).latest is not None:
         found = read_config(folder)
         different = differing_settings(_with_defaults(found, config), config)
@@ -79,12 +78,8 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
             listed = "; ".join(f"{name}: the run has {a!r}, expected {b!r}" for name, (a, b) in different.items())
             raise OptionError(f"{folder}: holds a run of other settings ({listed}); give another --out")
         return found
-    foreign = sorted(path.name for path in folder.iterdir() if path.name.lstrip(".").split(".tmp")[0] not in _FILES)
-    if foreign:
-        raise OptionError(
-            f"{folder}: has files of something else ({', '.join(foreign[:3])}), expected a run, or an empty or new "
-            f"folder; give another --out"
-        )
+    check_own_folder(folder, _FILES, "a run")
+    folder.mkdir(parents=True, exist_ok=True)
     if jax.process_index() == 0:
         with atomic_write(folder / CONFIG) as partial:
             write_json(partial, config)

@@ -93,6 +93,22 @@ def test_results_of_other_settings_are_never_reused(tmp_path):
         evaluate("random", random, SIMPLE, PUBLISHED, out=tmp_path)
 
 
+def test_folders_with_other_files_are_refused(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(OptionError, match=r"has other files \(notes.txt\), expected results of `evaluate`"):
+        evaluate("stay", stay, SIMPLE, PUBLISHED, out=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("seeds", "message"),
+    [(3, "seeds = 3: expected a sequence"), ((), "seeds"), ((True,), "seeds = True"), ((1, 1), "expected different")],
+)
+def test_impossible_seeds(seeds, message):
+    with pytest.raises(OptionError, match=message):
+        evaluate("stay", stay, SIMPLE, "published", seeds=seeds)
+
+
 def test_damaged_results_are_named(tmp_path):
     evaluate("stay", stay, SIMPLE, PUBLISHED, out=tmp_path)
     path = min((tmp_path / "tasks").iterdir())

@@ -6,12 +6,14 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import struct
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ import pytest
 from icrl4aht_baselines.methods.registry import get_method
 from icrl4aht_baselines.training.histories import hold_out, prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
-from icrl4aht_baselines.training.run_folder import CHECKPOINTS
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions, open_run, read_config
 from icrl4aht_baselines.training.stopping import StopSignals, TrainingStopped
 from icrl4aht_baselines.training.trainer import (
     Trainer,
@@ -33,7 +35,7 @@ from icrl4aht_baselines.training.trainer import (
     train,
     training_optimizer,
 )
-from icrl4aht_generation.learners.resume import Checkpoints
+from icrl4aht_generation.learners.resume import Checkpoints, StateFile
 from jax.experimental import multihost_utils
 from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
 
@@ -229,6 +231,44 @@ class TestStopping:
         assert agreed((0, 0), (1, 0)) == (False, 0)
         assert agreed((0, 0), (0, 15)) == agreed((0, 15), (0, 0)) == (False, 15)
         assert agreed((1, 2)) == (True, 2)
+
+
+class TestFolder:
+    def test_a_refused_training_does_not_block_the_corrected_one(self, through, tmp_path):
+        """Without a checkpoint nothing is lost; with one, other settings are refused."""
+        first, corrected = ({**format_versions(), "train": {"batch_size": size}} for size in (10**9, 4))
+        open_run(tmp_path / "run", first)
+        assert open_run(tmp_path / "run", corrected) == corrected == read_config(tmp_path / "run")
+        shutil.copytree(through[0] / CHECKPOINTS, tmp_path / "run" / CHECKPOINTS)
+        with pytest.raises(OptionError, match=r"train.batch_size: the run has 4, expected 1000000000"):
+            open_run(tmp_path / "run", first)
+
+    def test_folders_with_other_files_are_refused(self, tmp_path):
+        (tmp_path / "notes.txt").touch()
+        with pytest.raises(OptionError, match=r"has other files \(notes.txt\), expected a run, or an empty or new"):
+            trained(tmp_path)
+        assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+        with pytest.raises(OptionError, match="a file is where a folder is needed"):
+            trained(tmp_path / "notes.txt")
+
+    def test_options_that_no_longer_exist(self, through, tmp_path):
+        """They are ignored if the run did not use them."""
+        shutil.copytree(through[0] / CHECKPOINTS, tmp_path / CHECKPOINTS)
+        config = {**format_versions(), "model": {"layers": 1}}
+        for gone, refused in ((False, False), (True, True)):
+            (tmp_path / "config.json").write_text(json.dumps({**config, "model": {"layers": 1, "gone": gone}}))
+            with pytest.raises(OptionError, match=r"model\.gone") if refused else nullcontext():
+                open_run(tmp_path, config)
+
+    def test_equal_states_are_files_of_equal_bytes(self, tmp_path):
+        """The library writes the metadata in a random order."""
+        file = StateFile(tmp_path / "state", {"name": "ä", "list": [1, "\\"]})
+        contents = set()
+        for _ in range(8):
+            file.save({"b": np.arange(3), "a": jnp.ones(2)}, 7)
+            contents.add(file.path.read_bytes())
+        assert len(contents) == 1 and file.progress == 7
+        np.testing.assert_array_equal(file.load({"b": np.arange(3), "a": jnp.zeros(2)})["a"], [1, 1])
 
 
 class TestStep:
