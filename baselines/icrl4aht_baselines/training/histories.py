@@ -426,8 +426,9 @@ def read_trained(folder: Path) -> TrainedModel:
     try:
         histories, train = config["histories"], config["train"]
         # An option that no longer exists is an error only if the run used it.
-        given = {k: v for k, v in config["model"].items() if v or hasattr(ModelOptions(), k)}
-        model = ModelOptions(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+        stated = {k: v for k, v in config["model"].items() if v or hasattr(ModelOptions(), k)}
+        options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stated.items()}
+        model = ModelOptions(**options)
         layouts = [get_layout(name) for name in histories["layouts"]]
         channels, obs_shape = histories["channels"], tuple(histories["obs_shape"])
         expected = observation_shape(layouts[0], channels == "canonical")

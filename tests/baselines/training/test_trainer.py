@@ -35,7 +35,7 @@ from icrl4aht_baselines.training.trainer import (
     train,
     training_optimizer,
 )
-from icrl4aht_generation.learners.resume import Checkpoints, StateFile
+from icrl4aht_generation.learners.resume import Checkpoints
 from jax.experimental import multihost_utils
 from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
 
@@ -259,16 +259,6 @@ class TestFolder:
             (tmp_path / "config.json").write_text(json.dumps({**config, "model": {"layers": 1, "gone": gone}}))
             with pytest.raises(OptionError, match=r"model\.gone") if refused else nullcontext():
                 open_run(tmp_path, config)
-
-    def test_equal_states_are_files_of_equal_bytes(self, tmp_path):
-        """The library writes the metadata in a random order."""
-        file = StateFile(tmp_path / "state", {"name": "ä", "list": [1, "\\"]})
-        contents = set()
-        for _ in range(8):
-            file.save({"b": np.arange(3), "a": jnp.ones(2)}, 7)
-            contents.add(file.path.read_bytes())
-        assert len(contents) == 1 and file.progress == 7
-        np.testing.assert_array_equal(file.load({"b": np.arange(3), "a": jnp.zeros(2)})["a"], [1, 1])
 
 
 class TestStep:
