@@ -157,6 +157,7 @@ class _Player:
         self, layout: Layout, teammates: Sequence[Policy], hidden: bool, method: Method, play: PlayOptions, mirror: bool
     ) -> None:
         self.layout, self.hidden, self._method, self._play, self._mirror = layout, hidden, method, play, mirror
+        # A model whose view never changes needs no code for it, which is a part of every step and of its compilation.
         self._changes = mirror or hidden
         ego = _model_policy(method, layout, self._changes)
         self.rollout = EvaluationRollout(layout, ego, teammates, get_protocol("seeded"))
@@ -183,6 +184,7 @@ class _Player:
         after, played = self.rollout.episode(params, mates, state)
         ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
         sequences = self._sequences(params, state, after, played, ended)
+        # Where a task ends, a new one begins with the same teammate: another view, an empty state, no previous step.
         begun = _select(ended, self._draw_change(change_key), after.ego.change)
         memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended)
         before = _select(ended, no_outcome(self.tasks), after.before)
@@ -202,26 +204,31 @@ class _Player:
             prev_teammate_action=jnp.concatenate([state.before.prev_teammate_action[None], theirs]),
         )
         if self._changes:
+            # Only the first step of an episode can be a task's first one.
             started = jnp.ones((len(record) + 1, self.tasks), bool).at[0].set(state.ego.started)
             seen = seen_steps(change.at_each_step(len(record) + 1, 0), steps, started)
         else:
             seen = steps
+        # A second pass over the episode gives log-probabilities and values by the operations of the loss, and the value
+        # of the step after the last.
         _, logits, value = _Network(self._method.model).apply(params, state.ego.state, seen)
         own = change.at_each_step(len(record), 0)
         action = own.actions(taken)
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits[:-1]), action[..., None], axis=-1)[..., 0]
         return Sequences(
             seen=jax.tree.map(lambda leaf: leaf[:-1], seen),
-            reset=jnp.zeros(reward.shape, bool),
+            reset=jnp.zeros(reward.shape, bool),  # within an episode the recurrent state is never cleared
             action=action,
             log_prob=log_prob,
             value=value[:-1],
             reward=PLAY_REWARD_SCALE * reward,
+            # Returns end with a task, not with an episode, so that exploring early pays in later episodes.
             done=jnp.zeros(reward.shape, bool).at[-1].set(ended),
             hidden=state.ego.state[None],
-            partner=jnp.zeros((1, self.tasks), jnp.int32),
+            partner=jnp.zeros((1, self.tasks), jnp.int32),  # one value function for all teammates
             weight=jnp.ones((1, self.tasks)),
             last_value=value[-1][None],
+            # The oracle acts in the environment's view; its actions are learned in the model's.
             expert=own.actions(follow_oracle(layout, record, taken)),
         )
 
@@ -275,6 +282,7 @@ def _group_players(
         _Player(layout, [group.teammates[group.layouts.index(layout)]], group.hidden, method, play, mirror)
         for layout in layouts
     ]
+    # Shapes suffice to compare programs: nothing is computed or compiled here.
     key = jax.eval_shape(lambda: jax.random.key(0))
     params = jax.eval_shape(lambda: method.init(jax.random.key(0)))
     state, mates = jax.eval_shape(players[0].start, key), players[0].rollout.teammate_params
@@ -390,7 +398,8 @@ class PlayTrainer:
                 f"minibatches = {play.minibatches}: expected at most the {self.tasks} tasks that are played at once; "
                 f"give fewer --minibatches or a larger --batch-size"
             )
-        learned = self.tasks - self.tasks % play.minibatches  # from so many tasks in each pass
+        # Minibatches have equal sizes: a pass leaves out up to minibatches - 1 tasks, others in each pass.
+        learned = self.tasks - self.tasks % play.minibatches
         config = PPOConfig(
             total_steps=options.steps * learned * KEPT_STEPS,
             environments=learned,
@@ -433,6 +442,7 @@ class PlayTrainer:
 
     def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:
         """Play one episode of every task and learn from them; return the state after it and the numbers to log."""
+        # Keys are functions of the seed and the step's number, so that a resumed run plays the same episodes.
         play_key, learn_key = jax.random.split(jax.random.fold_in(jax.random.key(self.options.seed + 1), number))
         keys = jax.random.split(play_key, len(self.players))
         if self._compiled is None:
@@ -442,6 +452,7 @@ class PlayTrainer:
             for episode, mates, tasks, key in zip(self._compiled, self._mates, state.tasks, keys, strict=True)
         ]
         tasks, sequences, returns = zip(*played, strict=True)
+        # All groups are one batch, from which minibatches are drawn: none learns from one layout alone.
         weight = imitation_weight(self.play, state.step, self.options.steps)
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
         by_name: dict[str, list[Array]] = defaultdict(list)
@@ -451,7 +462,7 @@ class PlayTrainer:
         return PlayState(params, optimizer, tasks, state.step + 1), log
 
     def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:
-        """Compile the episodes of all groups side by side."""
+        """Compile the episodes of all groups at the same time, since each takes seconds and one core."""
         with ThreadPoolExecutor() as pool:
             lowered = [
                 player.episode.lower(state.params, mates, tasks, key)
@@ -467,7 +478,7 @@ class PlayTrainer:
         params, optimizer, log = self.ppo.learn(params, optimizer, played, key)
         config = self.ppo.config
         total = log["policy_loss"] + config.value * log["value_loss"] - config.entropy * log["entropy"]
-        total += weight * log["imitation_loss"]
+        total += weight * log["imitation_loss"]  # the loss of a training is one number in all logs
         return params, optimizer, {"loss": total, **log, "imitation_weight": weight}
 
 

@@ -1,4 +1,4 @@
-"""The trainer (paper, App. E.4): any method on any batches; exact resume, accumulation, data parallelism.
+"""The trainer (paper, App. E.4): any method on any batches, with exact resume, accumulation and data parallelism.
 
 Step i is a function of the state before it and of batch i, which is a function of (seed, i). So a run that was killed
 resumes from its last checkpoint to the same parameters and the same log as an uninterrupted one.
@@ -63,7 +63,7 @@ class TrainState(NamedTuple):
 
     Attributes:
         params: pytree of float32 arrays.
-        slow: copy of the parameters that follows them slowly, or None.
+        slow: exponential moving average of the parameters, or None.
         optimizer: state of the optimizer.
         step: int32 (), steps so far.
     """
@@ -109,10 +109,13 @@ class Trainer:
         self.method, self.options, self._optimizer = method, options, training_optimizer(options)
         self._learning_rate = learning_rate_schedule(options)
         mesh = Mesh(np.asarray(devices), (BATCH_AXIS,))
+        # Data parallelism: every device has the complete state and its share of the rows. XLA adds the mean of the
+        # gradients over devices by itself, because the result must be the same everywhere.
         self.rows, self._parts, self.everywhere = (
             NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((BATCH_AXIS,), (None, BATCH_AXIS), ())
         )
         same = self.everywhere
+        # The state is donated: two copies of parameters and optimizer would not fit where one just does.
         self.step = jax.jit(self._step, in_shardings=(same, self.rows), out_shardings=same, donate_argnums=0)
         self.validate = jax.jit(self._validate, in_shardings=(same, self.rows), out_shardings=same)
 
@@ -132,6 +135,7 @@ class Trainer:
 
     def _step(self, state: TrainState, batch: Any) -> tuple[TrainState, dict[str, Array]]:
         """Return the state after one update, and the numbers to log."""
+        # Dropout is a function of the seed and the step, so that a resumed run draws what an uninterrupted one does.
         key = jax.random.fold_in(jax.random.key(self.options.seed + 1), state.step)
         gradient, log = self._gradient(state, batch, key)
         change, optimizer = self._optimizer.update(gradient, state.optimizer, state.params)
@@ -155,6 +159,8 @@ class Trainer:
 
         if parts == 1:
             return part_gradient(jnp.int32(0), batch)
+        # A scan keeps the activations of one part at a time; the methods' losses are means of rows of equal weight, so
+        # that the mean of the parts is the gradient of the batch.
         split = jax.tree.map(self._split_rows, batch)
         first = jax.tree.map(lambda leaf: leaf[0], split)
         shapes = jax.eval_shape(part_gradient, jnp.int32(0), first)
@@ -236,10 +242,12 @@ def train(
     trainer = trainer or Trainer(method, options, devices)
     config = {**format_versions(), "method": method.name, **about, "train": asdict(options)}
     with ExitStack() as stack:
+        # All processes compute the same state; one of them writes it.
         writes = jax.process_index() == 0
         if writes:
             stack.enter_context(run_lock(folder))
         config = open_run(folder, config)
+        # The number of threads decides the order of sums, and so the bits that a resumed run must reach.
         checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
         if checkpoints.latest is None:
             state = trainer.init()
@@ -247,12 +255,13 @@ def train(
         else:
             state = checkpoints.load(trainer.state_like())[0]
         first = int(state.step)
+        # Lines after the checkpoint are dropped, since their steps are computed again.
         log = stack.enter_context(RunLog(folder, lambda line: line["step"] <= first))
         events = TensorBoardLog(folder / TENSORBOARD, folder / METRICS) if tensorboard and writes else None
         if events:
             stack.callback(events.close)
         batches = stack.enter_context(trainer.batches(data.train, first, options.steps))
-        stop = stack.enter_context(StopSignals())
+        stop = stack.enter_context(StopSignals())  # entered last: what came before ends by a signal as usual
         clock = _StepClock(first)
         save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * save_minutes)
         loss: float | None = None
@@ -260,6 +269,7 @@ def train(
             state, numbers = trainer.step(state, batch)
             last, lines = step == options.steps, []
             if step % options.log_every == 0 or last:
+                # Reading numbers waits for the device, so that it is done only in steps that are logged.
                 lines.append({"step": step, "part": "train", **_as_floats(numbers)})
                 loss = lines[0]["loss"]
             done(step, loss)
@@ -271,7 +281,7 @@ def train(
                     events.add(lines)
             saves, stopped_by = agree_on_stop(save.due(step), stop.received)
             if saves or stopped_by:
-                log.sync()
+                log.sync()  # a checkpoint whose log was lost could never get these lines again
                 checkpoints.save(state, step)
             if stopped_by:
                 name = signal.Signals(stopped_by).name

@@ -11,9 +11,9 @@ import signal
 import socket
 import struct
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -70,15 +70,21 @@ class Rows:
         return self.batch(0)
 
 
-def trained(folder: Path, die_at: int | None = None, **options: Any) -> TrainState:
-    method = get_method("amago_offline")(MODEL, FLAT)
+@cache
+def compiled() -> Trainer:
+    """Return the trainer of all runs of this file, of the method with the most state (slow parameters)."""
+    return Trainer(get_method("amago_offline")(MODEL, FLAT), OPTIONS)
+
+
+def trained(folder: Path, die_at: int | None = None, changes: Any = None, **options: Any) -> TrainState:
     data = TrainingData(Rows(0, die_at), {"held out": Rows(1)})
-    return train(method, data, OPTIONS, folder, {}, **options)
+    settings = dataclasses.replace(OPTIONS, **(changes or {}))
+    return train(compiled().method, data, settings, folder, {}, trainer=compiled(), **options)
 
 
 @pytest.fixture(scope="module")
 def through(tmp_path_factory) -> tuple[Path, TrainState]:
-    """An uninterrupted run, of the method with the most state (slow parameters)."""
+    """An uninterrupted run."""
     folder = tmp_path_factory.mktemp("runs") / "through"
     return folder, trained(folder)
 
@@ -136,15 +142,11 @@ class TestResume:
             (7, "train"),
             (7, "held out"),
         ]
-        assert {"loss", "actor_loss", "critic_loss", "next_obs_loss", "gradient_norm", "learning_rate"} <= lines[
-            0
-        ].keys()
+        assert {"loss", "actor_loss", "critic_loss", "gradient_norm", "learning_rate"} <= lines[0].keys()
         assert int(state.step) == 7
         assert (folder / "curves.png").stat().st_size > 5000
-        config = json.loads((folder / "config.json").read_text())
-        assert config["train"]["steps"] == 7
-        assert config["method"] == "amago_offline"
-        assert not list(folder.rglob("*.pkl")) + list(folder.rglob("*.pickle"))
+        config = read_config(folder)
+        assert (config["train"]["steps"], config["method"]) == (7, "amago_offline")
 
     def test_tensorboard_enabled_later_has_the_complete_log(self, through):
         trained(through[0], tensorboard=True)
@@ -157,12 +159,10 @@ class TestResume:
         assert not (tmp_path / "run").exists()
 
     def test_other_settings_are_refused(self, through):
-        method = get_method("amago_offline")(MODEL, FLAT)
-        other = dataclasses.replace(OPTIONS, seed=3)
         with pytest.raises(
             OptionError, match=r"other settings \(train.seed: the run has 0, expected 3\); give another"
         ):
-            train(method, TrainingData(Rows(), {}), other, through[0], {})
+            trained(through[0], changes={"seed": 3})
 
 
 def terminate_at_4(step: int, loss: float | None) -> None:
@@ -188,19 +188,6 @@ class TestStopping:
         assert_same(trained(tmp_path), through[1])
         for name in ("metrics.jsonl", "config.json"):
             assert (tmp_path / name).read_bytes() == (through[0] / name).read_bytes()
-
-    def test_a_run_that_is_older_than_an_option_has_its_default(self, through, tmp_path, monkeypatch):
-        def before(options: Any) -> dict[str, Any]:
-            return {name: value for name, value in dataclasses.asdict(options).items() if name != "weight_decay"}
-
-        with monkeypatch.context() as older, pytest.raises(TrainingStopped):
-            older.setattr("icrl4aht_baselines.training.trainer.asdict", before)
-            trained(tmp_path, done=terminate_at_4)
-        assert "weight_decay" not in json.loads((tmp_path / "config.json").read_text())["train"]
-        method, other = get_method("amago_offline")(MODEL, FLAT), dataclasses.replace(OPTIONS, weight_decay=0.5)
-        with pytest.raises(OptionError, match=r"\(train.weight_decay: the run has 0.0, expected 0.5\)"):
-            train(method, TrainingData(Rows(), {}), other, tmp_path, {})
-        assert_same(trained(tmp_path), through[1])
 
     def test_a_second_sigint_does_not_wait(self):
         found = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
@@ -251,14 +238,20 @@ class TestFolder:
         with pytest.raises(OptionError, match="a file is where a folder is needed"):
             trained(tmp_path / "notes.txt")
 
-    def test_options_that_no_longer_exist(self, through, tmp_path):
-        """They are ignored if the run did not use them."""
+    @pytest.mark.parametrize(
+        ("stored", "asked", "refused"),
+        [
+            ({"layers": 1, "gone": False}, {"layers": 1}, None),  # an option that no longer exists, and was not used
+            ({"layers": 1, "gone": True}, {"layers": 1}, r"model\.gone: the run has True, expected None"),
+            ({"layers": 1}, {"layers": 1, "width": 256}, None),  # one that came after the run, which has its default
+            ({"layers": 1}, {"layers": 1, "width": 64}, r"model\.width: the run has 256, expected 64"),
+        ],
+    )
+    def test_runs_of_other_versions(self, through, tmp_path, stored, asked, refused):
         shutil.copytree(through[0] / CHECKPOINTS, tmp_path / CHECKPOINTS)
-        config = {**format_versions(), "model": {"layers": 1}}
-        for gone, refused in ((False, False), (True, True)):
-            (tmp_path / "config.json").write_text(json.dumps({**config, "model": {"layers": 1, "gone": gone}}))
-            with pytest.raises(OptionError, match=r"model\.gone") if refused else nullcontext():
-                open_run(tmp_path, config)
+        (tmp_path / "config.json").write_text(json.dumps({**format_versions(), "model": stored}))
+        with pytest.raises(OptionError, match=refused) if refused else nullcontext():
+            open_run(tmp_path, {**format_versions(), "model": asked})
 
 
 class TestStep:
@@ -297,6 +290,14 @@ class TestStep:
     def test_batches_that_cannot_be_divided(self):
         with pytest.raises(OptionError, match="batch_size = 4: expected a multiple of 3, 1 devices x 3 parts"):
             Trainer(get_method("ad")(MODEL, FLAT), dataclasses.replace(OPTIONS, accumulate=3))
+
+
+@pytest.fixture(scope="module")
+def long_ppo(tmp_path_factory) -> Path:
+    """A release whose PPO histories are longer than its noise histories."""
+    root = tmp_path_factory.mktemp("releases") / "both"
+    two_source_release(root, ppo_episodes=7)
+    return root
 
 
 class TestHeldOut:
@@ -364,12 +365,6 @@ class TestHeldOut:
             assert (len(split.train), len(split.histories)) == (6 - held, held)
             assert len(set(split.train.column("task_id").tolist())) == 2
 
-    def test_streams_of_two_learners_are_told_apart(self, two_sources):
-        dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
-        first = [entry.history_id for entry in hold_out(dataset, 0.5).histories.entries]
-        again = hold_out(dataset.select(dataset.ids[::-1].copy()), 0.5).histories.ids
-        assert set(first) == set(again.tolist())
-
     def test_labels(self, two_sources):
         def job(method: str, **choice: Any) -> Any:
             return prepare(method, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(two_sources[0]), **choice))
@@ -386,27 +381,15 @@ class TestHeldOut:
             assert found.about["histories"]["labels"] == labels
             assert {cell["labels"] for cell in found.about["trained_on"]} == {labels}
             assert {sampler.labels for sampler in (found.data.train, *found.data.validation.values())} == {labels}
-        with pytest.raises(OptionError, match="labels = expert: amago_offline learns from the histories' own actions"):
-            job("amago_offline", labels="expert")
 
-    def test_windows_of_every_nth_episode(self, two_sources):
-        def job(method: str, every: int, context: int = 40) -> Any:
-            options = dataclasses.replace(OPTIONS, context=context)
-            return prepare(method, MODEL, options, HistoryOptions(("demo_wide",), str(two_sources[0]), every=every))
+    def test_samplers_draw_as_chosen(self, two_sources):
+        def job(method: str, **choice: Any) -> Any:
+            options = dataclasses.replace(OPTIONS, context=40)
+            return prepare(method, MODEL, options, HistoryOptions(("demo_wide",), str(two_sources[0]), **choice))
 
-        found = job("ad", 3)
-        assert found.about["histories"]["every"] == 3
+        found = job("ad", every=3)
         assert {sampler.every for sampler in (found.data.train, *found.data.validation.values())} == {3}
-        with pytest.raises(OptionError, match=r"context = 41, every = 3: every 3-th of the 6 episodes .* are 40 steps"):
-            job("ad", 3, 41)
-        with pytest.raises(OptionError, match="every = 2: dpt learns from contexts of one part"):
-            job("dpt", 2)
-
-    def test_queries_are_for_dpt(self):
-        with pytest.raises(OptionError, match="queries = 3: ad learns from windows without queries"):
-            prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), queries=3))
-        found = prepare("dpt", MODEL, OPTIONS, HistoryOptions(("asymm_both",), queries=3))
-        assert found.data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
+        assert job("dpt", queries=3).data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
 
     def test_one_teammate_cannot_be_held_out(self):
         dataset = load_icrl4aht(layout="coord_simple")
@@ -431,41 +414,47 @@ class TestHeldOut:
         assert cell.items() >= names.items()
         assert cell["histories"] < len(load_icrl4aht(layout="asymm_both", teammate_kind=one))  # some are held out
 
-    def test_filters_that_no_history_passes(self):
-        def fails(match: str, **filters: Any) -> None:
-            with pytest.raises(EmptySelectionError, match=match):
-                prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), **filters))
+    @pytest.mark.parametrize(
+        ("filters", "message"),
+        [
+            (
+                {"algorithm": ("fpc",)},
+                r"algorithm = fpc: none of .*; these have assembly_line, fcp, recipe_aware_button: choose",
+            ),
+            ({"source": ("ppo", "dqn")}, "source = dqn: none of .*; these have noise, ppo: choose"),
+            (
+                {"teammate_family": ("rl",), "algorithm": ("assembly_line",)},
+                "^teammate_family = rl, algorithm = assembly_line: none of .* on asymm_both.* has these together",
+            ),
+        ],
+    )
+    def test_filters_that_no_history_passes(self, filters, message):
+        with pytest.raises(EmptySelectionError, match=message):
+            prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), **filters))
 
-        fails(
-            r"algorithm = fpc: none of .* on asymm_both.*; these have assembly_line, fcp, recipe_aware_button: choose",
-            algorithm=("fpc",),
-        )
-        fails("source = dqn: none of .*; these have noise, ppo: choose", source=("ppo", "dqn"))
-        fails("teammate_family = H4: none of", teammate_family=("rl", "H4"))
-        fails(
-            "^teammate_family = rl, algorithm = assembly_line: none of .* on asymm_both.* has these together",
-            teammate_family=("rl",),
-            algorithm=("assembly_line",),
-        )
+    @pytest.mark.parametrize(
+        ("method", "context", "choice", "message"),
+        [
+            ("ad", 121, {}, r"context = 121: the shortest history of .* has 120 steps; take fewer, or choose --source"),
+            ("dpt", 121, {}, r"context = 121: the shortest history of .* has 120 steps; take fewer"),
+            ("ad", 41, {"every": 3}, "context = 41, every = 3: every 3-th of the 6 episodes .* are 40 steps"),
+            ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts of one part"),
+            ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
+            ("ad", 40, {"curriculum": 0.5}, r"context = 40, curriculum = 0\.5: it begins with 30 steps"),
+            ("amago_offline", 7, {"labels": "expert"}, "amago_offline learns from the histories' own actions"),
+            ("ad", 7, {"layouts": ("demo_wide", "coord_simple"), "channels": "own"}, "channels = own: .*: leave out"),
+            ("rl2", 7, {}, "rl2 learns by playing, not from histories"),
+        ],
+    )
+    def test_impossible_trainings(self, long_ppo, method, context, choice, message):
+        histories = HistoryOptions(**{"layouts": ("demo_wide",), "root": str(long_ppo)} | choice)
+        with pytest.raises(OptionError, match=message):
+            prepare(method, MODEL, dataclasses.replace(OPTIONS, context=context), histories)
 
-    def test_impossible_trainings(self, tmp_path, lite):
+    def test_releases_without_labels(self, tmp_path):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
-        wide = HistoryOptions(("demo_wide",), str(tmp_path / "r"))
         with pytest.raises(LabelsMissingError, match=r"have no expert actions .*: choose histories or a release"):
-            prepare("dpt", MODEL, OPTIONS, wide)
-        long = dataclasses.replace(OPTIONS, context=121)
-        for name in ("ad", "dpt"):
-            with pytest.raises(
-                OptionError, match=r"context = 121: the shortest history of .* has 120 steps; take fewer"
-            ):
-                prepare(name, MODEL, long, HistoryOptions(("demo_wide",), str(lite[0])))
-        two_source_release(tmp_path / "both", layouts=("demo_wide",), ppo_episodes=7)
-        mixed = HistoryOptions(("demo_wide",), str(tmp_path / "both"))
-        with pytest.raises(OptionError, match=r"has 120 steps; take fewer, or choose --source ppo, whose"):
-            prepare("ad", MODEL, long, mixed)
-        two = HistoryOptions(("demo_wide", "coord_simple"), str(lite[0]), channels="own")
-        with pytest.raises(OptionError, match=r"channels = own: .* coord_simple, demo_wide .*: leave out --channels"):
-            prepare("ad", MODEL, OPTIONS, two)
+            prepare("dpt", MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(tmp_path / "r")))
 
 
 DEVICES = """
@@ -555,31 +544,3 @@ def test_two_processes_train_as_one(lite, tmp_path, on_one_device):
         assert Checkpoints(tmp_path / "run" / CHECKPOINTS).steps == [1]
         two = across(lite[0], tmp_path, both, address)
     assert_close(two, on_one_device)
-
-
-@pytest.mark.slow
-def test_the_command_that_is_told_to_stop(lite, tmp_path):
-    run = tmp_path / "run"
-    small = ["--batch-size", "2", "--context", "4", "--layers", "1", "--width", "8", "--heads", "2", "--log-every", "1"]
-    command = [
-        "-m",
-        "icrl4aht_data",
-        "train",
-        "ad",
-        "--layout",
-        "demo_wide",
-        "--root",
-        str(lite[0]),
-        "--out",
-        str(run),
-    ]
-    process = start(*command, *small)
-    end = time.monotonic() + 120
-    while not ((run / "metrics.jsonl").exists() and metrics(run)) and time.monotonic() < end:
-        time.sleep(0.1)
-    process.send_signal(signal.SIGTERM)
-    _, error = process.communicate(timeout=60)
-    assert process.returncode == 143, error
-    step = Checkpoints(run / CHECKPOINTS).latest
-    said = f"{run}: stopped by SIGTERM after step {step} of 20000, whose state is saved; the same command resumes it"
-    assert error.splitlines()[-1] == said
