@@ -20,7 +20,6 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.schema import (
     CARD_TABLES,
-    INFO,
     MANIFEST,
     PARQUET_EPISODES,
     PARQUET_INDEX,
@@ -113,8 +112,8 @@ def check_valid(root: Path, advance: NamedProgress = lambda what, done, total: N
     Raises:
         ReleaseError: if there is any problem; names the first ones.
     """
-    if not (root / INFO).exists() and not (root / MANIFEST).exists():
-        read_info(root)  # raises an error that suggests other folders
+    if not (root / MANIFEST).exists():
+        read_info(root)  # raises an error that suggests other folders, if there is no release
     report = verify_release(root, advance=advance)
     if not report.ok:
         first = "; ".join(f"{finding.file}: {finding.problem}" for finding in report.findings[:3])
@@ -158,10 +157,9 @@ def teammate_card(folder: Path) -> str:
 
 def _is_made_here(name: str) -> bool:
     """Return whether building writes a file, so that the source's version is not copied."""
-    top, _, rest = name.partition("/")
-    is_teammate_card = top == TEAMMATES and rest.endswith(f"/{RELEASE_CARD}")
-    is_made = name in (RELEASE_CARD, CARD_TABLES, CROISSANT, *_COPIED_TEXTS) or is_teammate_card
-    return is_made or top in ("figures", PARQUET_INDEX, PARQUET_EPISODES)
+    folders = ("figures/", f"{PARQUET_INDEX}/", f"{PARQUET_EPISODES}/")
+    is_card = name == RELEASE_CARD or name.endswith(f"/{RELEASE_CARD}")
+    return is_card or name in (CARD_TABLES, CROISSANT, *_COPIED_TEXTS) or name.startswith(folders)
 
 
 def _copy(source: Path, target: Path, link: bool) -> None:

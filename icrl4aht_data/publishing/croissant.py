@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import datetime
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import ReleaseInfo, read_info
@@ -50,35 +50,6 @@ _TERMS_OF_1_1 = {
 """Terms of the standard's JSON-LD context that mlcroissant's default context, which is 1.0's, does not have."""
 
 
-class _Column(NamedTuple):
-    """A column of Parquet files: its name, what it is, Croissant's type, and the lengths of lists or None."""
-
-    name: str
-    description: str
-    type: str
-    shape: str | None
-
-
-class _Table(NamedTuple):
-    """Parquet files of equal columns, and the record set that they are.
-
-    Args:
-        folder: the files' folder.
-        files: description of the files.
-        name: name of the record set.
-        description: description of the record set.
-        key: names of the columns that identify a record.
-        columns: the columns.
-    """
-
-    folder: str
-    files: str
-    name: str
-    description: str
-    key: list[str]
-    columns: list[_Column]
-
-
 def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) -> dict[str, Any]:
     """Return the content of croissant.json.
 
@@ -96,11 +67,11 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         raise OptionError(f"croissant.json needs mlcroissant: {install_command('hf')}") from error
     info, texts = read_info(root), card_texts("arrays")
     arrays = "; ".join(f"{name}: {texts[name]}" for name, field in FIELDS.items() if info.kind not in field.absent)
-    tables = [_index_table()] + ([_episode_table(info)] if info.kind in KINDS else [])
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)  # pyright: ignore[reportArgumentType]  # it parses addresses
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # raised by libraries that mlcroissant is built on
+        sets, records = zip(*_tables(context, info), strict=True)
         return mlc.Metadata(
             ctx=context,
             conforms_to=[_STANDARD],
@@ -117,8 +88,8 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             cite_as=card_file("citation.bib").read_text(encoding="utf-8").strip(),
             creators=[mlc.Organization(ctx=context, name="The icrl4aht-data authors")],
             keywords=["reinforcement learning", "in-context learning", "ad-hoc teamwork", "Overcooked"],
-            distribution=[*_files(context, root, digests), *(_file_set(context, table) for table in tables)],
-            record_sets=[_record_set(context, table) for table in tables],
+            distribution=[*_files(context, root, digests), *sets],
+            record_sets=list(records),
         ).to_json()
 
 
@@ -139,73 +110,66 @@ def _files(context: mlcroissant.Context, root: Path, digests: Mapping[str, str])
     ]
 
 
-def _index_table() -> _Table:
+def _tables(
+    context: mlcroissant.Context, info: ReleaseInfo
+) -> Iterator[tuple[mlcroissant.FileSet, mlcroissant.RecordSet]]:
+    """Yield the Parquet files of the index, and of the episodes if there are any, with the records that they hold."""
     texts = card_texts("index")
-    return _Table(
-        folder=PARQUET_INDEX,
-        files="The index, one row per history, in one file for each layout and split.",
-        name="histories",
-        description="One record per learning history: what it is, and where its arrays are stored.",
-        key=["history_id"],
-        columns=[
-            _Column(name, texts[name], _TYPES[hint], "3" if hint == _SHAPE else None)
-            for name, hint in ENTRY_HINTS.items()
-        ],
-    )
-
-
-def _episode_table(info: ReleaseInfo) -> _Table:
-    lengths = {"steps": info.environment.kept_steps, "width": record_width(list(map(get_layout, info.layouts)))}
-    texts, types = episode_texts(), {"s": "TEXT", "i": "INTEGER", "u": "INTEGER", "f": "FLOAT"}
-    return _Table(
-        folder=PARQUET_EPISODES,
-        files="The episodes, one row each, in files for each layout and split.",
-        name="episodes",
-        description="One record per episode: its history's names, returns, actions, rewards, labels, state records.",
-        key=["history_id", "episode"],
-        columns=[
-            _Column(name, texts[name], types[dtype[0]], ",".join(str(lengths[axis]) for axis in shape) or None)
+    columns = [(name, texts[name], _TYPES[hint], "3" if hint == _SHAPE else None) for name, hint in ENTRY_HINTS.items()]
+    said = "One record per learning history: what it is, and where its arrays are stored."
+    yield _table(context, PARQUET_INDEX, "histories", said, ["history_id"], columns)
+    if info.kind in KINDS:
+        lengths = {"steps": info.environment.kept_steps, "width": record_width(list(map(get_layout, info.layouts)))}
+        texts, types = episode_texts(), {"s": "TEXT", "i": "INTEGER", "u": "INTEGER", "f": "FLOAT"}
+        columns = [
+            (name, texts[name], types[dtype[0]], ",".join(str(lengths[axis]) for axis in shape) or None)
             for name, (dtype, shape) in EPISODE_COLUMNS.items()
-        ],
-    )
+        ]
+        said = "One record per episode: its history's names, returns, actions, rewards, labels, state records."
+        yield _table(context, PARQUET_EPISODES, "episodes", said, ["history_id", "episode"], columns)
 
 
-def _file_set(context: mlcroissant.Context, table: _Table) -> mlcroissant.FileSet:
+def _table(
+    context: mlcroissant.Context,
+    folder: str,
+    name: str,
+    description: str,
+    key: Sequence[str],
+    columns: Iterable[tuple[str, str, str, str | None]],
+) -> tuple[mlcroissant.FileSet, mlcroissant.RecordSet]:
+    """Return the files of a folder, and the record set that they are.
+
+    Args:
+        context: the context of all objects.
+        folder: folder of Parquet files with equal columns, in folders by layout.
+        name: name of the record set.
+        description: description of the record set.
+        key: names of the columns that identify a record.
+        columns: name, description, Croissant's type, and lengths of lists or None, of each column.
+    """
     import mlcroissant as mlc
 
-    return mlc.FileSet(
+    files = mlc.FileSet(
         ctx=context,
-        id=f"{table.folder}-files",
-        name=table.folder,
-        description=table.files,
+        id=f"{folder}-files",
+        name=folder,
+        description=f"The {name}, one row each, in files for each layout and split.",
         encoding_formats=[_FORMATS[".parquet"]],
-        includes=[f"{table.folder}/*/*.parquet"],
+        includes=[f"{folder}/*/*.parquet"],
     )
-
-
-def _record_set(context: mlcroissant.Context, table: _Table) -> mlcroissant.RecordSet:
-    import mlcroissant as mlc
-
     fields = [
         mlc.Field(
             ctx=context,
-            id=f"{table.name}/{column.name}",
-            name=column.name,
-            description=column.description,
-            data_types=[getattr(mlc.DataType, column.type)],
-            is_array=True if column.shape else None,
-            array_shape=column.shape,
-            source=mlc.Source(
-                ctx=context, file_set=f"{table.folder}-files", extract=mlc.Extract(ctx=context, column=column.name)
-            ),
+            id=f"{name}/{column}",
+            name=column,
+            description=text,
+            data_types=[getattr(mlc.DataType, kind)],
+            is_array=True if shape else None,
+            array_shape=shape,
+            source=mlc.Source(ctx=context, file_set=f"{folder}-files", extract=mlc.Extract(ctx=context, column=column)),
         )
-        for column in table.columns
+        for column, text, kind, shape in columns
     ]
-    return mlc.RecordSet(
-        ctx=context,
-        id=table.name,
-        name=table.name,
-        description=table.description,
-        key=[f"{table.name}/{name}" for name in table.key],
-        fields=fields,
-    )
+    keys = [f"{name}/{column}" for column in key]
+    records = mlc.RecordSet(ctx=context, id=name, name=name, description=description, key=keys, fields=fields)
+    return files, records

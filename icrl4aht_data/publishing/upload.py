@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 from icrl4aht_data.checking.report import NamedProgress
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, UploadError
@@ -22,14 +22,8 @@ if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoFile
 
 _HUB_FILE = ".gitattributes"  # the Hub adds it to every repository
-_KIND = "dataset"
-
-
-class _File(NamedTuple):
-    """Size in bytes and SHA-256, hexadecimal, of a file of the release."""
-
-    size: int
-    sha256: str
+_NOTHING_SENT = "nothing was sent: run the same command again"
+_KEPT = "files sent so far are kept: run the same command to resume"
 
 
 @dataclass(frozen=True)
@@ -101,125 +95,93 @@ def upload_release(
     """
     from huggingface_hub import HfApi
 
-    repo = _repo_of(address)
-    check_valid(folder, advance)
-    manifest = read_manifest(folder) | {MANIFEST: file_hash(folder / MANIFEST)}
-    files = {name: _File((folder / name).stat().st_size, digest) for name, digest in manifest.items()}
-    tag = f"v{read_info(folder).data_version}"
-    api = HfApi()
-    uploader = _Uploader(api, folder, repo, tag, files)
-    with _wrap_hub_errors(uploader), _progress_bars(show):
-        sizes = {name: files[name].size for name in sorted(files)}
-        plan = Upload(repo, tag, f"{api.endpoint}/datasets/{repo}", sizes)
-        return uploader.run(plan, private, dry_run)
-
-
-@dataclass
-class _Uploader:
-    """One upload; `files` has the size and hash of every file of the release, `sending` is set by the first request
-    that changes the repository."""
-
-    api: HfApi
-    folder: Path
-    repo: str
-    tag: str
-    files: Mapping[str, _File]
-    sending: bool = False
-
-    def run(self, plan: Upload, private: bool, dry_run: bool) -> Upload:
-        tags = self._tags()
-        if tags is not None and self.tag in tags:
-            differences = self._differences(self._tree(tags[self.tag]))
-            if differences:
-                raise UploadError(
-                    f"{self.repo}: tag {self.tag} has other content: {_some(differences)}; tags do not move: give the "
-                    "data another data version"
-                )
-            return replace(plan, done="already there", commit=tags[self.tag])
-        if private and tags is not None and not self.api.repo_info(self.repo, repo_type=_KIND).private:
-            raise UploadError(f"{self.repo}: is public; make it private in its settings, or give another repository")
-        foreign = [] if tags is None else self._foreign()
-        plan = replace(plan, creates=tags is None, private=private, deletes=foreign)
-        if dry_run:
-            return plan
-        self.sending = True
-        if tags is None:
-            self.api.create_repo(self.repo, repo_type=_KIND, private=private, exist_ok=True)
-        self.api.upload_folder(
-            repo_id=self.repo,
-            repo_type=_KIND,
-            folder_path=self.folder,
-            commit_message=f"Data version {self.tag.removeprefix('v')}",
-            delete_patterns=foreign or None,
-        )
-        commit = self.api.repo_info(self.repo, repo_type=_KIND).sha or "main"
-        differences = self._differences(self._tree(commit))
-        if differences:
-            raise UploadError(
-                f"{self.repo}: after the upload, commit {commit} is not the release: {_some(differences)}; it was "
-                "not tagged; run the same command again"
-            )
-        self.api.create_tag(self.repo, tag=self.tag, revision=commit, repo_type=_KIND)
-        return replace(plan, done="uploaded", commit=commit)
-
-    def _tags(self) -> dict[str, str] | None:
-        """Return tag -> commit; None if there is no such repository."""
-        from huggingface_hub.errors import RepositoryNotFoundError
-
-        try:
-            refs = self.api.list_repo_refs(self.repo, repo_type=_KIND)
-        except RepositoryNotFoundError:
-            return None
-        return {reference.name: reference.target_commit for reference in refs.tags}
-
-    def _tree(self, revision: str) -> dict[str, RepoFile]:
-        """Return path -> the Hub's size and hashes of the file."""
-        from huggingface_hub.hf_api import RepoFile
-
-        listed = self.api.list_repo_tree(self.repo, recursive=True, revision=revision, repo_type=_KIND)
-        return {entry.path: entry for entry in listed if isinstance(entry, RepoFile) and entry.path != _HUB_FILE}
-
-    def _foreign(self) -> list[str]:
-        """Return the files of the repository that belong to another version of the release.
-
-        Raises:
-            UploadError: if there are files that the repository's manifest does not list.
-        """
-        tree = self._tree("main")
-        foreign = sorted(tree.keys() - self.files.keys())
-        listed: Mapping[str, str] = {}
-        if foreign and MANIFEST in tree:
-            path = self.api.hf_hub_download(self.repo, MANIFEST, repo_type=_KIND)
-            listed = read_manifest(Path(path).parent)
-        unknown = [name for name in foreign if name not in listed]
-        if unknown:
-            raise UploadError(
-                f"{self.repo}: has {len(unknown)} files that belong to no release, such as {unknown[0]}: expected an "
-                "empty repository or one with a release; remove them, or give another repository"
-            )
-        return foreign
-
-    def _differences(self, tree: Mapping[str, RepoFile]) -> list[str]:
-        """Return the differences between a tree of the repository and the release."""
-        found = [f"{name}: not in the release" for name in sorted(tree.keys() - self.files.keys())]
-        for name, file in self.files.items():
-            remote = tree.get(name)
-            if remote is None:
-                found.append(f"{name}: missing")
-            elif remote.size != file.size:
-                found.append(f"{name}: expected {file.size} bytes, found {remote.size}")
-            elif remote.lfs is not None and remote.lfs.sha256 != file.sha256:
-                found.append(f"{name}: expected sha256 {file.sha256}, found {remote.lfs.sha256}")
-            elif remote.lfs is None and remote.blob_id != (blob := git_hash((self.folder / name).read_bytes())):
-                found.append(f"{name}: expected git's blob {blob}, found {remote.blob_id}")
-        return found
-
-
-def _repo_of(address: str) -> str:
     found = re.fullmatch(r"hf://datasets/([\w.-]+/[\w.-]+)/?", address)
     if found is None:
         raise OptionError(f"{address!r}: expected hf://datasets/ORG/REPO; the revision is the data version's tag")
-    return found[1]
+    check_valid(folder, advance)
+    hashes = read_manifest(folder) | {MANIFEST: file_hash(folder / MANIFEST)}
+    api, repo, version = HfApi(), found[1], read_info(folder).data_version
+    sizes = {name: (folder / name).stat().st_size for name in sorted(hashes)}
+    plan = Upload(repo, f"v{version}", f"{api.endpoint}/datasets/{repo}", sizes)
+    with _progress_bars(show):
+        with _wrap_hub_errors(plan, api, _NOTHING_SENT):
+            plan = _plan(api, plan, folder, hashes, private)
+        if dry_run or plan.done == "already there":
+            return plan
+        with _wrap_hub_errors(plan, api, _KEPT):
+            return _send(api, plan, folder, hashes)
+
+
+def _plan(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str], private: bool) -> Upload:
+    """Return the plan with what the repository has; changes nothing."""
+    from huggingface_hub.errors import RepositoryNotFoundError
+
+    try:
+        refs = api.list_repo_refs(plan.repo, repo_type="dataset")
+    except RepositoryNotFoundError:
+        return replace(plan, creates=True, private=private)
+    commit = next((reference.target_commit for reference in refs.tags if reference.name == plan.tag), None)
+    if commit is not None:
+        if differences := _differences(_tree(api, plan.repo, commit), folder, hashes):
+            raise UploadError(
+                f"{plan.repo}: tag {plan.tag} has other content: {_some(differences)}; tags do not move: give the data "
+                "another data version"
+            )
+        return replace(plan, done="already there", commit=commit)
+    if private and not api.repo_info(plan.repo, repo_type="dataset").private:
+        raise UploadError(f"{plan.repo}: is public; make it private in its settings, or give another repository")
+    present = _tree(api, plan.repo, "main").keys()
+    foreign = sorted(present - hashes.keys())
+    listed: Mapping[str, str] = {}
+    if foreign and MANIFEST in present:
+        listed = read_manifest(Path(api.hf_hub_download(plan.repo, MANIFEST, repo_type="dataset")).parent)
+    if unknown := [name for name in foreign if name not in listed]:
+        raise UploadError(
+            f"{plan.repo}: has {len(unknown)} files that belong to no release, such as {unknown[0]}: expected an empty "
+            "repository or one with a release; remove them, or give another repository"
+        )
+    return replace(plan, private=private, deletes=foreign)
+
+
+def _send(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str]) -> Upload:
+    """Send the files of a plan, compare what the repository then has, and tag it."""
+    repo = plan.repo
+    if plan.creates:
+        api.create_repo(repo, repo_type="dataset", private=plan.private, exist_ok=True)
+    message = f"Data version {plan.tag.removeprefix('v')}"
+    options = {"folder_path": folder, "commit_message": message, "delete_patterns": plan.deletes or None}
+    api.upload_folder(repo_id=repo, repo_type="dataset", **options)
+    commit = api.repo_info(repo, repo_type="dataset").sha or "main"
+    if differences := _differences(_tree(api, repo, commit), folder, hashes):
+        raise UploadError(
+            f"{repo}: after the upload, commit {commit} is not the release: {_some(differences)}; it was not tagged; "
+            "run the same command again"
+        )
+    api.create_tag(repo, tag=plan.tag, revision=commit, repo_type="dataset")
+    return replace(plan, done="uploaded", commit=commit)
+
+
+def _tree(api: HfApi, repo: str, revision: str) -> dict[str, RepoFile]:
+    """Return path -> the Hub's size and hashes of the file."""
+    from huggingface_hub.hf_api import RepoFile
+
+    listed = api.list_repo_tree(repo, recursive=True, revision=revision, repo_type="dataset")
+    return {entry.path: entry for entry in listed if isinstance(entry, RepoFile) and entry.path != _HUB_FILE}
+
+
+def _differences(tree: Mapping[str, RepoFile], folder: Path, hashes: Mapping[str, str]) -> list[str]:
+    """Return the differences between a tree of the repository and the release.
+
+    The Hub knows large files by SHA-256, and others by Git's hash.
+    """
+    found = [f"{name}: not in the release" for name in sorted(tree.keys() - hashes.keys())]
+    found += [f"{name}: missing" for name in hashes if name not in tree]
+    for name, file in ((name, tree[name]) for name in hashes if name in tree):
+        sha256 = None if file.lfs is None else file.lfs.sha256
+        expected = git_hash((folder / name).read_bytes()) if sha256 is None else hashes[name]
+        if (there := sha256 or file.blob_id) != expected:
+            found.append(f"{name}: expected hash {expected}, found {there}")
+    return found
 
 
 def _some(differences: list[str]) -> str:
@@ -243,7 +205,7 @@ def _progress_bars(show: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _wrap_hub_errors(uploader: _Uploader) -> Iterator[None]:
+def _wrap_hub_errors(plan: Upload, api: HfApi, remedy: str) -> Iterator[None]:
     """Raise errors of the Hub's client as `UploadError`, which names the repository, the cause and a remedy."""
     from huggingface_hub.errors import HTTPError, LocalTokenNotFoundError  # pyright: ignore[reportPrivateImportUsage]
 
@@ -254,13 +216,11 @@ def _wrap_hub_errors(uploader: _Uploader) -> Iterator[None]:
     except (HTTPError, OSError, RuntimeError, ValueError) as error:
         cause = error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ else error
         status = getattr(getattr(cause, "response", None), "status_code", None)
-        repo, endpoint, remedy = uploader.repo, uploader.api.endpoint, "nothing was sent: run the same command again"
-        if uploader.sending:
-            remedy = "files sent so far are kept: run the same command to resume"
         if status in (401, 403) or isinstance(cause, (LocalTokenNotFoundError, PermissionError)):
-            remedy = f"expected a token that may write to {repo.split('/')[0]}: `hf auth login`, or set HF_TOKEN"
+            owner = plan.repo.split("/")[0]
+            remedy = f"expected a token that may write to {owner}: `hf auth login`, or set HF_TOKEN"
         elif isinstance(cause, ValueError):
             remedy = "correct it, then run the same command"
         lines = [line.strip() for line in str(cause).splitlines()]
         text = " ".join(line for line in lines if line and not line.startswith("For more information"))
-        raise UploadError(f"{repo} at {endpoint}: {text or repr(cause)}; {remedy}") from error
+        raise UploadError(f"{plan.repo} at {api.endpoint}: {text or repr(cause)}; {remedy}") from error

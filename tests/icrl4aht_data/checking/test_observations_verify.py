@@ -11,17 +11,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data import verify_release
 from icrl4aht_data.checking.report import Level
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import KINDS
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.writing.published import to_published
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from tests.helpers.batches import CACHES
 from tests.helpers.published_files import KEPT, SHARD
 from tests.helpers.random_releases import make_tasks
 
@@ -68,16 +65,6 @@ class TestVerify:
         write_manifest(copy)
         assert problems(copy) == []
 
-    @pytest.mark.parametrize("cache", CACHES)
-    def test_damage_is_named_not_sampled(self, copy, cache):
-        table = np.load(chunk_table_path(copy, SHARD))
-        data = bytearray((copy / SHARD).read_bytes())
-        data[int(table["offset"][5]) + 4] ^= 1  # of the first history: five scalars, then its observations
-        (copy / SHARD).write_bytes(data)
-        sampler = load_icrl4aht(copy, cache=cache).select([0]).ad(batch_size=4, length=120)
-        with pytest.raises(Exception, match="chunk 0 of obs in history 0"):
-            sampler[0]
-
     @pytest.mark.parametrize(
         ("name", "index", "value", "message"),
         [
@@ -108,11 +95,6 @@ class TestVerify:
         assert any("history 0: score: the index says" in line for line in found), found
         assert any("history 1: dones: expected 5 episodes of 20 steps, found 6" in line for line in found), found
 
-    def test_other_kinds_need_their_tasks(self, damaged):
-        (damaged / "meta" / "tasks.jsonl").write_text("")
-        write_manifest(damaged)
-        assert any("its task" in line and "is missing" in line for line in problems(damaged))
-
 
 class TestCommand:
     def run(self, *arguments: Any, code: int = 0) -> str:
@@ -132,15 +114,6 @@ class TestCommand:
             "convert", tmp_path / "out", "--out", tmp_path / "full", "--to", "full", code=1
         )
         assert "give the form to convert to" in self.run("convert", tmp_path / "out", "--out", tmp_path / "x", code=2)
-
-    @pytest.mark.parametrize("kind", KINDS)
-    def test_convert_to_what_needs_states(self, lite, tmp_path, kind):
-        to_published(load_icrl4aht(lite[0]), tmp_path / "files", states=False)
-        said = self.run(
-            "convert", tmp_path / "files", "--out", tmp_path / "out", "--to", kind, "--kept-steps", KEPT, code=1
-        )
-        assert "group /0: missing state, episode_end_state" in said
-        assert f"a {kind} release is made of state records" in said
 
     def test_show(self, converted_release, reconverted_release, lite):
         missing = json.loads(self.run("show", "--json", converted_release))["missing"]

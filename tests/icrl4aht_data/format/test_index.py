@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError
-from icrl4aht_data.format import columns
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.schema import Entry
-from icrl4aht_data.utils import system as cache
 from tests.helpers.damages import DAMAGES, contents
 from tests.helpers.random_releases import long_index
 
@@ -147,15 +141,6 @@ def test_a_changed_index_is_parsed_again(tmp_path, folder):
     assert len(cached(folder)) == 2
 
 
-def test_a_file_is_hashed_once_however_new_it_is(tmp_path, folder, monkeypatch):
-    root = tmp_path / "release"
-    entries = long_index(root)
-    read_index(root)
-    monkeypatch.setattr(hashlib, "file_digest", lambda *_: pytest.fail("hashed again"))
-    monkeypatch.setattr(columns, "_parse", lambda path: pytest.fail("parsed again"))
-    assert read_index(root).entry(2999) == entries[2999]
-
-
 def test_a_damaged_cache_is_rebuilt(long, folder):
     """Files of the cached columns are damaged, each in another way."""
     root, entries = long
@@ -170,30 +155,6 @@ def test_a_damaged_cache_is_rebuilt(long, folder):
         assert (folder / made / name).read_bytes() == data, (damage, name)
     shutil.rmtree(folder / made)
     assert read_index(root).entry(2999) == entries[2999]
-
-
-def test_without_a_cache_folder(long, tmp_path, monkeypatch):
-    root, entries = long
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "file" / "below"))
-    assert read_index(root).entry(2999) == entries[2999]
-
-
-def test_processes_may_build_at_the_same_time(long, folder):
-    root, entries = long
-    code = (
-        "import sys; from pathlib import Path; from icrl4aht_data.format.index import read_index; "
-        "print(read_index(Path(sys.argv[1])).entry(7).score)"
-    )
-
-    def run(_: int) -> str:
-        return subprocess.run(
-            [sys.executable, "-c", code, str(root)], capture_output=True, text=True, check=True
-        ).stdout.strip()
-
-    with ThreadPoolExecutor(3) as pool:
-        assert set(pool.map(run, range(3))) == {str(entries[7].score)}
-    assert len(cached(folder)) == 1
 
 
 @pytest.mark.parametrize("where", [0, 1500, 2999])
@@ -217,18 +178,3 @@ def test_a_bad_line_of_many_is_named(rewritten, where, change, message):
 
     with pytest.raises(IndexFormatError, match=rf"histories\.jsonl, line {where + 1}: .*({message})"):
         rewritten(spoil)
-
-
-def test_default_folders_follow_the_environment(monkeypatch):
-    for name in ("ICRL4AHT_CACHE_DIR", "ICRL4AHT_DATA_DIR", "XDG_CACHE_HOME", "XDG_DATA_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("HOME", "/home/someone")
-    monkeypatch.setattr(sys, "platform", "linux")
-    assert cache.cache_folder() == Path("/home/someone/.cache/icrl4aht")
-    assert cache.data_folder() == Path("/home/someone/.local/share/icrl4aht")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/x")
-    monkeypatch.setenv("XDG_DATA_HOME", "/y")
-    assert (cache.cache_folder(), cache.data_folder()) == (Path("/x/icrl4aht"), Path("/y/icrl4aht"))
-    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", "~/own")
-    monkeypatch.setenv("ICRL4AHT_DATA_DIR", "/data")
-    assert (cache.cache_folder(), cache.data_folder()) == (Path("/home/someone/own"), Path("/data"))

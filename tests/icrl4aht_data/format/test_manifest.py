@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,11 +11,10 @@ from icrl4aht_generation.teammates.registry import recover_teammate
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.errors import ChunkTableError, IndexFormatError, ReleaseError, RootNotFoundError
+from icrl4aht_data.errors import ChunkTableError, IndexFormatError, ReleaseError
 from icrl4aht_data.format.chunks import chunk_table_name
-from icrl4aht_data.format.manifest import check_against_manifest, check_meta, write_manifest
+from icrl4aht_data.format.manifest import check_against_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, TEAMMATES
-from icrl4aht_data.utils import remembered
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.damages import DAMAGES, flip_bit, restore
 from tests.helpers.random_releases import SHARD
@@ -66,12 +63,6 @@ def test_a_damaged_file_is_an_error_that_names_it(damaged, name, damage):
     load_icrl4aht(damaged)[0].read("actions")
 
 
-def test_a_release_without_its_manifest(damaged):
-    (damaged / MANIFEST).unlink()
-    with pytest.raises(IndexFormatError, match=rf"{MANIFEST}: missing; fetch the release again"):
-        load_icrl4aht(damaged)
-
-
 def test_an_empty_manifest_is_refused(damaged):
     (damaged / MANIFEST).write_text("")
     with pytest.raises(IndexFormatError, match=rf"{MANIFEST}: lists no file; fetch the release again"):
@@ -90,11 +81,6 @@ def test_a_file_of_meta_that_the_manifest_does_not_list(damaged):
     (damaged / PROVENANCE).unlink()  # a release may be without it
     load_icrl4aht(damaged)
     check_against_manifest(damaged, [INFO, chunk_table_name(SHARD)])
-
-
-def test_a_folder_that_is_no_release(tmp_path):
-    with pytest.raises(RootNotFoundError, match=r"no release here, expected meta/info\.json in it"):
-        load_icrl4aht(tmp_path)
 
 
 def test_files_that_change_after_opening_are_checked_when_they_are_read(damaged):
@@ -121,48 +107,6 @@ def test_checkpoints_are_checked_before_they_are_copied_or_play(tmp_path):
         with pytest.raises(IndexFormatError, match=rf"{name}: expected sha256"):
             to_release(dataset, tmp_path / "copy", "lite")
         flip_bit(path, path.stat().st_size // 2)
-
-
-def test_an_edited_release_with_a_new_manifest_opens(damaged):
-    path = damaged / INFO
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"data_version": "9.9.9"}))
-    with pytest.raises(IndexFormatError, match="was edited"):
-        load_icrl4aht(damaged)
-    write_manifest(damaged)
-    assert load_icrl4aht(damaged).info.data_version == "9.9.9"
-
-
-def test_a_large_file_is_hashed_once_per_change(damaged, tmp_path, monkeypatch):
-    computed: list[Path] = []
-    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(remembered, "_SMALL", 0)
-    monkeypatch.setattr(remembered, "_TICK_NS", 2 * 10**7)
-    compute = remembered.file_hash
-    monkeypatch.setattr(remembered, "file_hash", lambda path: computed.append(path) or compute(path))
-    for _ in range(2):
-        check_meta(damaged)
-    assert sorted(path.name for path in computed) == ["histories.jsonl", "info.json", "provenance.json", "tasks.jsonl"]
-    flip_bit(damaged / HISTORIES)
-    for _ in range(2):
-        with pytest.raises(IndexFormatError, match="expected sha256"):
-            check_meta(damaged)
-    assert len(computed) == 5
-
-
-@pytest.mark.parametrize("folder", ["a file", "read-only"])
-def test_a_cache_folder_that_cannot_be_written(damaged, tmp_path, monkeypatch, folder):
-    cache = tmp_path / "cache"
-    cache.mkdir(mode=0o555) if folder == "read-only" else cache.touch()
-    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(cache))
-    monkeypatch.setattr(remembered, "_SMALL", 0)
-    monkeypatch.setattr(remembered, "_TICK_NS", 2 * 10**7)
-    with permissions_count():
-        for _ in range(2):
-            load_icrl4aht(damaged, layout="demo_wide", threads=1, cache="stream").ad(batch_size=2, length=5)[0]
-        flip_bit(damaged / INFO)
-        with pytest.raises(IndexFormatError, match="expected sha256"):
-            load_icrl4aht(damaged)
-    assert not cache.is_dir() or not list(cache.iterdir())
 
 
 @pytest.mark.parametrize("name", [MANIFEST, INFO, HISTORIES, chunk_table_name(SHARD), SHARD])

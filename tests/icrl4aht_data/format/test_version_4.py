@@ -12,18 +12,16 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from fsspec.implementations.memory import MemoryFileSystem
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, LabelsMissingError, OptionError, RemoteError
+from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, OptionError
 from icrl4aht_data.format.info import LeftOutTask, read_info
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, read_provenance
-from icrl4aht_data.format.schema import FIELDS, HISTORIES, INFO, KINDS, PROVENANCE
+from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, PROVENANCE
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
-from icrl4aht_data.writing.parquet import to_parquet
 from icrl4aht_data.writing.published import from_published, to_published
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_releases import SHARD, make_tasks, random_history, random_release
@@ -111,38 +109,6 @@ def test_verification_says_what_it_believes(mixed, lite_mixed):
     ]
 
 
-def test_a_remote_is_read_chunk_by_chunk(lite_mixed, tmp_path, monkeypatch):
-    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path))
-    monkeypatch.setattr(MemoryFileSystem, "store", {})
-    memory = MemoryFileSystem()
-    memory.put(str(lite_mixed), "/mixed", recursive=True)
-    local, remote = load_icrl4aht(lite_mixed), load_icrl4aht("memory://mixed", source="ppo")
-    assert [history.entry for history in remote] == list(local.entries[2:])
-    np.testing.assert_array_equal(remote[3].read("oracle_actions", 7, 60), local[5].read("oracle_actions", 7, 60))
-    assert not list((remote.root / "data").rglob("*.h5")), "no shard was downloaded"
-    data = bytearray((lite_mixed / SHARD).read_bytes())
-    shard = Shards(local.origin, local.index).open(SHARD)
-    row = next(row for row, history, field in shard.chunks() if (history, field.name) == (2, "oracle_actions"))
-    data[shard.table["offset"][row]] ^= 1
-    memory.pipe(f"/mixed/{SHARD}", bytes(data))
-    with pytest.raises(RemoteError, match=r"bytes \d+\.\.\d+: expected crc32"):
-        load_icrl4aht("memory://mixed")[2].read("oracle_actions")
-
-
-def test_a_bit_flip_in_the_oracle_actions_is_found(mixed, tmp_path):
-    root = shutil.copytree(mixed[0], tmp_path / "release")
-    dataset = load_icrl4aht(mixed[0])
-    shard = Shards(dataset.origin, dataset.index).open(SHARD)
-    row = next(row for row, history, field in shard.chunks() if (history, field.name) == (3, "oracle_actions"))
-    data = bytearray((root / SHARD).read_bytes())
-    data[shard.table["offset"][row] + shard.table["size"][row] // 2] ^= 4
-    (root / SHARD).write_bytes(data)
-    assert "chunk 0 of oracle_actions in history 3" in problems(root)
-    with pytest.raises(Exception, match="chunk 0 of oracle_actions in history 3"):
-        load_icrl4aht(root).history(3).read("oracle_actions")
-    load_icrl4aht(root).history(3).read("expert_actions")
-
-
 def test_conversions_between_kinds_keep_everything(mixed, tmp_path):
     root, written = mixed
     dataset = load_icrl4aht(root)
@@ -173,13 +139,6 @@ def test_published_files_have_no_place_for_it(lite_mixed, tmp_path):
     with pytest.raises(LabelsMissingError, match=r"has no oracle actions: .* has_oracle_actions = false"):
         after[2].read("oracle_actions")
     np.testing.assert_array_equal(after[0].read("oracle_actions"), before[0].read("oracle_actions"))
-
-
-def test_the_index_as_a_parquet_file(lite_mixed, tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet")
-    table = parquet.read_table(to_parquet(load_icrl4aht(lite_mixed), tmp_path / "index.parquet"))
-    assert table.column("learner").to_pylist() == [0, 0, 0, 0, 1, 1]
-    assert table.column("has_oracle_actions").to_pylist() == [True] * 6
 
 
 @pytest.mark.parametrize(
@@ -263,11 +222,6 @@ def test_a_learner_that_provenance_does_not_have_is_not_written(tmp_path):
     assert not (tmp_path / "r").exists()
 
 
-def test_a_source_that_the_release_does_not_have(lite):
-    with pytest.raises(EmptySelectionError, match=r"no history has source='noise'.*; sources: ppo"):
-        load_icrl4aht(lite[0], source="noise")
-
-
 LEFT_OUT = LeftOutTask("task_x", "demo_wide", "H3/t12", "ppo", 2, 32, 0.1, 0.4, "the learners did not learn")
 
 
@@ -321,9 +275,3 @@ def test_a_task_of_another_source_is_not_combined(tmp_path):
         random_release(tmp_path / name, layouts=("demo_wide",), teammates=1, streams=1, sources=(name,))
     with pytest.raises(OptionError, match=r"task .* is of source 'ppo', but in .*noise of 'noise': .*another seed"):
         combine_releases(tmp_path / "out", [tmp_path / "noise", tmp_path / "ppo"])
-
-
-def test_the_field_is_optional_everywhere():
-    field = FIELDS["oracle_actions"]
-    assert (field.dtype, field.compact, field.axis, field.chunk) == ("int32", "int8", "T", 2000)
-    assert set(field.optional) == {"full", "lite", "observations"}

@@ -26,7 +26,7 @@ from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
 from icrl4aht_data.utils.installation import install_command
-from icrl4aht_data.utils.templates import card_file, fill_template
+from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
@@ -110,11 +110,6 @@ def test_it_contains_the_source_and_is_valid(release, published):
         assert (published / name).read_bytes() == (ROOT / name).read_bytes()
 
 
-def test_building_a_built_release_changes_nothing(published, tmp_path):
-    again = build_release(published, tmp_path / "again", published=DAY)
-    assert (again / "MANIFEST.sha256").read_bytes() == (published / "MANIFEST.sha256").read_bytes()
-
-
 def test_a_combination_lists_its_sources(published, tmp_path):
     random_release(tmp_path / "other", "full", ("demo_wide",))
     both = combine_releases(tmp_path / "both", [published, tmp_path / "other"])
@@ -163,16 +158,6 @@ def test_changes_during_copying_are_detected(damaged, tmp_path):
     with pytest.raises(ReleaseError, match=r"provenance\.json: changed while it was copied, sha256 now"):
         build_release(damaged, tmp_path / "out", advance=change)
     assert not (tmp_path / "out").exists()
-
-
-def test_the_parquet_files_have_the_index(published):
-    import pyarrow.parquet as pq
-
-    lines = [json.loads(line) for line in (published / "meta/histories.jsonl").read_text().splitlines()]
-    tables = [pq.read_table(path) for path in sorted((published / "index").glob("*/*.parquet"))]
-    assert len({str(table.schema) for table in tables}) == 1
-    rows = [row for table in tables for row in table.to_pylist()]
-    assert sorted(rows, key=lambda row: row["history_id"]) == lines
 
 
 def test_datasets_loads_every_configuration(published, tmp_path):
@@ -304,14 +289,6 @@ def test_releases_of_observations_are_built(release, tmp_path):
     assert "`state`" not in card
 
 
-def test_the_baseline_card_uses_its_names():
-    names = set(re.findall(r"\$([a-z_]+)", card_file("baseline.md").read_text()))
-    card = fill_template("baseline.md", **{name: f"<{name}>" for name in names})
-    assert front_matter(card)["license"] == "mit"
-    assert "# <title>, trained on" in card
-    assert "- <method>" in card
-
-
 def test_cards_are_found_in_a_checkout_and_in_an_installed_package(tmp_path):
     names = ("dataset.md", "teammate.md", "headroom.json", "citation.bib", "LICENSE", "CITATION.cff")
     assert {card_file(name).relative_to(ROOT).as_posix() for name in names} == {
@@ -327,15 +304,6 @@ def test_cards_are_found_in_a_checkout_and_in_an_installed_package(tmp_path):
         assert card_file(name, tmp_path / "icrl4aht_data") == tmp_path / "icrl4aht_data/cards" / name
     with pytest.raises(OptionError, match=r"cards/nothing\.md: missing; restore it: `"):
         card_file("nothing.md")
-
-
-def test_both_forms_of_the_citation_agree():
-    cited = yaml.safe_load(card_file("CITATION.cff").read_text())["preferred-citation"]
-    text = " ".join(card_file("citation.bib").read_text().split())
-    authors = " and ".join(f"{author['family-names']}, {author['given-names']}" for author in cited["authors"])
-    assert f"author = {{{authors}}}" in text
-    assert f"title = {{{cited['title']}}}" in text
-    assert f"year = {{{cited['year']}}}" in text
 
 
 def test_the_command_builds(release, tmp_path):
@@ -354,11 +322,3 @@ def test_missing_libraries_are_named(release, tmp_path, monkeypatch):
     monkeypatch.setattr("icrl4aht_data.publishing.build.find_spec", lambda name: None if name in absent else name)
     with pytest.raises(OptionError, match=re.escape(f"needs pyarrow, mlcroissant: {install_command('plot', 'hf')}")):
         build_release(release, tmp_path / "out")
-
-
-def test_a_manifest_that_is_none_is_named(damaged):
-    (damaged / "MANIFEST.sha256").write_text("abc  meta/info.json\n")
-    with pytest.raises(IndexFormatError, match=r"MANIFEST\.sha256, line 1: expected '<sha256>  <path>'"):
-        read_manifest(damaged)
-    write_manifest(damaged)
-    assert verify_release(damaged).ok

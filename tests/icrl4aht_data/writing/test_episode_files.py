@@ -15,16 +15,14 @@ import pytest
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.errors import IndexFormatError, NotStoredError, OptionError, UnknownNameError
+from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError
 from icrl4aht_data.format.schema import ACTION_FIELDS
 from icrl4aht_data.interop import hf_episodes, render_observations
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
-from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, episode_schema
+from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.reading.episodes import Episode
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.remote.download import chosen_files
-from icrl4aht_data.remote.remote_release import open_root
 from icrl4aht_data.writing import parquet
 from icrl4aht_data.writing.parquet import write_episodes
 from tests.helpers.paths import ROOT
@@ -102,15 +100,6 @@ class TestObservations:
             (batch,) = rows.with_format("numpy").batch(1000)
             np.testing.assert_array_equal(render_observations(batch, channels=channels, obs=obs), expected)
 
-    def test_a_map_renders_while_streaming(self, built, dataset):
-        rows = stream(built, "train")
-        rendered = rows.map(
-            lambda rows: {"obs": render_observations(rows, channels="canonical", obs="uint8")}, batched=True
-        )
-        expected = in_file_order(dataset.with_options(channels="canonical"), "train")
-        for row, (_, episode) in zip(rendered, expected, strict=True):
-            np.testing.assert_array_equal(row["obs"], episode.obs)
-
     def test_rows_of_several_layouts(self, built, dataset):
         by_layout = {row["layout"]: row for row in stream(built, "train")}
         assert len(by_layout) > 1
@@ -165,21 +154,6 @@ def test_histories_are_divided_among_files_and_row_groups(dataset, tmp_path, mon
     sizes = [group.row_group(n).num_rows for group in metadata for n in range(group.num_row_groups)]
     assert max(sizes) < 12 + max(part.column("episodes")) and len(sizes) > count
     assert done[-1] == (len(part), len(part))
-
-
-def test_a_history_of_other_episodes_is_named(dataset, monkeypatch):
-    history = dataset[0]
-    schema = episode_schema(dataset)
-    monkeypatch.setattr(history, "entry", history.entry.__class__(**history.entry.to_json() | {"T": 3}))
-    with pytest.raises(IndexFormatError, match=r"history 0: expected \d+ episodes of 20 steps, found 3 steps; check"):
-        parquet.episode_table(history, schema)
-
-
-def test_a_part_of_a_release_is_downloaded_without_them(built):
-    origin = open_root(built)
-    names = {name for name in chosen_files(origin) if name.startswith("episodes/")}
-    assert names
-    assert chosen_files(origin) - chosen_files(origin, layout=list(load_icrl4aht(built).info.layouts)) == names
 
 
 HUB = """
