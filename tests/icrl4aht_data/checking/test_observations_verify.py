@@ -114,24 +114,3 @@ class TestCommand:
             "convert", tmp_path / "out", "--out", tmp_path / "full", "--to", "full", code=1
         )
         assert "give the form to convert to" in self.run("convert", tmp_path / "out", "--out", tmp_path / "x", code=2)
-
-    def test_show(self, converted_release, reconverted_release, lite):
-        missing = json.loads(self.run("show", "--json", converted_release))["missing"]
-        assert [what.split(":")[0] for what in missing] == ["state records", "tasks", "teammate actions of 1 histories"]
-        assert [
-            what.split(":")[0] for what in json.loads(self.run("show", "--json", reconverted_release))["missing"]
-        ] == ["state records"]
-        assert "missing" not in json.loads(self.run("show", "--json", lite[0]))
-        assert "observations release" in self.run("show", converted_release)
-        assert "teammate" not in json.loads(self.run("show", "--json", "--history", 0, converted_release))
-        assert "teammate" in json.loads(self.run("show", "--json", "--history", 0, reconverted_release))
-        assert "task_a" in self.run("list", converted_release)
-
-    def test_verify(self, converted_release):
-        said = self.run("verify", "--deep", converted_release)
-        assert "valid; checked" in said
-        assert "physics" not in said
-        assert "nothing was replayed: without state records" in said
-        content = json.loads(self.run("verify", "--deep", "--json", converted_release))
-        assert (content["ok"], len(content["notes"])) == (True, 1)
-        assert "replayed" not in self.run("verify", converted_release)

@@ -56,16 +56,25 @@ def test_one_flipped_byte_names_the_chunk(damaged):
     assert any("chunk 0 of rewards in history 1 (bytes" in line and "crc32" in line for line in found), found
 
 
-@pytest.mark.parametrize("release", ["lite", "observations"])
-def test_every_file_is_covered(request, tmp_path, release):
-    source = request.getfixturevalue("lite")[0] if release == "lite" else request.getfixturevalue("converted_release")
-    root = shutil.copytree(source, tmp_path / "copy")
-    rng = np.random.default_rng(1)
-    for path in sorted(p for p in root.rglob("*") if p.is_file() and p.stat().st_size):
+@pytest.mark.parametrize(
+    ("release", "flips"), [("tiny", 40), ("observations", 20), pytest.param("tiny", 1000, marks=pytest.mark.slow)]
+)
+def test_every_flipped_bit_is_found(converted_release, tmp_path, release, flips):
+    root = tmp_path / "release"
+    if release == "tiny":
+        random_release(root, layouts=("cramped_up",), teammates=1, streams=1, episodes=3)
+    else:
+        shutil.copytree(converted_release, root)
+    rng, files = np.random.default_rng(1), sorted(p for p in root.rglob("*") if p.is_file() and p.stat().st_size)
+    for number in range(flips):
+        path = files[number % len(files)]
         content = path.read_bytes()
-        for position in rng.integers(0, len(content), 4):
-            path.write_bytes(flipped(content, position, rng))
-            assert not verify_release(root).ok, (path, position)
+        position = int(rng.integers(len(content)))
+        path.write_bytes(flipped(content, position, rng))
+        report = verify_release(root)
+        assert not report.ok, (path, position)
+        if path.name != "MANIFEST.sha256":
+            assert path.relative_to(root).as_posix() in report.files_at_fault
         path.write_bytes(content)
     assert verify_release(root).ok
 
@@ -289,21 +298,6 @@ def test_other_episode_lengths_than_stated(damaged):
     assert any("expected 6 episodes of 40 steps, found 6 in 120 steps" in p for p in problems(damaged))
 
 
-def test_another_attribute_and_a_group_more(damaged):
-    import h5py
-
-    path = damaged / SHARD
-    with h5py.File(path, "r+") as file:
-        file.attrs["layout"] = "demo_wide"
-    write_manifest(damaged)
-    assert any("attributes: expected" in problem for problem in problems(damaged))
-    with h5py.File(path, "r+") as file:
-        file.attrs["layout"] = "coord_simple"
-        file.create_group("extra")
-    write_manifest(damaged)
-    assert any("groups: expected ['/0'], found ['/0', '/extra']" in problem for problem in problems(damaged))
-
-
 @pytest.mark.parametrize(("flips", "texts"), [(1, 1), pytest.param(25, 7, marks=pytest.mark.slow)])
 def test_no_damage_makes_verify_raise(damaged, flips, texts):
     """Flipped bits and hostile texts in any file: verify reports, never raises, and never calls the release valid."""
@@ -370,10 +364,6 @@ class TestCommand:
         content = json.loads(as_json.output)
         assert not content["ok"]
         assert {finding["file"] for finding in content["findings"]} == {SHARD}
-
-    def test_quiet(self, lite):
-        result = CliRunner().invoke(cli, ["verify", "-q", str(lite[0])])
-        assert (result.exit_code, result.output) == (0, "")
 
 
 def test_a_shard_that_neither_manifest_nor_folder_has(damaged):

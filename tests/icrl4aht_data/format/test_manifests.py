@@ -13,7 +13,7 @@ from icrl4aht_data.benchmark import tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.errors import TaskFormatError, UnknownNameError
+from icrl4aht_data.errors import TaskFormatError
 
 PUBLISHED_HASHES = """
 grounded_coord_simple recipe_aware_button 9bc579c9 57546c8f ebc58b53 5f64c6e3 f465bd31
@@ -90,26 +90,6 @@ def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     result = CliRunner().invoke(cli, ["research", "manifests", "--check"])
     assert result.exit_code == 1
     assert "differs from the parameter sets or draws" in str(result.exception)
-
-
-def test_manifests_are_replaced_on_demand(tmp_path):
-    arguments = ["research", "manifests", "--out", str(tmp_path / "new")]
-    for _ in range(2):  # the second time, equal files are there
-        assert CliRunner().invoke(cli, arguments).exit_code == 0
-    path = tmp_path / "new" / "layout_test.jsonl"
-    assert read_tasks(path) == published_tasks("layout")
-    tasks.write_tasks(path, published_tasks("layout")[:-1])
-    assert "replace it by --overwrite" in str(CliRunner().invoke(cli, arguments).exception)
-    assert CliRunner().invoke(cli, [*arguments, "--overwrite"]).exit_code == 0
-    assert read_tasks(path) == published_tasks("layout")
-    path.write_text("mine")
-    assert CliRunner().invoke(cli, [*arguments, "--overwrite"]).exit_code == 1
-    assert path.read_text() == "mine"
-
-
-def test_unknown_manifest():
-    with pytest.raises(UnknownNameError, match="unknown track 'tracks'"):
-        manifest_path("tracks", "test")
 
 
 @pytest.mark.parametrize(

@@ -109,19 +109,6 @@ def test_verification_says_what_it_believes(mixed, lite_mixed):
     ]
 
 
-def test_conversions_between_kinds_keep_everything(mixed, tmp_path):
-    root, written = mixed
-    dataset = load_icrl4aht(root)
-    to_release(dataset, tmp_path / "other", "full" if dataset.info.kind == "lite" else "lite")
-    to_release(load_icrl4aht(tmp_path / "other"), tmp_path / "back", dataset.info.kind)
-    for name in (HISTORIES, PROVENANCE, INFO, SHARD):
-        assert (tmp_path / "back" / name).read_bytes() == (root / name).read_bytes(), name
-    to_release(dataset, tmp_path / "seen", "observations")
-    assert verify_release(tmp_path / "seen", level="deep").ok
-    for number, history in enumerate(load_icrl4aht(tmp_path / "seen")):
-        np.testing.assert_array_equal(history.read("oracle_actions"), written[number]["oracle_actions"])
-
-
 def test_published_files_have_no_place_for_it(lite_mixed, tmp_path):
     """They lose oracle actions but those of noise, and number the streams of several learners consecutively."""
     before = load_icrl4aht(lite_mixed)
@@ -182,18 +169,6 @@ def first(content: dict[str, Any]) -> dict[str, Any]:
 
 def last(content: dict[str, Any]) -> dict[str, Any]:
     return list(content.values())[-1]
-
-
-def test_labels_of_a_script_are_told_from_those_of_a_policy(lite_mixed):
-    found = json.loads((lite_mixed / PROVENANCE).read_text())
-    assert first(found)["expert"] == {
-        "policy_sha256": None,
-        "action": "the oracle's",
-        "return_greedy": 40.0,
-        "episodes": 200,
-    }
-    for content in found.values():
-        assert Provenance.from_json(content).to_json() == content
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import hashlib
 import json
 import re
 import shutil
-import tomllib
 import warnings
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,6 @@ from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release, teammate_card
-from icrl4aht_data.utils.installation import install_command
-from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
@@ -289,23 +286,6 @@ def test_releases_of_observations_are_built(release, tmp_path):
     assert "`state`" not in card
 
 
-def test_cards_are_found_in_a_checkout_and_in_an_installed_package(tmp_path):
-    names = ("dataset.md", "teammate.md", "headroom.json", "citation.bib", "LICENSE", "CITATION.cff")
-    assert {card_file(name).relative_to(ROOT).as_posix() for name in names} == {
-        *(f"cards/{name}" for name in names[:4]),
-        *names[4:],
-    }
-    included = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
-    for source, target in included["force-include"].items():  # as the wheel is packed
-        (tmp_path / target).parent.mkdir(parents=True, exist_ok=True)
-        copy = shutil.copytree if (ROOT / source).is_dir() else shutil.copyfile
-        copy(ROOT / source, tmp_path / target)
-    for name in names:
-        assert card_file(name, tmp_path / "icrl4aht_data") == tmp_path / "icrl4aht_data/cards" / name
-    with pytest.raises(OptionError, match=r"cards/nothing\.md: missing; restore it: `"):
-        card_file("nothing.md")
-
-
 def test_the_command_builds(release, tmp_path):
     out = tmp_path / "out"
     result = CliRunner().invoke(cli, ["release", "build", "--json", str(release), "--out", str(out)])
@@ -315,10 +295,3 @@ def test_the_command_builds(release, tmp_path):
     assert summary["bytes"] > 10_000
     result = CliRunner().invoke(cli, ["release", "build", str(release), str(release), "--out", str(out)])
     assert result.exit_code == 2
-
-
-def test_missing_libraries_are_named(release, tmp_path, monkeypatch):
-    absent = ("pyarrow", "mlcroissant")
-    monkeypatch.setattr("icrl4aht_data.publishing.build.find_spec", lambda name: None if name in absent else name)
-    with pytest.raises(OptionError, match=re.escape(f"needs pyarrow, mlcroissant: {install_command('plot', 'hf')}")):
-        build_release(release, tmp_path / "out")

@@ -10,10 +10,8 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, PublishedFormatError
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.writing.convert import to_release
@@ -122,18 +120,3 @@ def test_parquet_index(lite, tmp_path):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     rows = pq.read_table(to_parquet(dataset, tmp_path / "index.parquet")).to_pylist()
     assert rows == [entry.to_json() for entry in dataset.entries]
-
-
-@pytest.mark.parametrize("to", ["full", "published", "parquet"])
-def test_on_the_command_line(lite, tmp_path, to):
-    target = tmp_path / ("index.parquet" if to == "parquet" else "out")
-    done = CliRunner().invoke(cli, ["convert", str(lite[0]), "--out", str(target), "--to", to, "--layout", "demo_wide"])
-    assert done.exit_code == 0, done.output
-    assert str(target) in done.output
-    if to == "published":
-        arguments = ["convert", str(target), "--out", str(tmp_path / "r"), "--to", "lite", "--kept-steps", "20"]
-        back = CliRunner().invoke(cli, arguments)
-        assert back.exit_code == 0, back.output
-        assert verify_release(tmp_path / "r", level="deep").ok
-        arguments = ["convert", str(target), "--out", str(tmp_path / "x"), "--to", "parquet"]
-        assert CliRunner().invoke(cli, arguments).exit_code != 0

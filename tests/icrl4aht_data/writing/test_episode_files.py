@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +16,10 @@ from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError
 from icrl4aht_data.format.schema import ACTION_FIELDS
 from icrl4aht_data.interop import hf_episodes, render_observations
 from icrl4aht_data.publishing.build import build_release
-from icrl4aht_data.publishing.upload import upload_release
-from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.reading.episodes import Episode
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.writing import parquet
 from icrl4aht_data.writing.parquet import write_episodes
-from tests.helpers.paths import ROOT
-from tests.servers.common import hub_server, uploads
 
 STEPS, WIDTH = 20, 24
 """Steps of an episode of `two_sources`, and bytes of the longest state record of its layouts."""
@@ -68,20 +61,6 @@ def test_streamed_rows_are_the_episodes(built, dataset, split):
             size = episode[name].shape[-1]
             np.testing.assert_array_equal(records[..., :size], episode[name])
             assert records.shape[-1] == WIDTH and not records[..., size:].any()
-
-
-def test_every_feature_has_a_type_and_a_length(built):
-    features = stream(built, "train").features
-    assert list(features) == list(EPISODE_COLUMNS)
-    for name, (dtype, shape) in EPISODE_COLUMNS.items():
-        found, lengths = features[name], []
-        while isinstance(found, datasets.List):
-            lengths.append(found.length)
-            found = found.feature
-        assert found == datasets.Value("string" if dtype == "str" else dtype), name
-        assert lengths == [{"steps": STEPS, "width": WIDTH}[axis] for axis in shape], name
-    index: Any = datasets.load_dataset(str(built), split="train", streaming=True)
-    assert index.features["obs_shape"] == datasets.List(datasets.Value("int64"), length=3)
 
 
 class TestObservations:
@@ -154,29 +133,3 @@ def test_histories_are_divided_among_files_and_row_groups(dataset, tmp_path, mon
     sizes = [group.row_group(n).num_rows for group in metadata for n in range(group.num_row_groups)]
     assert max(sizes) < 12 + max(part.column("episodes")) and len(sizes) > count
     assert done[-1] == (len(part), len(part))
-
-
-HUB = """
-import datasets
-from icrl4aht_data.interop import render_observations
-
-rows = datasets.load_dataset("us/histories", "episodes", split="train", streaming=True)
-print([int(render_observations(row, channels="canonical").sum()) for row in rows])
-"""
-
-
-@pytest.mark.slow
-@uploads
-def test_streaming_from_a_hub(built, dataset, tmp_path):
-    """In a process of its own, because `datasets` reads the Hub's address when it is imported."""
-    with hub_server(tmp_path / "hub") as hub:
-        upload_release(built, "hf://datasets/us/histories")
-        hub.log.clear()
-        done = subprocess.run(
-            [sys.executable, "-W", "error", "-c", HUB], env=hub.environment, cwd=ROOT, capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr
-        files = {request.path.rpartition("/")[2] for request in hub.log if request.path.startswith("/cdn/")}
-    assert files == {"train-00000-of-00001.parquet"}
-    expected = in_file_order(dataset.with_options(channels="canonical"), "train")
-    assert json.loads(done.stdout) == [int(episode.obs.sum()) for _, episode in expected]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import subprocess
-import sys
 
 import h5py
 import pytest
@@ -14,7 +12,6 @@ from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import to_published
-from tests.helpers.paths import ROOT
 from tests.robustness.limits import PAGE, can_mount, file_size_limit, small_disk
 
 needs_disks = pytest.mark.skipif(not can_mount(), reason="this user may not mount a small disk")
@@ -46,47 +43,6 @@ def test_a_full_disk_is_named(lite, tmp_path):
                 with pytest.raises(DiskFullError, match=rf"{name}: the disk is full: .* free on the disk of {disk};"):
                     write(disk / name)
                 assert not any(disk.iterdir())
-
-
-COMMANDS = {
-    "full": "convert {source} --to full",
-    "observations": "convert {source} --to observations",
-    "published": "convert {source} --to published",
-    "parquet": "convert {source} --to parquet",
-    "combine": "combine {source}",
-    "build": "release build {source}",
-}
-SERIES = """
-import sys
-from pathlib import Path
-from click.testing import CliRunner
-from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.errors import DiskFullError
-from tests.robustness.limits import PAGE, small_disk
-
-disk, command, full = Path(sys.argv[1]), sys.argv[2:], 0
-for number in range(20):
-    with small_disk(disk, int(PAGE * 1.4**number)):
-        result = CliRunner().invoke(cli, [*command, "--out", str(disk / "out"), "-q"])
-        if result.exit_code:
-            assert isinstance(result.exception, OSError), repr(result.exception)
-            assert str(disk) in str(result.exception), result.exception
-            assert not any(disk.iterdir()), list(disk.iterdir())
-            full += 1
-assert full > 0, full
-"""
-
-
-@needs_disks
-@pytest.mark.slow
-@pytest.mark.parametrize("name", COMMANDS)
-def test_disks_of_20_sizes(full, converted_release, tmp_path, name):
-    source = converted_release if name == "combine" else full[0]
-    command = COMMANDS[name].format(source=source).split()
-    done = subprocess.run(
-        [sys.executable, "-c", SERIES, str(tmp_path / "disk"), *command], cwd=ROOT, capture_output=True, text=True
-    )
-    assert (done.returncode, done.stderr) == (0, ""), done.stderr[-2000:]
 
 
 def test_the_bytes_of_a_shard_are_those_that_libhdf5_writes(lite, tmp_path, monkeypatch):
