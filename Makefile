@@ -14,7 +14,7 @@ STAMP := $(VENV)/installed
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify control test test-slow check docs format bench-env bench-eval bench-learner bench-curves bench-collect bench-gpu bench-loader bench-remote bench-faults bench-train clean
+.PHONY: help install demo generate teammates verify control test test-slow check docs format bench-env bench-collect bench-gpu bench-learn bench-loader bench-faults clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -61,30 +61,17 @@ format: install ## format the code and apply the linter's fixes
 	$(BIN)/ruff check --fix $(CODE)
 	$(BIN)/ruff format $(CODE)
 
-bench-env: install ## steps/s of environments, and of IPPO in them, compared with JaxMARL's, JSON lines; PEER= takes its IPPO
+bench-env: install ## steps/s of environments compared with JaxMARL's, JSON lines; PEER=its ippo_rnn_overcooked_v2.py learns in both
 	$(BIN)/python -m benchmarks.bench_env $(if $(PEER),--peer $(PEER))
 
-bench-eval: install ## evaluation steps/s per teammate family, compared with the environment alone, JSON lines
-	$(BIN)/python -m benchmarks.bench_eval
-
-bench-loader: install ## batches/s of each storage mode, compared with readers of the published format, JSON lines
+bench-loader: install ## windows/s of each cache compared with readers of the published format, JSON lines
 	$(BIN)/python -m benchmarks.bench_loader
-
-bench-learner: install ## learning steps/s by profile and part, JSON lines; PEER=ippo_rnn_overcooked_v2.py compares with JaxMARL's IPPO
-	$(BIN)/python -m benchmarks.bench_learner
-	$(if $(PEER),$(BIN)/python -m benchmarks.bench_learner --part peer --peer $(PEER))
-
-bench-curves: install ## learning curves of the profiles mini and cpu, 8 seeds on three layouts (half an hour); resumes
-	$(BIN)/python -m benchmarks.bench_curves
-
-bench-remote: install ## requests, bytes and seconds of remote releases over HTTP, S3 and the Hub's protocol, JSON lines
-	$(BIN)/python -m tests.robustness.bench_remote
 
 bench-faults: install ## faults of servers, disks, processes and files: tried, survived, lost, JSON lines
 	$(BIN)/python -m tests.robustness.faults.series
 
-bench-train: install ## training steps/s, compared with a reader of the published format; cached and exact acting, JSON lines
-	$(BIN)/python -m benchmarks.bench_train $(OPTIONS)
+bench-learn: install ## speed of learning egos and of training and playing sequence models, JSON lines; PEER= as for bench-env
+	$(BIN)/python -m benchmarks.bench_learn $(if $(PEER),--peer $(PEER)) $(OPTIONS)
 
 bench-gpu: install ## learners, training, loader, acting on a GPU in at most 9 minutes; tiny sizes on a CPU, JSON lines
 	$(BIN)/python -m benchmarks.bench_gpu $(OPTIONS)

@@ -2,8 +2,7 @@
 
 One JSON line for each part:
 
-    noise   recorded transitions/s of noise histories, writing and hashing included, by wall clock and by CPU time, and
-            the seconds to compile them
+    noise   recorded transitions/s of noise histories, writing and hashing included, and the seconds to compile them
     speed   recorded transitions/s of the complete path (PPO, recording, writing), and the share of the time that
             recording and writing take
     memory  highest resident memory of a collection with the paper's 1024 environments and of its learner alone, each
@@ -17,7 +16,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import tempfile
-import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
@@ -37,11 +35,10 @@ from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
-from benchmarks.common import folder_size, peak_memory, print_line
+from benchmarks.harness import COUNT, elapsed, folder_size, peak_memory, print_line
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, track_of
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks
-from icrl4aht_data.commands.options import COUNT, LAYOUT
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.schema import HISTORIES, KINDS, TASKS
 from icrl4aht_data.writing.published import PUBLISHED_CHUNK
@@ -66,8 +63,8 @@ class _EnoughError(Exception):
 
 
 def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
-    """Timing of a collection of the profile's last heuristic task after a number of updates."""
-    work = _work(profile)
+    """Return the timing of a collection of the profile's last heuristic task after a number of updates."""
+    work = _first_heuristic(profile)
 
     def report(update: int, metrics: dict[str, float]) -> None:
         if update + 1 == updates:
@@ -80,8 +77,13 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
         return last_timing(artefact) or {}
 
 
+def _first_heuristic(profile: Profile) -> Work:
+    """Return the first learner of a task with a teammate that needs no training."""
+    return replace(profile, presets=("default",)).works()[-1]
+
+
 def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:
-    """Speed of a collection that saves the learner's state every two seconds, 15 times as often as usual."""
+    """Return the speed of a collection that saves the learner's state every two seconds, 15 times as often as usual."""
     profile = load_profile(profile_name)
     timing = collect_some(profile, updates, save_seconds=2)
     return {
@@ -93,73 +95,51 @@ def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:
     }
 
 
-def noise_speed_facts(layout: str) -> dict[str, Any]:
-    """Speed of a task of noise histories with H4 after another one has compiled it."""
+def noise_speed(layout: str) -> dict[str, Any]:
+    """Return the speed of a task of noise histories with H4 after another one has compiled it."""
     profile = replace(load_profile("smoke"), noise=_NOISE, sources=("noise",))
     mate = heuristic_teammate("utility_greedy", "default", 0)
     tasks = [make_task(track_of(layout), "train", layout, mate, seed) for seed in range(2)]
-    wall, cpu = [], []
     with tempfile.TemporaryDirectory() as folder:
-        for task in tasks:
-            began, used = time.perf_counter(), time.process_time()
-            run_noise(Work(task, "noise"), profile, Path(folder) / task.task_id)
-            wall.append(time.perf_counter() - began)
-            cpu.append(time.process_time() - used)
+        first, second = (
+            elapsed(lambda task=task: run_noise(Work(task, "noise"), profile, Path(folder) / task.task_id))
+            for task in tasks
+        )
     transitions = _NOISE.histories * _NOISE.episodes * KEPT_STEPS
     return {
         "layout": layout,
         "transitions": transitions,
-        "transitions_per_second": round(transitions / wall[1]),
-        "transitions_per_cpu_second": round(transitions / cpu[1]),
-        "compile_seconds": round(wall[0] - wall[1], 1),
+        "transitions_per_second": round(transitions / second),
+        "compile_seconds": round(first - second, 1),
     }
 
 
 def collection_memory(updates: int) -> dict[str, Any]:
-    """Peak memory of a collection and of its learner alone, in MiB."""
-    peaks = {}
-    for part in (learn_only, learn_and_record):
+    """Return the peak memory of a collection and of its learner alone, in MiB, each in its own process."""
+    peaks = []
+    for recording in (False, True):
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
-            peaks[part] = process.submit(part, updates).result()
-    return {
-        "environments": 1024,
-        "rollout": 256,
-        "updates": updates,
-        "learner_peak_mib": round(peaks[learn_only]),
-        "collection_peak_mib": round(peaks[learn_and_record]),
-        "over_the_learner_mib": round(peaks[learn_and_record] - peaks[learn_only]),
-    }
+            peaks.append(round(process.submit(peak_of_learning, updates, recording).result()))
+    return {"environments": 1024, "updates": updates, "learner_peak_mib": peaks[0], "collection_peak_mib": peaks[1]}
 
 
-def learn_only(updates: int) -> float:
-    """Peak MiB of a process that only learns."""
-    profile = _wide()
-    learner = make_learner(_work(profile).task, profile)
+def peak_of_learning(updates: int, recording: bool) -> float:
+    """Return the peak MiB of this process after learning, or after collecting and saving at every update."""
+    profile = load_profile("paper")
+    # The paper's number of streams and rollout length, with a network that is small enough to be fast.
+    profile = replace(profile, ego=replace(profile.ego, widths=Widths((4,), (4,), 8, 8, 8)))
+    if recording:
+        collect_some(profile, updates, save_seconds=0)
+        return peak_memory()
+    learner = make_learner(_first_heuristic(profile).task, profile)
     state, update = jax.jit(learner.init)(jax.random.key(0)), jax.jit(learner.update, donate_argnums=0)
     for _ in range(updates):
         state, *_ = jax.block_until_ready(update(state))
     return peak_memory()
 
 
-def learn_and_record(updates: int) -> float:
-    """Peak MiB of a process that collects, and writes histories and the learner's state at every update."""
-    collect_some(_wide(), updates, save_seconds=0)
-    return peak_memory()
-
-
-def _work(profile: Profile) -> Work:
-    """The first learner of a task with a teammate that needs no training."""
-    return replace(profile, presets=("default",)).works()[-1]
-
-
-def _wide() -> Profile:
-    """The paper's number of streams and rollout length, with a network that is small enough to be fast."""
-    profile = load_profile("paper")
-    return replace(profile, ego=replace(profile.ego, widths=Widths((4,), (4,), 8, 8, 8)))
-
-
 def transition_bytes(streams: int) -> dict[str, Any]:
-    """Bytes per transition of the first streams of every task of the bundled release, in all formats."""
+    """Return the bytes per transition of the first streams of every task of the bundled release, in all formats."""
     dataset = load_icrl4aht(obs="uint8")
     chosen = [(task, dataset.filter(task_id=task.task_id)[:streams]) for task in read_tasks(dataset.root / TASKS)]
     new = [
@@ -195,27 +175,25 @@ def write_paper_format(root: Path, parts: list[Dataset]) -> None:
                 index.write(json.dumps(history.entry.to_json()) + "\n")
 
 
-PARTS_OF_COLLECTION = ("speed", "noise", "memory", "bytes")
+PARTS = ("speed", "noise", "memory", "bytes")
 
 
 @click.command()
-@click.argument("parts", nargs=-1, type=click.Choice(PARTS_OF_COLLECTION))
-@click.option("--profile", "profile_name", default="smoke", show_default=True, help="Profile of the speed part.")
+@click.argument("parts", nargs=-1, type=click.Choice(PARTS))
+@click.option("--profile", default="smoke", show_default=True, help="Profile of the speed part.")
 @click.option("--updates", type=COUNT, default=30, show_default=True, help="Updates of the speed part.")
-@click.option("--layout", "noise_layout", type=LAYOUT, default="demo_wide", help="Layout of the noise part.")
+@click.option("--layout", default="demo_wide", show_default=True, help="Layout of the noise part.")
 @click.option("--wide-updates", type=COUNT, default=4, show_default=True, help="Updates of the memory part.")
 @click.option("--streams", type=COUNT, default=8, show_default=True, help="Histories of each task in the bytes part.")
-def main(
-    parts: tuple[str, ...], profile_name: str, updates: int, noise_layout: str, wide_updates: int, streams: int
-) -> None:
+def main(parts: tuple[str, ...], profile: str, updates: int, layout: str, wide_updates: int, streams: int) -> None:
     """Measure speed, memory and bytes of a collection; one JSON line each. An update of memory has 262,144 steps."""
     measures: dict[str, Callable[[], dict[str, Any]]] = {
-        "speed": lambda: collection_speed(profile_name, updates),
-        "noise": lambda: noise_speed_facts(noise_layout),
+        "speed": lambda: collection_speed(profile, updates),
+        "noise": lambda: noise_speed(layout),
         "memory": lambda: collection_memory(wide_updates),
         "bytes": lambda: transition_bytes(streams),
     }
-    for part in parts or PARTS_OF_COLLECTION:
+    for part in parts or PARTS:
         print_line("collect", part=part, **measures[part]())
 
 

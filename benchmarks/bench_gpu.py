@@ -13,7 +13,7 @@ running case is stopped and the others are skipped, both with a line. Learners r
 deterministic operations, as in `generate`. Models are untrained.
 
 `mfu` is the model FLOP utilisation: the operations of the matrix products in the traced program
-(`benchmarks.flops.product_flops`, backward pass included) by the time of a step, divided by what the large product
+(`benchmarks.harness.product_flops`, backward pass included) by the time of a step, divided by what the large product
 reaches with the same dtype, or by `--peak-tflops`. With `words` in training, the operations are those of a batch whose
 observations all differ; equal ones are computed once.
 """
@@ -53,9 +53,8 @@ from icrl4aht_generation.teammates.instances import published_tasks
 from jax.extend.backend import get_backend
 from jaxlib import version as jaxlib_version
 
-from benchmarks.bench_learner import heuristic_learner
-from benchmarks.common import print_line
-from benchmarks.flops import compile_measured, device_memory, gib
+from benchmarks.bench_learn import heuristic_learner
+from benchmarks.harness import compile_measured, print_line
 from benchmarks.isolated import run_isolated
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
@@ -126,13 +125,25 @@ class Bench:
     peaks: dict[str, float]
 
     def mfu(self, flops: float, seconds: float, dtype: str) -> float:
-        """Returns the share of the peak that `flops` in `seconds` are."""
+        """Return the share of the peak that `flops` in `seconds` are."""
         peak = self.peaks.get(dtype) or product_tflops(self.sizes.product, dtype, None, self.sizes.seconds / 4)
         return round(flops / seconds / peak / 1e12, 4)
 
 
+def device_memory() -> dict[str, float]:
+    """Return GiB of memory in use, the highest so far in this process, and the limit; nothing on a CPU."""
+    found = jax.local_devices()[0].memory_stats() or {}
+    names = {"bytes_in_use": "in_use_gib", "peak_bytes_in_use": "process_peak_gib", "bytes_limit": "limit_gib"}
+    return {name: gib(found[key]) for key, name in names.items() if key in found}
+
+
+def gib(count: int) -> float:
+    """Return a number of bytes in GiB."""
+    return round(count / 2**30, 3)
+
+
 def seconds_of_calls(call: Callable[[], Any], seconds: float, least: int = 3) -> list[float]:
-    """Returns the seconds of each of some calls, which together take `seconds` or more; the first one is left out."""
+    """Return the seconds of each of some calls, which together take `seconds` or more; the first one is left out."""
     jax.block_until_ready(call())
     found: list[float] = []
     while len(found) < least or sum(found) < seconds:
@@ -144,7 +155,7 @@ def seconds_of_calls(call: Callable[[], Any], seconds: float, least: int = 3) ->
 
 @cache
 def product_tflops(size: int, dtype: str, precision: str | None, seconds: float) -> float:
-    """Returns the TFLOP/s of the product of two normally distributed square matrices."""
+    """Return the TFLOP/s of the product of two normally distributed square matrices."""
     one, two = jax.random.normal(jax.random.key(0), (2, size, size), dtype)
     multiply = jax.jit(partial(jnp.matmul, precision=precision))
 
@@ -155,7 +166,7 @@ def product_tflops(size: int, dtype: str, precision: str | None, seconds: float)
 
 
 def describe_device(bench: Bench) -> dict[str, Any]:
-    """Facts on machine, software and settings."""
+    """Return facts on machine, software and settings."""
     devices = jax.devices()
     root = Path(__file__).resolve().parent
     commit = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
@@ -332,35 +343,35 @@ def measure_attention(bench: Bench) -> dict[str, Any]:
 
 
 def h4_tasks() -> list[Task]:
-    """Returns the test tasks with teammates of family H4 on the layout of the benchmark."""
+    """Return the test tasks with teammates of family H4 on the layout of the benchmark."""
     tasks = published_tasks("teammate")
     return [task for task in tasks if task.layout.name == _LAYOUT and task.teammate_family == "H4"]
 
 
 def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
-    """Returns the learner of an ego with teammate H4, with the paper's network except for the kind of encoder."""
+    """Return the learner of an ego with teammate H4, with the paper's network except for the kind of encoder."""
     config = replace(PPOConfig(), widths=Widths(encoder=encoder), **sizes.ppo)
     return heuristic_learner(get_layout(_LAYOUT), config)
 
 
 def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
-    """Returns the architecture of a size of AD."""
-    model = SIZES[size].model | sizes.shrunk.get(size, {})
-    return ModelOptions(**model | {"encoder": encoder, "bfloat16": dtype == "bfloat16"})
+    """Return the architecture of a size of AD."""
+    changes = {**sizes.shrunk.get(size, {}), "encoder": encoder, "bfloat16": dtype == "bfloat16"}
+    return ModelOptions(**SIZES[size].model | changes)
 
 
 def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:
-    """Returns AD for batches of state records of these layouts."""
+    """Return AD for batches of state records of these layouts."""
     return get_method("ad")(model, overcooked_world(layouts, model.encoder))
 
 
 def context_length(sizes: Sizes, size: str) -> int:
-    """Returns L in training and K in acting of a size of AD."""
+    """Return L in training and K in acting of a size of AD."""
     return min(sizes.length, SIZES[size].context)
 
 
 def short_message(error: BaseException) -> str:
-    """Returns class and start of the message of an error."""
+    """Return class and start of the message of an error."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]
 
 
@@ -446,13 +457,13 @@ def main(
 
 
 def child_environment() -> dict[str, str]:
-    """Returns the environment of child processes, in which JAX may use most of a GPU's memory, not three quarters."""
+    """Return the environment of child processes, in which JAX may use most of a GPU's memory, not three quarters."""
     names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX refuses both together
     return {**os.environ, **({} if any(name in os.environ for name in names) else {names[0]: "0.92"})}
 
 
 def make_bench(small: bool, seconds: float | None, peaks: Sequence[tuple[str, float]]) -> Bench:
-    """Returns the settings of this process, in which JAX is used from here on."""
+    """Return the settings of this process, in which JAX is used from here on."""
     sizes = FULL_SIZES
     if small or jax.default_backend() == "cpu":
         sizes = SMALL_SIZES
@@ -463,7 +474,7 @@ def make_bench(small: bool, seconds: float | None, peaks: Sequence[tuple[str, fl
 def child_options(
     names: Sequence[str], small: bool, seconds: float | None, peaks: Sequence[tuple[str, float]]
 ) -> list[str]:
-    """Returns the options by which a child process measures some cases under the same settings."""
+    """Return the options by which a child process measures some cases under the same settings."""
     options = [word for name in names for word in ("--case", name)]
     options += [word for dtype, peak in peaks for word in ("--peak-tflops", dtype, str(peak))]
     options += ["--seconds", str(seconds)] if seconds is not None else []

@@ -63,7 +63,7 @@ class _Child:
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
 
     def lines(self, until: float, case_seconds: float) -> Iterator[dict[str, Any]]:
-        """Yields the lines of cases; other output is dropped."""
+        """Yield the lines of cases; other output is dropped."""
         with self._process as process:
             assert process.stdout is not None
             timer = self._timer(until, case_seconds)
@@ -97,7 +97,7 @@ class _Child:
 
 
 def _parse_line(line: str) -> dict[str, Any] | None:
-    """Returns the facts of a case's line; None for other output."""
+    """Return the facts of a case's line; None for other output."""
     try:
         facts = json.loads(line)
     except ValueError:

@@ -19,7 +19,7 @@ import click
 import jax
 from icrl4aht_generation.learners.config import PPOConfig
 
-from benchmarks.common import compiled_call
+from benchmarks.harness import compiled_call
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked.layouts import Layout
 
@@ -30,7 +30,7 @@ with redirect_stdout(sys.stderr):  # it prints on import
 
 
 def jaxmarl_environment(layout: Layout, max_steps: int = EPISODE_STEPS) -> OvercookedV2:
-    """JaxMARL's OvercookedV2 on our map, with the benchmark's options."""
+    """Return JaxMARL's OvercookedV2 on our map, with the benchmark's options."""
     return OvercookedV2(
         PeerLayout.from_string("\n".join(layout.rows), possible_recipes=[list(r) for r in layout.recipes]),
         max_steps=max_steps,
@@ -43,13 +43,13 @@ def jaxmarl_environment(layout: Layout, max_steps: int = EPISODE_STEPS) -> Overc
 
 
 def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, updates: int) -> Callable[[], Any]:
-    """Returns a compiled call of JaxMARL's IPPO on an environment, which initialises and waits for its updates.
+    """Return a compiled call of JaxMARL's IPPO on an environment, which initialises and waits for its updates.
 
     The call returns what the script's function `train` returns.
 
     Args:
         script: a copy of JaxMARL's file.
-        env: the environment that the script gets in place of the one that it asks for.
+        env: the environment that the script gets instead of the one that it asks for.
         config: hyper-parameters.
         updates: number of updates.
 

@@ -36,7 +36,7 @@ from benchmarks.bench_gpu import (
     main,
     measure_training,
 )
-from benchmarks.flops import product_flops
+from benchmarks.harness import product_flops
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from tests.helpers.paths import ROOT

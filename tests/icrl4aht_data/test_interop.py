@@ -29,12 +29,6 @@ def sampler(lite):
     return load_icrl4aht(lite[0], layout="demo_wide", obs="uint8").ad(batch_size=4, length=25, seed=6)
 
 
-def test_a_plain_loop_ends_after_as_many_steps_as_the_selection_has(sampler):
-    batches = list(sampler)
-    assert len(batches) == len(sampler) == 6 * 120 // (4 * 25)
-    assert_equal(batches[3], sampler[3])
-
-
 class TestPasses:
     """A second pass had the batches of the first, so that a model trained on one set of windows for ever."""
 
@@ -242,10 +236,6 @@ class TestLosses:
         batch = take(load_icrl4aht(lite[0], layout="demo_wide").dpt(batch_size=3, context=7))
         assert batch.query_target.dtype == batch.context_actions.dtype == torch.int64
         assert functional.cross_entropy(torch.zeros(3, 6), batch.query_target) > 0
-
-    def test_steps_without_a_previous_one_are_marked(self, lite, take):
-        sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=2, length=120)
-        np.testing.assert_array_equal(take(sampler).is_first, np.arange(120) == np.zeros((2, 1)))
 
 
 @pytest.mark.parametrize(

@@ -114,11 +114,6 @@ def test_html_escapes_names():
     assert ElementTree.fromstring(html).find("strong") is not None
 
 
-def test_a_constant_curve_of_one_value_is_drawn():
-    (line,) = ElementTree.fromstring(curve_svg({"ppo": np.array([2.0])})).iter("polyline")
-    assert line.get("points")
-
-
 @pytest.mark.parametrize("values", [[40.0, 40.0, 40.0], [38.0, 42.0] * 3])
 def test_the_axis_of_a_curve_does_not_magnify(values):
     """Alternating returns once filled the axis, and a constant lay on its bottom line."""
@@ -165,12 +160,6 @@ def test_help_of_methods_shows_types(shown):
         found = [one.annotation for one in signature.parameters.values()] + [signature.return_annotation]
         texts = {annotation for annotation in found if isinstance(annotation, str)}
         assert texts <= {"gymnasium.Env", "pandas.DataFrame"}, name
-
-
-def test_one_history_is_singular(bundled):
-    one = bundled[:1]
-    assert "1 history of 1 task on" in repr(one) and "1 history of 1 task<" in one._repr_html_()
-    assert "1 history on" in repr(one.ad(batch_size=2, length=30))
 
 
 def test_provenance_is_a_read_only_mapping_with_a_short_repr(bundled):

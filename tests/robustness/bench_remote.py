@@ -23,7 +23,7 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.common import print_line
+from benchmarks.harness import print_line
 from benchmarks.histories import write_many
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.commands.options import COUNT

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.overcooked import observe as observe_module
 from icrl4aht_data.overcooked.channels import (
     CANONICAL_CHANNELS,
     canonical_positions,
@@ -17,11 +14,8 @@ from icrl4aht_data.overcooked.channels import (
     observation_shape,
     to_canonical,
 )
-from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
-from icrl4aht_data.overcooked.state import columns
-from tests.helpers.random_releases import random_history
 from tests.helpers.states import random_records
 
 each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
@@ -54,25 +48,6 @@ def test_the_canonical_channels_are_the_union():
     )  # fmt: skip
 
 
-@each_layout
-def test_the_table_in_the_docstring_of_observe_lists_the_channels(layout):
-    table = re.findall(r"^    (\w+|pot timer) +([0-9n +]+?) {2,}\S", observe_module.__doc__ or "", re.MULTILINE)
-    starts = dict.fromkeys(["self", "other", "item", "recipe"]) | {
-        "static": ("wall", "goal", "pot", "recipe_indicator", "button", "plate_pile"),
-        "piles": "pile_",
-        "pot timer": "pot_timer",
-        "delivery": "delivery",
-    }
-    assert {group for group, _ in table} == set(starts)
-    names = list(channel_names(layout))
-    for group, size in table:
-        counts = [layout.ingredient_types if part == "n" else int(part) for part in size.split(" + ")]
-        count = sum(counts) if group != "delivery" else int(layout.indicates_delivery)
-        found, names = names[:count], names[count:]
-        assert all(name.startswith(starts[group] or f"{group}_") for name in found), (group, found)
-    assert names == []
-
-
 def test_a_channel_that_no_layout_has_is_refused():
     layout = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
     with pytest.raises(OptionError, match=r"layout mine: channels \['self_ingredient_4', .* are not among the 46"):
@@ -90,26 +65,3 @@ def test_own_channels_are_in_their_places_and_others_are_0(layout):
         np.testing.assert_array_equal(observe_both(layout, records, canonical=True)[:, agent], expected, strict=True)
         rendered = np.asarray(observe(layout, jnp.asarray(records[:20]), agent, canonical=True))
         np.testing.assert_array_equal(rendered, expected[:20], strict=True)
-
-
-@each_layout
-@pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_fast_rendering(layout, dtype):
-    played = random_history(layout, 10, 60, np.random.default_rng(6))["state"]
-    drawn = random_records(layout, 300, np.random.default_rng(7))
-    for states in (played, drawn):
-        out = np.full((len(states), 5, 5, 46), 9, dtype)
-        assert fast_observe(layout, states, out, threads=2, canonical=True) is out
-        np.testing.assert_array_equal(out, observe(layout, states, 0, canonical=True))
-        own = np.empty((len(states), *layout.obs_shape), dtype)  # both kinds of lookup tables are cached
-        np.testing.assert_array_equal(fast_observe(layout, states, own), observe(layout, states, 0))
-
-
-def test_records_that_the_rules_exclude():
-    layout = get_layout("cramped_up")
-    states = random_history(layout, 2, 20, np.random.default_rng(3))["state"]
-    states[3, columns(layout).pot_timers] = 99
-    out = np.empty((len(states), 5, 5, 46), np.uint8)
-    np.testing.assert_array_equal(
-        fast_observe(layout, states, out, canonical=True), placed(layout, observe(layout, states, 0))
-    )

@@ -5,46 +5,55 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.overcooked.state import columns
+from icrl4aht_data.overcooked.state import columns, record_size
 from tests.helpers.random_releases import random_history
 
+each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+each_kind = pytest.mark.parametrize("canonical", [False, True], ids=["own", "canonical"])
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+
+@each_layout
+@each_kind
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
-def test_played_states(layout, dtype):
+def test_played_states(layout, dtype, canonical):
     states = random_history(layout, 40, 120, np.random.default_rng(1))["state"]
-    out = np.full((len(states), *layout.obs_shape), 9, dtype)
-    assert fast_observe(layout, states, out, threads=3) is out
-    np.testing.assert_array_equal(out, observe(layout, states, 0))
+    out = np.full((len(states), *observation_shape(layout, canonical)), 9, dtype)
+    assert fast_observe(layout, states, out, threads=3, canonical=canonical) is out
+    np.testing.assert_array_equal(out, observe(layout, states, 0, canonical))
 
 
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_states_that_play_seldom_reaches(layout):
+@each_layout
+@each_kind
+def test_states_that_play_seldom_reaches(layout, canonical):
     """Every item on every counter and pot, every timer, lit buttons, deliveries: drawn independently."""
     rng = np.random.default_rng(2)
     where = columns(layout)
-    states = rng.integers(0, 256, (3000, random_history(layout, 1, 1, rng)["state"].shape[1])).astype(np.uint8)
+    states = rng.integers(0, 256, (3000, record_size(layout))).astype(np.uint8)
     states[:, where.positions] = rng.choice(np.flatnonzero(layout.walkable), (3000, 2))
     states[:, where.facings] %= 4
     states[:, where.delivered] %= 2
     states[:, where.pot_timers] %= 32
     states[:, where.recipe] = rng.choice(layout.recipe_items, 3000)
-    out = np.empty((3000, *layout.obs_shape), np.uint8)
-    np.testing.assert_array_equal(fast_observe(layout, states, out), observe(layout, states, 0))
+    out = np.empty((3000, *observation_shape(layout, canonical)), np.uint8)
+    found = fast_observe(layout, states, out, canonical=canonical)
+    np.testing.assert_array_equal(found, observe(layout, states, 0, canonical))
 
 
+@each_kind
 @pytest.mark.parametrize(
     ("column", "value"), [("positions", 0), ("recipe", 77), ("delivered", 2), ("facings", 4), ("pot_timers", 99)]
 )
-def test_records_that_the_rules_exclude(column, value):
+def test_records_that_the_rules_exclude(column, value, canonical):
     layout = get_layout("coord_simple")
     states = random_history(layout, 4, 20, np.random.default_rng(3))["state"]
     states[7, getattr(columns(layout), column)] = value
-    out = np.empty((len(states), *layout.obs_shape), np.float32)
-    np.testing.assert_array_equal(fast_observe(layout, states, out), observe(layout, states, 0))
+    out = np.empty((len(states), *observation_shape(layout, canonical)), np.float32)
+    found = fast_observe(layout, states, out, canonical=canonical)
+    np.testing.assert_array_equal(found, observe(layout, states, 0, canonical))
 
 
 def test_shapes_and_empty_input():

@@ -219,24 +219,6 @@ def test_the_same_scene_seen_by_the_teammate():
     }
 
 
-def test_rows_come_before_columns():
-    view = observe(CRAMPED, state_record(CRAMPED, (2, 1, "up"), (3, 2, "up")), 0)[0]
-    other = 9  # first of the other agent's channels, n = 2
-    assert view[2, 2, 0] == 1
-    assert np.argwhere(view[..., other]).tolist() == [[3, 3]]
-    view = observe(CRAMPED, state_record(CRAMPED, (2, 1, "up"), (2, 2, "up")), 0)[0]
-    assert np.argwhere(view[..., other]).tolist() == [[3, 2]]
-
-
-@pytest.mark.parametrize(("facing", "channel"), [("up", 1), ("down", 2), ("right", 3), ("left", 4)])
-def test_facings_have_their_channels(facing, channel):
-    other = "left" if facing != "left" else "up"
-    record = state_record(CRAMPED, (2, 1, facing), (2, 2, other))
-    both = observe_both(CRAMPED, record)[0]
-    assert np.flatnonzero(both[0, 2, 2, :5]).tolist() == [0, channel]
-    assert np.flatnonzero(both[1, 1, 2, 9:14]).tolist() == [0, channel]
-
-
 @each_layout
 def test_cells_outside_the_map_are_all_zero_and_all_others_are_not_cut(layout):
     records = random_records(layout, 256, np.random.default_rng(2))
@@ -275,13 +257,6 @@ def test_the_other_agent_is_seen_only_within_the_window(layout):
         np.testing.assert_array_equal(others[near, me].sum(axis=(1, 2)), itself[near])
 
 
-def test_the_other_agent_at_and_beyond_the_windows_corner():
-    for x, y, visible in ((3, 3, True), (4, 3, False), (3, 4, False)):
-        found = seen(RING, state_record(RING, (1, 1, "up"), (x, y, "left")), 0)
-        expected = {"other position": at(1, (x, y)), "other left": at(1, (x, y))} if visible else {}
-        assert part(found, "other") == expected
-
-
 def test_the_recipe_shows_on_indicators_always_and_on_buttons_while_lit():
     """coord_ring: indicators (0, 4) and (4, 0) among others, buttons (4, 2) and (4, 6)."""
     for timer, shown in ((0, [(4, 0)]), (1, [(4, 0), (4, 2)]), (9, [(4, 0), (4, 2)])):
@@ -294,26 +269,6 @@ def test_the_recipe_shows_on_indicators_always_and_on_buttons_while_lit():
     record = state_record(RING, (1, 4, "up"), (3, 4, "up"), buttons=[0, 5], recipe=2 * ZERO + ONE)
     assert part(seen(RING, record, 0), "recipe") == {"recipe 0": at(2, (0, 4)), "recipe 1": at(1, (0, 4))}
     assert part(seen(RING, record, 1), "recipe") == {"recipe 0": at(2, (4, 6)), "recipe 1": at(1, (4, 6))}
-
-
-@each_layout
-def test_plate_and_cooked_of_the_recipe_stay_0(layout):
-    records = random_records(layout, 512, np.random.default_rng(4))
-    observed = observe_both(layout, records)
-    names = channel_names(layout.ingredient_types, layout.indicates_delivery)
-    assert not observed[..., [names.index("recipe plate"), names.index("recipe cooked")]].any()
-    assert observed[..., names.index("recipe 0")].max() == 3
-
-
-@pytest.mark.parametrize("timer", [1, 10, 19])
-def test_a_pots_content_and_timer(timer):
-    record = state_record(CRAMPED, (2, 1, "up"), (3, 2, "up"), pot_items=[ZERO + 2 * ONE], pot_timers=[timer])
-    found = seen(CRAMPED, record, 0)
-    assert part(found, "item", "pot timer") == {
-        "item 0": at(1, (2, 0)),
-        "item 1": at(2, (2, 0)),
-        "pot timer": at(timer, (2, 0)),
-    }
 
 
 @pytest.mark.parametrize(
@@ -332,40 +287,6 @@ def test_a_correct_delivery_shows_on_the_goal_for_one_step(layout, goal, poses, 
     assert "delivery" not in seen(layout, after.state, 1 - deliverer)  # the goal is not in this window
     later = rules.step(layout, after.state, np.array([[STAY, STAY]]), next_recipe)
     assert "delivery" not in seen(layout, later.state, deliverer)
-
-
-def test_other_layouts_have_no_delivery_channel():
-    record = state_record(CRAMPED, (2, 2, "down"), (3, 2, "down"), hands=[0, RECIPE_000 + PLATE + COOKED])
-    after = rules.step(CRAMPED, record, np.array([[STAY, INTERACT]]), np.array([RECIPE_000], np.uint8))
-    assert (after.reward, unpack(CRAMPED, after.state).delivered) == (20, 1)
-    goal_only = {name for name, cells in seen(CRAMPED, after.state, 0).items() if (3, 3) in cells}
-    assert goal_only == {"goal"}
-
-
-@pytest.mark.parametrize("name", ["test_wide", "demo_wide"])
-def test_a_type_without_a_pile_has_empty_channels_and_the_next_keeps_its_own(name):
-    layout = LAYOUTS[name]
-    assert layout.ingredients == (0, 1, 3)
-    names = channel_names(4, layout.indicates_delivery)
-    observed = observe_both(layout, random_records(layout, 2048, np.random.default_rng(5)))
-    for kind, largest in (("self", 3), ("other", 3), ("pile", 1), ("item", 3)):
-        assert observed[..., names.index(f"{kind} 2")].max() == 0
-        assert observed[..., names.index(f"{kind} 3")].max() == largest
-    assert observed[..., names.index("recipe 2")].max() == 0
-
-
-def test_ingredient_3_of_test_wide_shows_as_3():
-    three = WIDE.ingredient_item(3)
-    record = state_record(
-        WIDE, (2, 1, "up"), (2, 4, "up"), hands=[0, three], recipe=2 * three + ZERO, pot_items=[0, 2 * three]
-    )
-    found = seen(WIDE, record, 1)
-    assert part(found, "self 3", "pile") == {"self 3": at(1, (2, 4)), "pile 3": at(1, (0, 4)), "pile 1": at(1, (0, 2))}
-    assert part(found, "item", "recipe") == {
-        "item 3": at(2, (3, 3)),
-        "recipe 3": at(2, (2, 6)),
-        "recipe 0": at(1, (2, 6)),
-    }
 
 
 # The state record

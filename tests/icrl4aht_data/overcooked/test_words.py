@@ -71,13 +71,6 @@ def test_records_of_all_layouts_in_one_batch_with_canonical_channels():
     assert len(words.channels) < 700
 
 
-def test_words_are_few_and_the_first_shows_nothing():
-    words = cell_words([get_layout("demo_wide")])
-    assert 300 < len(words.channels) < 400
-    assert not words.channels[0].any()
-    assert len(np.unique(words.channels, axis=0)) == len(words.channels)
-
-
 @pytest.mark.parametrize(("column", "value"), [("pot_timers", 31), ("pot_items", 255), ("hands", 255)])
 def test_contents_that_the_rules_exclude_have_the_last_word(column, value):
     layout = get_layout("cramped_up")

@@ -39,11 +39,6 @@ def test_batches_in_order(sampler, prefetch, reuse):
     assert next(batches, None) is None
 
 
-def test_batches_are_kept_without_reuse(sampler):
-    for i, batch in enumerate(list(sampler.batches(stop=6))):
-        assert_equal(batch, sampler[i])
-
-
 def _aligned(array):
     """An array of the same shape at an address that JAX would take over instead of copying from it."""
     if array is None:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import pickle
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import OptionError, UnknownNameError
-from icrl4aht_data.interop import hf_index, hf_windows, torch_loader
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, channel_names
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
@@ -119,15 +117,6 @@ def test_stored_observations_are_put_into_their_places(lite, reconverted_release
     assert {"delivery"}.isdisjoint(np.array(CANONICAL_CHANNELS)[mixed.context_obs.any(axis=(0, 1, 2, 3))])
 
 
-def test_buffers_and_processes(lite):
-    sampler = canonical(lite[0]).ad(batch_size=8, length=30)
-    buffer = sampler.empty()
-    assert sampler.batch(4, buffer) is buffer
-    assert_equal(buffer, sampler[4])
-    parts = [canonical(lite[0]).ad(batch_size=8, length=30, process_index=k, process_count=2)[4].obs for k in range(2)]
-    np.testing.assert_array_equal(np.concatenate(parts), buffer.obs)
-
-
 def test_selections(root):
     dataset = canonical(root)
     assert (dataset.channels, dataset.obs_shape) == ("canonical", (5, 5, 46))
@@ -149,11 +138,6 @@ def test_selections(root):
         load_icrl4aht(root, channels="canonic")  # type: ignore[arg-type]
     with pytest.raises(UnknownNameError, match="unknown channels 46"):
         own.with_options(channels=46)  # type: ignore[arg-type]
-
-
-def test_state_records_with_own_channels_of_unequal_number(lite):
-    with pytest.raises(OptionError, match='take channels="canonical"'):
-        load_icrl4aht(lite[0], layout=LAYOUTS, obs="state").ad(batch_size=2, length=5)
 
 
 def test_positions_of_other_channels_are_not_resumed(lite):
@@ -180,21 +164,3 @@ def test_memory_that_a_batch_takes(lite, reconverted_release):
         assert sampler._bytes == 21 * (25 * 46 + record + scalars)
     with pytest.raises(OptionError, match=r"obs uint8 \(1000000000000, 7, 5, 5, 46\)"):
         dataset.ad(batch_size=10**12, length=7)[0]
-
-
-def test_loaders_of_other_libraries(root):
-    import grain
-
-    dataset = canonical(root)
-    sampler = dataset.ad(batch_size=4, length=12)
-    expected = sampler[1]
-    assert expected.describe().splitlines()[0].split() == ["obs", "uint8", "(4,", "12,", "5,", "5,", "46)"]
-    tensors = next(iter(torch_loader(sampler, start=1, stop=2)))
-    np.testing.assert_array_equal(tensors.obs.numpy(), expected.obs)
-    (batch,) = grain.MapDataset.source(sampler)[1:2]
-    assert_equal(batch, expected)
-    rows = list(hf_windows(sampler, 1, 2))
-    np.testing.assert_array_equal(np.array([row["obs"] for row in rows]), expected.obs)
-    with sampler.batches(1, 2, device=jax.devices()[0]) as batches:
-        np.testing.assert_array_equal(np.asarray(next(batches).obs), expected.obs)
-    assert set(map(tuple, hf_index(dataset)["obs_shape"])) == {(5, 5, 40), (5, 5, 45)}

@@ -10,7 +10,7 @@ import pytest
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.sampling.draws import Curriculum
-from tests.helpers.batches import CACHES, assert_equal
+from tests.helpers.batches import CACHES
 from tests.helpers.two_sources import EPISODES, LENGTH
 
 OPTIONS: dict[str, Any] = {"batch_size": 32, "length": 2 * LENGTH + 7, "seed": 2}
@@ -64,12 +64,6 @@ def test_all_windows_are_drawn(two_sources):
     sampler = load_icrl4aht(two_sources[0], layout="demo_wide", split="train").ad(every=2, **OPTIONS)
     starts = np.concatenate([sampler.windows(i)[1] for i in range(40)])
     assert set(starts.tolist()) == {*range(14), *range(LENGTH, LENGTH + 14)}
-
-
-def test_every_episode_is_the_default(two_sources):
-    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
-    assert_equal(dataset.ad(**OPTIONS)[3], dataset.ad(every=1, **OPTIONS)[3])
-    assert "every" not in dataset.ad(**OPTIONS).options()
 
 
 def test_parts_of_histories(two_sources):

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.errors import LabelsMissingError, OptionError, UnknownNameError, WeakLabelsWarning
+from icrl4aht_data.errors import LabelsMissingError, OptionError, WeakLabelsWarning
 from icrl4aht_data.format.schema import HISTORIES, PROVENANCE
-from icrl4aht_data.interop import hf_episodes, hf_index, hf_windows, torch_loader
+from icrl4aht_data.interop import hf_episodes, hf_index
 from icrl4aht_data.reading.history import LABELS
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.batches import CACHES, assert_equal
 from tests.helpers.random_releases import random_release
 from tests.helpers.two_sources import two_source_release
-from tests.servers.common import http_server
 
 OPTIONS: dict[str, Any] = {"batch_size": 16, "context": 9, "seed": 4}
 
@@ -46,12 +44,6 @@ def test_targets_are_the_labels_of_the_query_step(two_sources, cache, labels, or
         np.testing.assert_array_equal(sampler[i].query_target, expected_targets(written, sampler, i))
 
 
-def test_labels_change_nothing_but_the_targets(sampler):
-    expert, oracle = sampler.dataset.dpt(**OPTIONS)[0], sampler[0]
-    assert (expert.query_target != oracle.query_target).any()
-    assert_equal(expert._replace(query_target=oracle.query_target), oracle)
-
-
 @pytest.mark.parametrize("labels", LABELS)
 @pytest.mark.parametrize("cache", CACHES)
 def test_windows_with_labels_differ_in_their_targets_only(two_sources, cache, labels):
@@ -71,52 +63,6 @@ def test_windows_with_labels_differ_in_their_targets_only(two_sources, cache, la
     assert (batch.target_actions != taken.target_actions).any()
 
 
-def test_windows_with_labels_are_resumed_with_the_same_ones(two_sources):
-    dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
-    own, oracle, expert = (
-        dataset.ad(batch_size=2, length=9, labels=labels).batches(prefetch=0) for labels in (None, "oracle", "expert")
-    )
-    oracle.load_state_dict(oracle.state_dict())
-    for one, other in ((own, oracle), (oracle, own), (oracle, expert), (expert, own)):
-        with pytest.raises(OptionError, match="it has labels = "):
-            one.load_state_dict(other.state_dict())
-
-
-def test_full_releases_have_the_same_labels(two_sources, tmp_path):
-    two_source_release(tmp_path / "full", "full")
-    lite, full = (load_icrl4aht(root, layout="demo_wide") for root in (two_sources[0], tmp_path / "full"))
-    assert_equal(lite.dpt(labels="oracle", **OPTIONS)[1], full.dpt(labels="oracle", **OPTIONS)[1])
-    assert full[0].oracle_actions.dtype == lite[0].oracle_actions.dtype == np.int32
-
-
-@pytest.mark.parametrize("cache", ["auto", "ram"])
-def test_a_remote_release_has_the_same_labels(two_sources, sampler, cache, tmp_path, monkeypatch):
-    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path))
-    with http_server(two_sources[0]) as server:
-        remote = load_icrl4aht(server.url, layout="demo_wide", cache=cache)
-        assert remote.cache.cache == ("stream" if cache == "auto" else "ram")
-        assert_equal(remote.dpt(labels="oracle", **OPTIONS)[0], sampler[0])
-        np.testing.assert_array_equal(remote[0].oracle_actions, two_sources[1][int(remote.ids[0])]["oracle_actions"])
-
-
-def test_on_a_device(sampler):
-    with sampler.batches(stop=2, device=jax.devices()[0]) as batches:
-        for i, batch in enumerate(batches):
-            assert isinstance(batch.query_target, jax.Array)
-            assert_equal(jax.device_get(batch), sampler[i])
-
-
-def test_in_loaders_of_other_libraries(sampler):
-    import grain
-
-    target = sampler[0].query_target
-    assert_equal(grain.MapDataset.source(sampler)[0], sampler[0])
-    (batch,) = torch_loader(sampler, stop=1)
-    np.testing.assert_array_equal(batch.query_target, target)
-    rows = list(hf_windows(sampler, stop=1))
-    np.testing.assert_array_equal([row["query_target"] for row in rows], target)
-
-
 def test_hugging_face_has_both_labels(two_sources, tmp_path, monkeypatch):
     monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
     root, written = two_sources
@@ -126,16 +72,6 @@ def test_hugging_face_has_both_labels(two_sources, tmp_path, monkeypatch):
         found = np.concatenate([row[name] for row in rows if row["history_id"] == 3])
         np.testing.assert_array_equal(found, written[3][name])
     assert hf_index(dataset)["has_oracle_actions"] == [True, True]
-
-
-def test_arrays_by_name(two_sources):
-    root, written = two_sources
-    history = load_icrl4aht(root, source="noise", split="train")[0]
-    actions = written[history.entry.history_id]["oracle_actions"]
-    np.testing.assert_array_equal(history.oracle_actions, actions)
-    np.testing.assert_array_equal(history.read("oracle_actions", 5, 9), actions[5:9])
-    np.testing.assert_array_equal(history.oracle_actions, history.expert_actions)  # the oracle was the expert
-    assert (history.actions[-20:] == history.oracle_actions[-20:]).all()
 
 
 def test_resuming_needs_the_same_labels(sampler):
@@ -180,25 +116,12 @@ class TestNoiseWithoutOracleActions:
         rows: Any = hf_episodes(dataset[:1])
         np.testing.assert_array_equal(np.concatenate([row["oracle_actions"] for row in rows]), actions)
 
-    def test_a_remote_fetches_the_expert_actions(self, two_sources, smaller, tmp_path, monkeypatch):
-        monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path))
-        with http_server(smaller) as server:
-            remote = load_icrl4aht(server.url, source="noise")
-            np.testing.assert_array_equal(
-                remote[0].oracle_actions, two_sources[1][int(remote.ids[0])]["expert_actions"]
-            )
-
     def test_verification_and_conversion_leave_them_out(self, smaller, tmp_path):
         to_release(load_icrl4aht(smaller), tmp_path / "full", "full")
         assert verify_release(tmp_path / "full", level="deep").ok
         to_release(load_icrl4aht(tmp_path / "full"), tmp_path / "lite", "lite")
         for name in (HISTORIES, PROVENANCE):
             assert (tmp_path / "lite" / name).read_bytes() == (smaller / name).read_bytes()
-
-    def test_without_expert_actions_there_are_none(self, tmp_path):
-        random_release(tmp_path / "r", layouts=("demo_wide",), teammates=1, labels=False, sources=("noise",))
-        with pytest.raises(LabelsMissingError, match=r"labels = oracle: .* 0 have expert actions"):
-            load_icrl4aht(tmp_path / "r").dpt(labels="oracle", **OPTIONS)
 
 
 class TestMissingLabels:
@@ -230,15 +153,6 @@ class TestMissingLabels:
             LabelsMissingError, match=r"no expert actions .*, 0 have oracle actions: choose histories or a release with"
         ):
             load_icrl4aht(tmp_path / "r").dpt(**OPTIONS)
-
-    def test_of_an_unknown_name(self, two_sources):
-        with pytest.raises(UnknownNameError, match=r"unknown labels 'orcale'; valid: expert, oracle\. Did you mean"):
-            load_icrl4aht(two_sources[0], layout="demo_wide").dpt(labels="orcale", **OPTIONS)  # type: ignore[arg-type]
-
-    def test_of_windows(self, tmp_path):
-        random_release(tmp_path / "r", layouts=("demo_wide",))
-        with pytest.raises(LabelsMissingError, match=r"labels = oracle: .*take expert as labels, which all have"):
-            load_icrl4aht(tmp_path / "r").ad(batch_size=2, length=9, labels="oracle")
 
 
 def test_an_oracle_that_earns_little_is_warned_of(two_sources, monkeypatch):

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import Curriculum, load_icrl4aht
-from icrl4aht_data.errors import OptionError, ShardCorruptError, UnknownNameError
+from icrl4aht_data.errors import ShardCorruptError, UnknownNameError
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.sources import choose_cache
-from icrl4aht_data.utils.system import in_slices
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.batches import CACHES, assert_equal, samplers
 from tests.helpers.random_releases import SHARD, random_release
@@ -98,12 +97,6 @@ class TestCaches:
         with pytest.raises(ShardCorruptError, match="chunk 0 of state in history 0"):
             sampler[0]
 
-    def test_decoded_arrays_do_not_travel(self, lite):
-        sampler = load_icrl4aht(lite[0], layout="demo_wide", cache="ram").ad(batch_size=3, length=9)
-        first, sent = sampler[0], pickle.dumps(sampler)
-        assert len(sent) < 100_000
-        assert_equal(pickle.loads(sent)[0], first)
-
     def test_threads_share_a_sampler(self, lite):
         sampler = load_icrl4aht(lite[0], layout="demo_wide", cache="stream", threads=2).ad(batch_size=9, length=30)
         found = {}
@@ -115,14 +108,6 @@ class TestCaches:
         assert len(found) == 12
         for k, batch in found.items():
             assert_equal(batch, sampler[k % 4])
-
-    def test_an_error_in_a_slice_reaches_the_caller(self):
-        def work(start: int, stop: int) -> None:
-            if stop == 10:
-                raise OptionError("the last slice")
-
-        with pytest.raises(OptionError, match="the last slice"):
-            in_slices(work, 10, 4)
 
 
 @pytest.mark.parametrize("cache", CACHES)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -13,8 +10,6 @@ import pytest
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import all_families
 from icrl4aht_data.errors import MixedSplitsWarning, OptionError
-from tests.helpers.batches import digest
-from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_release
 
 LENGTH = 32
@@ -195,25 +190,6 @@ def test_fields_dtypes_and_shapes(lite, make, expected):
     assert {name: (str(a.dtype), a.shape) for name, a in batch._asdict().items() if a is not None} == expected
     assert sampler.specs == expected
     assert batch.describe().splitlines()[0].split() == [next(iter(expected)), "float32", *str(batch[0].shape).split()]
-
-
-def test_same_batches_in_two_processes_and_from_both_kinds(lite, full):
-    code = "import sys, pathlib; from tests.helpers.batches import digest; print(digest(pathlib.Path(sys.argv[1])))"
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    run = subprocess.run(
-        [sys.executable, "-c", code, str(lite[0])], capture_output=True, text=True, check=True, env=environment
-    )
-    assert run.stdout.strip() == digest(lite[0]) == digest(full[0])
-
-
-def test_batches_depend_on_seed_and_number_alone(lite):
-    dataset = load_icrl4aht(lite[0], layout="demo_wide")
-    one, two = dataset.ad(batch_size=8, length=20, seed=1), dataset.ad(batch_size=8, length=20, seed=2)
-    assert two[5].obs.shape == two[0].obs.shape
-    for i in (3, 0, 3):
-        np.testing.assert_array_equal(one[i].obs, dataset.ad(batch_size=8, length=20, seed=1)[i].obs)
-    assert (one.windows(0)[1] != one.windows(1)[1]).any()
-    assert (one.windows(0)[1] != two.windows(0)[1]).any()
 
 
 def test_the_draws_are_fixed_for_good(lite):

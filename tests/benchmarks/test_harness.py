@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks.flops import compile_measured, product_flops
+from benchmarks.harness import compile_measured, product_flops
 
 
 def counted(function, *shapes) -> float:
@@ -28,7 +28,7 @@ def test_the_backward_pass_has_two_products_for_each_of_the_forward_pass():
     assert counted(jax.grad(loss, (0, 1)), (3, 5), (5, 7)) == 3 * 2 * 3 * 5 * 7
 
 
-def test_loops_count_every_round_and_conditions_the_dearest_branch():
+def test_loops_count_every_round_and_conditions_the_most_expensive_branch():
     def loop(x, kernel):
         return jax.lax.scan(lambda x, _: (x @ kernel, None), x, length=11)[0]
 

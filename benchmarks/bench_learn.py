@@ -1,0 +1,267 @@
+"""Speed of learning: `make bench-learn`.
+
+    ego      steps/s of an ego that learns with teammate H4, by profile, compared with the first profile
+    jaxmarl  self-play with the paper's network compared with JaxMARL's recurrent IPPO: `PEER=file`, see `peers`
+    ad       AD's training steps on state records by encoder, compared with the paper's encoder on float32 observations
+             that a reader of the published format makes
+    act      the evaluator's steps/s with `cached` acting, compared with `exact` acting
+    tasks    minutes of all 160 test tasks with `cached` acting, compiling included
+
+One JSON line each. Models are untrained: speed does not depend on what they know.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, get_args
+
+import click
+import jax
+import numpy as np
+from icrl4aht_baselines.agents.egos import Acting, PlayMode, learned
+from icrl4aht_baselines.evaluate.evaluator import evaluate, play_episodes, prepare_rollout
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, Protocol
+from icrl4aht_baselines.methods.ad import dropped_steps
+from icrl4aht_baselines.methods.options import SIZES, ModelOptions
+from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.methods.tokens import plain_view
+from icrl4aht_baselines.training.options import TrainOptions
+from icrl4aht_baselines.training.trainer import Trainer
+from icrl4aht_generation.env import Environment
+from icrl4aht_generation.learners.config import EncoderKind, PPOConfig
+from icrl4aht_generation.learners.ego import Learner, compiled_update
+from icrl4aht_generation.learners.population.fcp import FCP
+from icrl4aht_generation.learners.population.population import Population
+from icrl4aht_generation.learners.resume import limit_xla_threads, xla_threads
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.profiles import load_profile
+from icrl4aht_generation.teammates.instances import published_tasks
+from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
+
+from benchmarks.harness import COUNT, compared, compiled_call, elapsed, print_line, rates_in_turn
+from benchmarks.published import published_reader
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.benchmark.facts import TRACKS, track_of
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.sampling.ad import ADBatch, ADSampler
+from icrl4aht_data.writing.published import FROM_PUBLISHED, to_published
+
+_UPDATES, _PEER_UPDATES = 3, 2  # in one measured call
+_print = partial(print_line, "learn")
+
+
+def heuristic_learner(layout: Layout, config: PPOConfig) -> Learner:
+    """Return an ego with these hyper-parameters and teammate H4."""
+    mate = build_teammate(layout, heuristic_teammate("utility_greedy", "default", 0), noise="seeded")
+    return Learner(Environment(layout), mate, config)
+
+
+def ego_updates(layout: Layout, config: PPOConfig) -> Callable[[], None]:
+    """Return a compiled call that does `_UPDATES` updates of an ego and waits for them."""
+    learner = heuristic_learner(layout, config)
+    update, state = compiled_update(learner), jax.jit(learner.init)(jax.random.key(0))
+
+    def run() -> None:
+        nonlocal state
+        for _ in range(_UPDATES):
+            state, *_ = update(state)
+        jax.block_until_ready(state.params)
+
+    run()
+    return run
+
+
+def compare_egos(layout: Layout, configs: dict[str, PPOConfig], rounds: int) -> None:
+    """Print steps/s of every profile's ego, and the ratio to the first one."""
+    ways = {name: ego_updates(layout, config) for name, config in configs.items()}
+    steps = {name: _UPDATES * config.steps_per_update for name, config in configs.items()}
+    rates, first = rates_in_turn(ways, steps, rounds), next(iter(configs))
+    for name, config in configs.items():
+        sizes = {size: getattr(config, size) for size in ("environments", "rollout", "minibatches", "epochs")}
+        facts = sizes | {"encoder": config.widths.encoder, "threads": xla_threads()} | compared(rates, name, first)
+        _print(part="ego", profile=name, layout=layout.name, **facts)
+
+
+def compare_jaxmarl(script: Path, layout: Layout, environments: int, rounds: int) -> None:
+    """Print steps/s of self-play with the paper's network, ours with encoder `words`, and the ratio to JaxMARL's."""
+    from benchmarks.peers import jaxmarl_environment, jaxmarl_training  # only this part needs JaxMARL
+
+    config = PPOConfig(environments=environments, rollout=64, minibatches=min(environments, 8), warmup=0.05)
+    words = replace(config, widths=replace(config.widths, encoder="words"))
+    population = Population(Environment(layout), FCP(1), words)
+
+    def train_through(key: Any) -> Any:
+        start = population.init(key)
+        return jax.lax.scan(lambda state, _: population.update(state), start, length=_PEER_UPDATES)
+
+    ways = {
+        "ours": compiled_call(train_through, jax.random.key(0)),
+        "jaxmarl": jaxmarl_training(script, jaxmarl_environment(layout), config, _PEER_UPDATES),
+    }
+    rates = rates_in_turn(ways, _PEER_UPDATES * config.steps_per_update, rounds)
+    sizes = {name: getattr(config, name) for name in ("environments", "rollout", "minibatches")}
+    _print(part="jaxmarl", layout=layout.name, threads=xla_threads(), **sizes, **compared(rates, "ours", "jaxmarl"))
+
+
+def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
+    """Yield the windows that a sampler draws, read like the published code.
+
+    The values of the step before a window are left at 0, since speed does not depend on them.
+    """
+    number = {int(history): k for k, history in enumerate(sampler.dataset.ids)}
+    read, i = published_reader(folder, sampler.length), 0
+    while True:
+        ids, starts = sampler.windows(i)
+        found = read(np.array([number[history] for history in ids.tolist()]), starts)
+        actions, rewards = FROM_PUBLISHED[found["actions"]], found["rewards"].astype(np.float32)
+        yield ADBatch(
+            obs=found["obs"],
+            prev_actions=np.pad(actions, ((0, 0), (1, 0)))[:, :-1],
+            prev_rewards=np.pad(rewards, ((0, 0), (1, 0)))[:, :-1],
+            target_actions=actions,
+            dones=found["dones"].astype(bool),
+            attention_mask=np.ones_like(actions, bool),
+            is_first=starts[:, None] + np.arange(sampler.length) == 0,
+        )
+        i += 1
+
+
+def architecture(size: str, **changes: Any) -> ModelOptions:
+    """Return the architecture of a size of AD."""
+    return ModelOptions(**SIZES[size].model | changes)
+
+
+def training_steps(trainer: Trainer, batches: Iterator[Any], steps: int) -> Callable[[], None]:
+    """Return a compiled call that does some training steps and waits for each."""
+    state = trainer.init()
+
+    def run(count: int = steps) -> None:
+        nonlocal state
+        for _ in range(count):
+            state, _ = jax.block_until_ready(trainer.step(state, next(batches)))
+
+    run(1)
+    return run
+
+
+def compare_training(
+    dataset: Dataset, size: str, encoders: Sequence[EncoderKind], options: TrainOptions, steps: int, rounds: int
+) -> None:
+    """Print transitions/s of AD of a size by encoder, and the ratio to the paper's encoder and the published format."""
+    sampler = dataset.ad(batch_size=options.batch_size, length=options.context, seed=1)
+    ways: dict[str, Callable[[], None]] = {}
+    loaders = {}
+    with TemporaryDirectory() as folder, ExitStack() as opened:
+        to_published(dataset, Path(folder) / "published", states=False)
+        for way in ("published", *encoders):
+            encoder: EncoderKind = "paper" if way == "published" else way
+            world = overcooked_world(dataset.layouts, encoder, plain_view if way == "published" else None)
+            trainer = Trainer(get_method("ad")(architecture(size, encoder=encoder), world), options)
+            if way == "published":
+                found = published_batches(Path(folder) / "published", sampler)
+                batches = (jax.device_put(batch, trainer.rows) for batch in found)
+            else:
+                batches = loaders[way] = opened.enter_context(trainer.batches(sampler, 0, sys.maxsize))
+            ways[way] = training_steps(trainer, batches, steps)
+        rates = rates_in_turn(ways, steps * options.batch_size * options.context, rounds)
+    for way in encoders:
+        sizes = {"batch": options.batch_size, "length": options.context, "wait_seconds": round(loaders[way].waited, 3)}
+        _print(part="ad", size=size, encoder=way, **sizes, **compared(rates, way, "published"))
+
+
+def untrained_ad(layout: Layout, size: str, acting: Acting) -> Policy:
+    """Return an ego of untrained AD of a size."""
+    model = architecture(size)
+    method = get_method("ad")(model, overcooked_world([layout], model.encoder))
+    return learned(method, method.init(jax.random.key(0)), SIZES[size].context, PlayMode(acting))
+
+
+def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -> Callable[[], None]:
+    """Return a compiled call that plays one episode of every task with a full window."""
+    protocol, policy = replace(PROTOCOLS["seeded"], steps=steps), untrained_ad(tasks[0].layout, size, acting)
+    episodes = play_episodes(prepare_rollout(lambda layout: policy, tasks, protocol), sys.maxsize)
+    # Exact acting computes all K positions from the first step on, cached acting only those in the window.
+    for _ in range(-(-SIZES[size].context // steps) if acting == "cached" else 1):
+        next(episodes)
+    return lambda: jax.block_until_ready(next(episodes))
+
+
+def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int) -> None:
+    """Print steps/s of cached acting on some tasks of a layout, and the ratio to exact acting."""
+    tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
+    dropped = dropped_steps(SIZES[size].context)  # a full window is computed again after so many steps
+    lengths: dict[Acting, int] = {"cached": dropped * -(-10 * steps // dropped), "exact": steps}
+    ways = {acting: acting_steps(tasks, size, acting, n) for acting, n in lengths.items()}
+    rates = rates_in_turn(ways, {acting: n * len(tasks) for acting, n in lengths.items()}, rounds)
+    _print(part="act", size=size, tasks=len(tasks), **compared(rates, "cached", "exact"))
+
+
+def evaluate_all_tasks(size: str, protocol: Protocol) -> None:
+    """Print the minutes of all test tasks with an untrained AD for each layout, compiling included."""
+    tasks = [task for track in TRACKS for task in published_tasks(track)]
+    seconds = elapsed(lambda: evaluate("AD", lambda layout: untrained_ad(layout, size, "cached"), tasks, protocol))
+    _print(part="tasks", size=size, tasks=len(tasks), episodes=protocol.episodes, minutes=round(seconds / 60, 2))
+
+
+PARTS = ("ego", "jaxmarl", "ad", "act", "tasks")
+_ENCODERS: tuple[EncoderKind, ...] = get_args(EncoderKind)
+
+
+@click.command()
+@click.option("--part", "parts", multiple=True, type=click.Choice(PARTS), help="[default: all; jaxmarl needs --peer]")
+@click.option("--layout", default="demo_wide", show_default=True)
+@click.option("--rounds", type=COUNT, default=5, show_default=True)
+@click.option("--profile", "profiles", multiple=True, default=("mini", "cpu"), show_default=True, help="For `ego`.")
+@click.option("--peer", type=click.Path(path_type=Path, exists=True, dir_okay=False), help="JaxMARL's file.")
+@click.option("--environments", type=COUNT, default=32, show_default=True, help="Environments of `jaxmarl`.")
+@click.option("--size", "sizes", multiple=True, type=click.Choice(list(SIZES)), default=("tiny",), show_default=True)
+@click.option("--encoder", "encoders", multiple=True, type=click.Choice(_ENCODERS), default=_ENCODERS, help="For `ad`.")
+@click.option("--batch", type=COUNT, default=16, show_default=True, help="Windows in a batch of `ad`.")
+@click.option("--length", type=COUNT, default=200, show_default=True, help="Steps of a window of `ad`.")
+@click.option("--steps", type=COUNT, default=2, show_default=True, help="Training steps in a round of `ad`.")
+@click.option("--acting-steps", type=COUNT, default=10, show_default=True, help="Exact steps in a round, 10x cached.")
+@click.option("--episodes", type=COUNT, default=100, show_default=True, help="Episodes of each of the 160 tasks.")
+@click.option("--tasks", type=COUNT, default=5, show_default=True, help="Tasks to compare acting on.")
+def main(
+    parts: tuple[str, ...],
+    layout: str,
+    rounds: int,
+    profiles: tuple[str, ...],
+    peer: Path | None,
+    sizes: tuple[str, ...],
+    encoders: tuple[EncoderKind, ...],
+    **numbers: int,
+) -> None:
+    """Measure the speed of learning egos and of training and playing sequence models; one JSON line each."""
+    if "jaxmarl" in parts and not peer:
+        raise click.UsageError("--part jaxmarl: expected --peer FILE, a copy of JaxMARL's ippo_rnn_overcooked_v2.py")
+    parts, here = parts or tuple(part for part in PARTS if peer or part != "jaxmarl"), get_layout(layout)
+    loaded = {profile.name: profile for profile in map(load_profile, profiles)}
+    threads = [profile.xla_threads for profile in loaded.values() if profile.xla_threads]
+    if threads and set(parts) == {"ego"}:  # sequence models use all cores
+        limit_xla_threads(threads[-1])
+    if "ego" in parts:
+        compare_egos(here, {name: profile.ego for name, profile in loaded.items()}, rounds)
+    if "jaxmarl" in parts and peer:
+        compare_jaxmarl(peer, here, numbers["environments"], rounds)
+    dataset = load_icrl4aht(split="train", source="ppo", layout=here.name, obs="state")[:8]
+    options = TrainOptions(batch_size=numbers["batch"], context=numbers["length"])
+    for size in sizes:
+        if "ad" in parts:
+            compare_training(dataset, size, encoders, options, numbers["steps"], rounds)
+        if "act" in parts:
+            compare_acting(here, size, numbers["acting_steps"], rounds, numbers["tasks"])
+        if "tasks" in parts:
+            evaluate_all_tasks(size, replace(PROTOCOLS["seeded"], episodes=numbers["episodes"]))
+
+
+if __name__ == "__main__":
+    main()

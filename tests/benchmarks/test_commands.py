@@ -1,0 +1,152 @@
+"""The benchmarks on the smallest scale: they run, and their figures are consistent."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from icrl4aht_baselines.methods.options import SIZES, ModelSize
+from icrl4aht_generation.teammates.instances import published_tasks
+
+from benchmarks import bench_collect, bench_env, bench_learn, bench_loader
+from benchmarks.bench_learn import published_batches
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.writing.published import to_published
+
+
+def run(module: Any, options: str) -> list[dict[str, Any]]:
+    """The JSON lines of a benchmark."""
+    result = CliRunner().invoke(module.main, options.split(), catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return [json.loads(line) for line in result.stdout.splitlines() if line.startswith("{")]
+
+
+def check_ratio(line: dict[str, Any], peer: str) -> None:
+    """Check the ratio of one round."""
+    assert line["ratio_min"] == line["ratio"] == line["ratio_max"]
+    assert line["ratio"] == pytest.approx(line["steps_per_second"] / line[f"{peer}_steps_per_second"], rel=2e-3)
+
+
+@pytest.mark.slow
+def test_collection(built):
+    speed, size = run(bench_collect, f"speed bytes --profile {built / 'tiny.toml'} --updates 3 --streams 1")
+    assert speed["recorded_transitions_per_second"] > 0
+    assert 0 < speed["recording_and_writing_share"] < 1
+    assert size["paper_bytes_per_transition"] > size["full_bytes_per_transition"] > size["lite_bytes_per_transition"]
+
+
+@pytest.mark.slow
+def test_environments(monkeypatch):
+    monkeypatch.setattr(bench_env, "STEPS", 8)
+    lines = run(bench_env, "--layout cramped_up --environments 2 --rounds 1")
+    assert [line["written"] for line in lines] == ["uint8", "state", "float32"]
+    for line in lines:
+        check_ratio(line, "jaxmarl")
+
+
+SCRIPT = """
+import hydra, jax, jaxmarl, wandb
+from omegaconf import OmegaConf
+
+def make_train(config):
+    env = jaxmarl.make(config["ENV_NAME"], **config["ENV_KWARGS"])
+    print("training", env.name, config["TOTAL_TIMESTEPS"], config["NUM_ENVS"])
+
+    def train(rng):
+        obs, state = env.reset(rng)
+        return env.step(rng, state, dict.fromkeys(env.agents, 0))[2]["agent_0"]
+
+    return train
+
+@hydra.main(version_base=None)
+def main(config):
+    wandb.log(OmegaConf)
+"""
+
+
+@pytest.mark.slow
+def test_jaxmarls_learner_gets_both_environments(tmp_path, monkeypatch):
+    """Both environments are passed to the script of `--peer`: here a small one, as JaxMARL's package has none."""
+    monkeypatch.setattr("jaxmarl.make", None)  # restored after the test
+    script = tmp_path / "ippo.py"
+    script.write_text(SCRIPT)
+    options = ["--layout", "cramped_up", "--environments", "2", "--rollout", "4", "--rounds", "1", "--peer", script]
+    result = CliRunner().invoke(bench_env.main, list(map(str, options)), catch_exceptions=False)
+    *said, last = result.stdout.splitlines()
+    assert said == ["training icrl4aht_cramped_up 80 2", "training Overcooked V2 80 2"]
+    check_ratio(json.loads(last), "jaxmarl")
+
+
+@pytest.mark.slow
+def test_readers(tmp_path):
+    options = "--histories 2 --batch 3 --length 100 --rounds 1 --threads 1 --lines 300"
+    *read, first, _, _ = run(bench_loader, f"--folder {tmp_path} {options}")
+    assert len(read) == 2 * (4 + 3 + 3)
+    for line in read:
+        check_ratio(line, line["peer"])
+    assert {line["least_ratio"] for line in read if "least_ratio" in line} == {8000, 400, 200, None}
+    assert (first["opening"], first["lines"]) == ("first", 300)
+
+
+def test_the_reader_of_the_published_format_makes_the_same_windows(lite, tmp_path):
+    dataset = load_icrl4aht(lite[0], layout="demo_wide")
+    to_published(dataset, tmp_path / "published", states=False)
+    sampler = dataset.ad(batch_size=8, length=100, seed=3)
+    for i, batch in zip(range(3), published_batches(tmp_path / "published", sampler), strict=False):
+        ours = sampler[i]
+        for name in ("obs", "target_actions", "dones", "attention_mask", "is_first"):
+            np.testing.assert_array_equal(getattr(batch, name), getattr(ours, name), err_msg=name)
+        np.testing.assert_array_equal(batch.prev_actions[:, 1:], ours.prev_actions[:, 1:])
+        assert not batch.prev_rewards[:, 0].any()
+
+
+PROFILE = """
+[ego]
+total_steps = 4000
+environments = 2
+rollout = 20
+minibatches = 1
+widths = {{ encoder = "{encoder}", pointwise = [4], spatial = [4], dense = 4, gru = 4, head = 4 }}
+
+[release]
+data_version = "0.0.1"
+keep = 1
+
+[tasks]
+layouts = ["cramped_up"]
+presets = ["default"]
+"""
+
+
+@pytest.mark.slow
+def test_egos_of_profiles(tmp_path):
+    options = "--part ego --layout cramped_up --rounds 1"
+    for encoder in ("paper", "mlp"):
+        path = tmp_path / f"{encoder}.toml"
+        path.write_text(PROFILE.format(encoder=encoder))
+        options += f" --profile {path}"
+    first, second = run(bench_learn, options)
+    assert [(line["profile"], line["encoder"]) for line in (first, second)] == [("paper", "paper"), ("mlp", "mlp")]
+    assert first["ratio"] == 1
+    check_ratio(second, "paper")
+
+
+@pytest.mark.slow
+def test_sequence_models(monkeypatch):
+    monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 8, 5, heads=2, context=6, encoder="mlp"))
+    tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"][:1]
+    monkeypatch.setattr(bench_learn, "published_tasks", lambda track: tasks)
+    parts = "--part ad --part act --part tasks --encoder mlp --batch 2 --length 6 --steps 1"
+    training, acting, all_tasks = run(bench_learn, f"{parts} --acting-steps 2 --episodes 1 --tasks 1 --rounds 1")
+    check_ratio(training, "published")
+    check_ratio(acting, "exact")
+    assert (all_tasks["tasks"], all_tasks["episodes"]) == (2, 1)
+
+
+def test_the_peer_needs_its_file():
+    result = CliRunner().invoke(bench_learn.main, ["--part", "jaxmarl"])
+    assert result.exit_code == 2
+    assert "--peer FILE" in result.output
