@@ -24,6 +24,9 @@ from icrl4aht_data.utils.system import in_slices
 _SLAB = 8192  # steps rendered at a time: fewer cost more in calls than they save in cache misses
 _IMPOSSIBLE = -(2**40)  # makes every sum of lookups negative
 _TIMERS = 32  # values of a timer's five bits
+_ON_COUNTER, _ON_BUTTON, _IN_POT = 0, 256, 512
+"""First patch of each kind of cell. An item byte b on a counter is patch b, a lit button that shows recipe byte b patch
+256 + b, and a pot with item byte b and timer t patch 512 + 256 * t + b."""
 
 
 def fast_observe(
@@ -80,14 +83,16 @@ class _Renderer:
 
     def render(self, record: np.ndarray, out: np.ndarray) -> None:
         """Render uint8 (n, S) into (n, 25, C)."""
-        # The first eight columns as pairs of bytes: positions, facings, hands, and recipe with delivery.
+        # The first eight columns as pairs of bytes, the ego's in the low byte: with the ego on cell 17 and the teammate
+        # on cell 20, `positions` is 17 + 20 * 256 = 5137. One lookup by a pair replaces two by bytes and their sum.
         positions, facings, hands, recipe = record[:, :8].copy().view("<u2").T.astype(np.intp)
         background = self._by_positions.take(positions)
         background += self._by_recipe.take(recipe)
         if background.min() < 0 or (facings & 0xFCFC).any() or (record[:, self._columns.pot_timers] >= _TIMERS).any():
-            # The rules make no such record, so the lookup tables do not have it.
+            # The rules make no such record, so the lookup tables do not have it: one is enough for the slow way.
             out.reshape(len(out), *self._shape)[...] = self._observe(record)
             return
+        # The default mode would write into a copy of `out` first, to leave it as it is if an index is out of range.
         np.take(self._background, background, axis=0, out=out.reshape(len(out), -1), mode="clip")
         cells = out.reshape(-1, self._shape[-1])
         self._render_agents(positions, facings, hands, cells)
@@ -98,6 +103,7 @@ class _Renderer:
 
     def _render_agents(self, positions: np.ndarray, facings: np.ndarray, hands: np.ndarray, cells: np.ndarray) -> None:
         ego = _as_items(cells[:, : self._agent])
+        # An agent's appearance is numbered facing * 256 + item byte.
         ego[CENTRE::VISIBLE] = self._agents.take(((facings & 255) << 8) + (hands & 255))
         where = self._teammate_in_window.take(positions)
         seen = np.flatnonzero(where != NOWHERE)
@@ -113,13 +119,16 @@ class _Renderer:
         seen = np.flatnonzero(where != NOWHERE)
         row, cell, where = row[seen], cell[seen], where[seen]
         flat, start = np.ascontiguousarray(record).reshape(-1), row * record.shape[1]
+        # A pot with item byte 8, two pieces of ingredient 0, and timer 0 shows patch 512 + 8; with item byte 12 and timer
+        # 19, a full pot that cooks, patch 512 + 19 * 256 + 12. It is copied onto the pot's cell in the ego's window.
         patch = self._first_patch.take(cell) + flat.take(start + self._patch_column.take(cell))
         pots = np.flatnonzero(cell < self._pots)
-        patch[pots] += flat.take(start[pots] + self._columns.pot_timers.start + cell[pots]).astype(np.intp) << 8
+        timers = flat.take(start[pots] + self._columns.pot_timers.start + cell[pots]).astype(np.intp)
+        patch[pots] += timers * 256
         _as_items(cells[:, self._first :])[row * VISIBLE + where] = self._patches.take(patch)
 
     def _make_pair_lookups(self) -> None:
-        """Lookup tables by a pair of bytes, low byte first: intp (2**16,), negative where the rules exclude the pair.
+        """Make lookup tables by a pair of bytes, low byte first: intp (2**16,), negative where the rules exclude the pair.
 
         The first two sum up to a row of the background.
         """
@@ -131,18 +140,18 @@ class _Renderer:
         self._teammate_in_window = np.where(on_map, self._in_window[low % cells, high % cells], NOWHERE)
 
     def _make_cell_lookups(self) -> None:
-        """Lookup tables by the number of a cell that changes: pots first, then buttons, then counters."""
+        """Make lookup tables by the number of a cell that changes: pots first, then buttons, then counters."""
         layout, where = self._layout, self._columns
         pots, buttons, counters = map(len, (layout.pots, layout.buttons, layout.counters))
         self._pots = pots
         self._cell_columns = np.r_[where.pot_items, where.buttons, where.counters]
         self._cell_in_window = self._in_window[:, [*layout.pots, *layout.buttons, *layout.counters]].reshape(-1)
-        self._first_patch = np.repeat([512, 256, 0], (pots, buttons, counters))
+        self._first_patch = np.repeat([_IN_POT, _ON_BUTTON, _ON_COUNTER], (pots, buttons, counters))
         # A lit button shows the recipe, whatever its own timer says.
-        self._patch_column = np.where(self._first_patch == 256, where.recipe, self._cell_columns)
+        self._patch_column = np.where(self._first_patch == _ON_BUTTON, where.recipe, self._cell_columns)
 
     def _make_background(self) -> np.ndarray:
-        """(floor * recipes * 2, 25 * C): all but agents and items, by the ego's cell, recipe and delivery."""
+        """Return all but agents and items by the ego's cell, recipe and delivery, (floor * recipes * 2, 25 * C)."""
         shape = len(self._floor), len(self._recipes), 2
         record = np.zeros((*shape, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., self._columns.recipe] = self._floor[:, None, None], self._recipes[:, None]
@@ -152,7 +161,7 @@ class _Renderer:
         return obs.reshape(np.prod(shape), -1).astype(self._dtype)
 
     def _make_agents(self) -> np.ndarray:
-        """(4 * 256, A): an agent's channels by facing and item byte."""
+        """Return an agent's channels by facing and item byte, (4 * 256, A)."""
         record = np.zeros((4, 256, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., 1] = self._floor[0], self._floor[-1]
         record[..., self._columns.facings] = np.arange(4)[:, None, None]
@@ -161,10 +170,7 @@ class _Renderer:
         return obs[:, CENTRE, : self._agent].astype(self._dtype)
 
     def _make_patches(self) -> np.ndarray:
-        """(512 + 32 * 256, C - first): what changes on a cell.
-
-        By the item byte on a counter, then by the recipe on a lit button, then by timer and item byte of a pot.
-        """
+        """Return what changes on a cell, (512 + 32 * 256, C - first), numbered as said at `_ON_COUNTER`."""
         layout, where = self._layout, self._columns
         every_byte = np.arange(256, dtype=np.uint8)
         record = np.zeros((2 + _TIMERS, 256, record_size(layout)), np.uint8)
@@ -185,12 +191,12 @@ class _Renderer:
 
 
 def _as_items(rows: np.ndarray) -> np.ndarray:
-    """(n, k) -> (n,): each row as one opaque item, which NumPy copies at once."""
+    """Return rows (n, k) as (n,) opaque items, which NumPy copies at once instead of value by value."""
     return rows.view(np.dtype((np.void, rows.shape[-1] * rows.itemsize)))[..., 0]
 
 
 def _index_of(values: np.ndarray) -> np.ndarray:
-    """intp (256,): the position of each byte among the values, or a large negative number."""
+    """Return the position of each byte among the values, intp (256,), or a large negative number."""
     lookup = np.full(256, _IMPOSSIBLE, np.intp)
     lookup[values] = np.arange(len(values))
     return lookup

@@ -7,7 +7,6 @@ a digit = ingredient pile, a space = floor. Source: paper, App. A.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 from string import digits
 
@@ -163,17 +162,13 @@ class Layout:
         return first, second
 
     def _room(self, start: int) -> np.ndarray:
-        seen, queue = {start}, deque([start])
-        while queue:
-            cell = queue.popleft()
-            for dx, dy in STEP.values():
-                x, y = cell % self.width + dx, cell // self.width + dy
-                inside = 0 <= x < self.width and 0 <= y < self.height
-                neighbour = y * self.width + x
-                if inside and self.kinds[neighbour] == EMPTY and neighbour not in seen:
-                    seen.add(neighbour)
-                    queue.append(neighbour)
-        return np.array(sorted(seen), np.uint8)
+        floor = set((self.kinds == EMPTY).nonzero()[0].tolist())
+        room, edge = set(), {start}
+        while edge:
+            room |= edge
+            # A step off the map's edge may arrive in another row, but a map whose edge can be reached is refused.
+            edge = {cell + dy * self.width + dx for cell in edge for dx, dy in STEP.values()} & floor - room
+        return np.array(sorted(room), np.uint8)
 
     @cached_property
     def walkable(self) -> np.ndarray:
@@ -185,11 +180,8 @@ class Layout:
     @cached_property
     def ahead(self) -> np.ndarray:
         """uint8 (cells, 4): the cell that an agent on a walkable cell faces, by facing; 0 elsewhere."""
-        table = np.zeros((self.cells, 4), np.uint8)
-        for facing, name in enumerate(FACINGS):
-            dx, dy = STEP[name]
-            table[self.walkable, facing] = self.walkable.nonzero()[0] + dy * self.width + dx
-        return table
+        steps = [dy * self.width + dx for dx, dy in (STEP[name] for name in FACINGS)]
+        return np.where(self.walkable[:, None], np.arange(self.cells)[:, None] + steps, 0).astype(np.uint8)
 
     @cached_property
     def moves(self) -> np.ndarray:
@@ -221,14 +213,10 @@ class Layout:
     @cached_property
     def window(self) -> np.ndarray:
         """int16 (cells, 25): the cells of the 5 x 5 window centred on a cell, in reading order; -1 outside the map."""
-        table = np.full((self.cells, VISIBLE), -1, np.int16)
-        reach = WINDOW // 2
-        for cell in range(self.cells):
-            for k in range(VISIBLE):
-                x, y = cell % self.width + k % WINDOW - reach, cell // self.width + k // WINDOW - reach
-                if 0 <= x < self.width and 0 <= y < self.height:
-                    table[cell, k] = y * self.width + x
-        return table
+        cell, position, reach = np.arange(self.cells)[:, None], np.arange(VISIBLE), WINDOW // 2
+        x, y = cell % self.width + position % WINDOW - reach, cell // self.width + position // WINDOW - reach
+        inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        return np.where(inside, y * self.width + x, -1).astype(np.int16)
 
     @cached_property
     def window_position(self) -> np.ndarray:

@@ -1,9 +1,13 @@
-"""Samplers of each kind, and equality of batches."""
+"""Samplers of each kind, equality of batches, a digest of batches."""
 
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
+
 import numpy as np
 
+from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.reading.sources import CacheMode
 
 CACHES: tuple[CacheMode, ...] = ("ram", "mmap", "stream")
@@ -24,3 +28,19 @@ def assert_equal(one, two) -> None:
     assert one._fields == two._fields
     for name, array in one._asdict().items():
         np.testing.assert_array_equal(array, getattr(two, name), err_msg=name, strict=True)
+
+
+def digest(root: Path) -> str:
+    """Return the SHA-256 of a few batches of each kind and order."""
+    dataset = load_icrl4aht(root, layout="demo_wide")
+    samplers = [
+        dataset.ad(batch_size=5, length=40, seed=7, teammate_actions=True),
+        dataset.dpt(batch_size=5, context=12, seed=7),
+        dataset.dpt(batch_size=5, context=12, seed=7, order="random"),
+    ]
+    state = hashlib.sha256()
+    for sampler in samplers:
+        for i in (0, 1, 1000):
+            for name, array in sampler[i]._asdict().items():
+                state.update(name.encode() + (b"" if array is None else array.tobytes()))
+    return state.hexdigest()
