@@ -298,11 +298,11 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
     tasks = h4_tasks()[: sizes.tasks]
     method = ad_method(architecture(sizes, size, encoder, "float32"), [layout])
     policy = learned(method, method.init(jax.random.key(0)), context)
-    protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps)
+    protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps, episodes=sys.maxsize)
     started = time.perf_counter()
     prepared = prepare_rollout(lambda layout: policy, tasks, protocol, range(seeds))
     compile_seconds = time.perf_counter() - started
-    episodes = play_episodes(prepared, sys.maxsize)
+    episodes = play_episodes(prepared)
     filling, shortest = -(-context // sizes.episode_steps), 2 * -(-context // 5 // sizes.episode_steps)
     for _ in islice(episodes, filling):  # from here on the oldest fifth is dropped again and again
         pass

@@ -186,8 +186,9 @@ def untrained_ad(layout: Layout, size: str, acting: Acting) -> Policy:
 
 def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -> Callable[[], None]:
     """Return a compiled call that plays one episode of every task with a full window."""
-    protocol, policy = replace(PROTOCOLS["seeded"], steps=steps), untrained_ad(tasks[0].layout, size, acting)
-    episodes = play_episodes(prepare_rollout(lambda layout: policy, tasks, protocol), sys.maxsize)
+    protocol = replace(PROTOCOLS["seeded"], steps=steps, episodes=sys.maxsize)
+    policy = untrained_ad(tasks[0].layout, size, acting)
+    episodes = play_episodes(prepare_rollout(lambda layout: policy, tasks, protocol))
     # Exact acting computes all K positions from the first step on, cached acting only those in the window.
     for _ in range(-(-SIZES[size].context // steps) if acting == "cached" else 1):
         next(episodes)

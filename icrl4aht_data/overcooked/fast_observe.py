@@ -119,8 +119,8 @@ class _Renderer:
         seen = np.flatnonzero(where != NOWHERE)
         row, cell, where = row[seen], cell[seen], where[seen]
         flat, start = np.ascontiguousarray(record).reshape(-1), row * record.shape[1]
-        # A pot with item byte 8, two pieces of ingredient 0, and timer 0 shows patch 512 + 8; with item byte 12 and timer
-        # 19, a full pot that cooks, patch 512 + 19 * 256 + 12. It is copied onto the pot's cell in the ego's window.
+        # A pot with item byte 8, two pieces of ingredient 0, and timer 0 shows patch 512 + 8; a full pot that cooks, with
+        # item byte 12 and timer 19, patch 512 + 19 * 256 + 12. It is copied onto the pot's cell in the window.
         patch = self._first_patch.take(cell) + flat.take(start + self._patch_column.take(cell))
         pots = np.flatnonzero(cell < self._pots)
         timers = flat.take(start[pots] + self._columns.pot_timers.start + cell[pots]).astype(np.intp)
@@ -128,7 +128,7 @@ class _Renderer:
         _as_items(cells[:, self._first :])[row * VISIBLE + where] = self._patches.take(patch)
 
     def _make_pair_lookups(self) -> None:
-        """Make lookup tables by a pair of bytes, low byte first: intp (2**16,), negative where the rules exclude the pair.
+        """Make lookup tables by a pair of bytes, low byte first: intp (2**16,), negative for pairs that cannot occur.
 
         The first two sum up to a row of the background.
         """
