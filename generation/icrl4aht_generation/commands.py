@@ -14,7 +14,7 @@ from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TESTED_ON, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
-from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
+from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import (
     COUNT,
     LAYOUT,
@@ -29,6 +29,7 @@ from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_generation.collection.options import CollectOptions, allocate_gpu_memory_on_demand, request_determinism
 from icrl4aht_generation.learners.config import PPOConfig, Widths
@@ -63,11 +64,12 @@ _threads_option = click.option(
 
 
 @click.command(
+    cls=TopicCommand,
     epilog=examples(
         "icrl4aht-data generate --profile smoke --out build/smoke",
         "icrl4aht-data generate --profile mini --out build/mini --kind lite --kind full",
         "icrl4aht-data generate --profile paper --out build/paper --executor ray",
-    )
+    ),
 )
 @_profile_option
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write artefacts and releases here.")
@@ -92,9 +94,8 @@ _threads_option = click.option(
     show_default="the profile's tasks",
 )
 @click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
-@_threads_option
-@dataclass_options(CollectOptions, "collect")
-@_ego_options
+@topic("Machines", _threads_option, dataclass_options(CollectOptions, "collect"))
+@topic("Egos, instead of the profile's values", _ego_options)
 def generate(
     profile_name: str,
     out: Path,
@@ -120,7 +121,7 @@ def generate(
 
     if bundle and "lite" not in kind:
         raise click.UsageError("--bundle needs --kind lite")
-    options = replace_given(CollectOptions(), collect)
+    options = replace_options(CollectOptions(), collect)
     if options.executor == "local" and (options.address or options.workers):
         raise click.UsageError("--address and --workers need --executor ray")
     request_determinism()

@@ -1,139 +1,148 @@
-"""Command-line options made from options dataclasses.
+"""Command-line options made from classes of options, see `icrl4aht_data.utils.options`.
 
-    @click.command()
+    @click.command(cls=TopicCommand)
     @dataclass_options(TrainOptions, "train", default_text={"steps": "the size's"})
     def run(train: dict[str, Any]) -> None:
-        options = replace_given(TrainOptions(), train)
+        options = replace_options(TrainOptions(), train)
 
-One option per field that `icrl4aht_data.utils.options.option_field` made: `learning_rate` becomes
-`--learning-rate`. Only values that were given on the command line are passed on, so that a command may start from other
-values than the dataclass's defaults (a profile, a size) without repeating any of them.
+Only values that were given on the command line are passed on, so that a command may start from other values than the
+defaults (a profile, a size) without repeating any of them.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Collection, Iterator, Mapping
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_args, get_origin
 
 import click
+from msgspec import Meta
 
-from icrl4aht_data.utils.options import FieldBounds, OptionField, option_fields
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.utils.options import Option, annotation_parts, convert_option, option_choices, option_hints
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-Options = TypeVar("Options")
-
-_PLAIN_TYPES = {str: click.STRING, Path: click.Path(path_type=Path)}
 
 
-class FiniteRange(click.FloatRange):
-    """A `click.FloatRange` that also refuses nan and infinity, which satisfy every comparison that it makes."""
+class TopicCommand(click.Command):
+    """Command whose help lists options under the headings that `topic` gave them, and the others under "Options"."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value} is not a finite number.", param, ctx)
-        return number
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        topics: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            if isinstance(param, click.Option) and (record := param.get_help_record(ctx)):
+                topics.setdefault(getattr(param, "topic", "Options"), []).append(record)
+        for heading, records in topics.items():
+            with formatter.section(heading):
+                formatter.write_dl(records)
 
 
-def dataclass_options(
-    kind: type, argument: str, *, exclude: Collection[str] = (), default_text: Mapping[str, str] | None = None
-) -> Callable[[Command], Command]:
-    """Returns a decorator that adds an option for every option field of a dataclass, also of dataclasses in its fields.
-
-    Args:
-        kind: the dataclass. Bool fields become flags, with a `--no-` form if their default is True; tuples become
-            options that may be repeated; Literal fields are a choice.
-        argument: name of the command's argument that receives a dict, field name -> value, of the options given by
-            the user. `replace_given` puts them into an instance.
-        exclude: names of fields without an option in this command.
-        default_text: field name -> text shown as its default, where the command starts from other values.
-    """
-    chosen = [field for field in _all_fields(kind) if field.name not in exclude]
-    texts = default_text or {}
+def topic(heading: str, *options: Callable[[Any], Any]) -> Callable[[Command], Command]:
+    """Return a decorator that adds options, which the help of a `TopicCommand` lists under a heading."""
 
     def decorate(command: Command) -> Command:
-        @functools.wraps(command)
-        def collect(*args: Any, **values: Any) -> Any:
-            passed = {field.name: values.pop(field.name) for field in chosen}
-            values[argument] = {name: value for name, value in passed.items() if value not in (None, ())}
-            return command(*args, **values)
-
-        decorated: Any = collect
-        for field in reversed(chosen):
-            decorated = _option(field, texts.get(field.name))(decorated)
+        decorated: Any = command
+        before = len(getattr(decorated, "__click_params__", ()))
+        for option in reversed(options):
+            decorated = option(decorated)
+        for param in decorated.__click_params__[before:]:
+            param.topic = heading
         return decorated
 
     return decorate
 
 
-def replace_given(options: Options, given: Mapping[str, Any]) -> Options:
-    """Returns a copy of a dataclass instance with the given fields replaced, at any depth of nested dataclasses.
+class OptionValue(click.ParamType):
+    """Value of an option, with the type and bounds of an annotation.
 
     Args:
-        options: an instance of the dataclass that the options were made from.
-        given: field name -> value, as `dataclass_options` passes it.
-
-    Raises:
-        OptionError: from the dataclass's own validation.
+        hint: the annotation, such as `Annotated[int, Meta(ge=1)]`.
     """
-    instance: Any = options
-    changes = {}
-    for field in dataclasses.fields(instance):
-        value = getattr(instance, field.name)
-        if dataclasses.is_dataclass(value):
-            changes[field.name] = replace_given(value, given)
-        elif field.name in given:
-            changes[field.name] = given[field.name]
-    return dataclasses.replace(instance, **changes)
+
+    def __init__(self, hint: Any) -> None:
+        kinds = {int: "integer", float: "float"}
+        self._hint, self.choices = hint, option_choices(hint)
+        self.name = next((name for kind, name in kinds.items() if kind in annotation_parts(hint)), "text")
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return convert_option(param.name if param and param.name else "value", value, self._hint, strict=False)
+        except (OptionError, UnknownNameError) as error:
+            self.fail(str(error), param, ctx)
 
 
-def _all_fields(kind: type) -> Iterator[OptionField]:
-    """Yields the option fields of a dataclass, then those of the dataclasses that are its fields' default factories."""
-    yield from option_fields(kind)
+class _Field(NamedTuple):
+    path: tuple[str, ...]
+    default: Any
+    hint: Any
+
+
+def dataclass_options(
+    kind: type, argument: str, *, exclude: Collection[str] = (), default_text: Mapping[str, str] | None = None
+) -> Callable[[Command], Command]:
+    """Return a decorator that adds an option for every option field of a dataclass, also of dataclasses in its fields.
+
+    Args:
+        kind: the dataclass. Bool fields become flags, with a `--no-` form if their default is True; tuples become
+            options that may be repeated.
+        argument: name of the command's argument that receives a dict, field -> value, of the options given by the user,
+            nested as the dataclasses are, see `icrl4aht_data.utils.options.replace_options`.
+        exclude: names of fields without an option in this command.
+        default_text: field name -> text shown as its default, where the command starts from other values.
+    """
+    chosen = [field for field in _all_fields(kind) if field.path[-1] not in exclude]
+    texts = default_text or {}
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def collect(*args: Any, **values: Any) -> Any:
+            given: dict[str, Any] = {}
+            for field in chosen:
+                *tables, name = field.path
+                if (value := values.pop(name)) not in (None, ()):
+                    functools.reduce(lambda table, key: table.setdefault(key, {}), tables, given)[name] = value
+            return command(*args, **values, **{argument: given})
+
+        decorated: Any = collect
+        for field in reversed(chosen):
+            decorated = _option(field, texts.get(field.path[-1]))(decorated)
+        return decorated
+
+    return decorate
+
+
+def _all_fields(kind: type, path: tuple[str, ...] = ()) -> Iterator[_Field]:
+    """Yield the option fields of a dataclass, then those of the dataclasses that are its fields' default factories."""
+    hints = option_hints(kind)
     for field in dataclasses.fields(kind):
-        if dataclasses.is_dataclass(field.default_factory):
-            yield from _all_fields(field.default_factory)  # type: ignore[arg-type]
+        if field.name in hints:
+            yield _Field((*path, field.name), field.default, hints[field.name])
+    for field in dataclasses.fields(kind):
+        if isinstance(field.default_factory, type):
+            yield from _all_fields(field.default_factory, (*path, field.name))
 
 
-def _option(field: OptionField, default_text: str | None) -> Callable[[Any], Any]:
-    flag = "--" + field.name.replace("_", "-")
-    common: dict[str, Any] = {"default": None, "help": field.bounds.help}
-    shown = default_text or field.bounds.default_text
-    if field.type is bool:
-        both = f"{flag}/--no-{flag[2:]}" if field.default is True else flag
-        if field.default is True or shown:
-            common["show_default"] = shown or flag[2:]
-        return click.option(both, *field.bounds.flags, field.name, is_flag=True, **common)
-    if shown is None and field.default not in (None, dataclasses.MISSING):
-        shown = ", ".join(map(str, field.default)) if field.repeated else str(field.default)
-    return click.option(
-        flag,
-        *field.bounds.flags,
-        field.name,
-        type=_parameter_type(field),
-        multiple=field.repeated,
-        show_default=shown or False,
-        **common,
-    )
-
-
-def _parameter_type(field: OptionField) -> click.ParamType:
-    if field.choices:
-        return click.Choice(field.choices)
-    if field.type in _PLAIN_TYPES:
-        return _PLAIN_TYPES[field.type]
-    return _number_range(field.type, field.bounds)
-
-
-def _number_range(kind: type, bounds: FieldBounds) -> click.ParamType:
-    ranges: Any = click.IntRange if kind is int else FiniteRange
-    return ranges(
-        min=bounds.at_least if bounds.above is None else bounds.above,
-        max=bounds.at_most if bounds.below is None else bounds.below,
-        min_open=bounds.above is not None,
-        max_open=bounds.below is not None,
-    )
+def _option(field: _Field, default_text: str | None) -> Callable[[Any], Any]:
+    about = next(part for part in get_args(field.hint) if isinstance(part, Option))
+    name, hint, default = field.path[-1], get_args(field.hint)[0], field.default
+    flag, shown, repeated = "--" + name.replace("_", "-"), default_text or about.default, get_origin(hint) is tuple
+    settings: dict[str, Any] = {"default": None, "show_default": False}
+    if hint is bool:
+        settings["is_flag"], flag = True, f"{flag}/--no-{flag[2:]}" if default is True else flag
+        shown = shown or (flag.partition("/")[0][2:] if default is True else None)
+    else:
+        settings |= {"type": OptionValue(get_args(hint)[0] if repeated else field.hint), "multiple": repeated}
+        if choices := option_choices(hint):
+            settings["metavar"] = "|".join(choices)
+        if shown is None and default is not None:
+            shown = ", ".join(map(str, default)) if repeated else str(default)
+    notes = [f"default: {shown}"] * bool(shown) + [
+        f"{sign} {bound:.10g}"
+        for meta in annotation_parts(field.hint)
+        if isinstance(meta, Meta)
+        for sign, bound in ((">=", meta.ge), (">", meta.gt), ("<=", meta.le), ("<", meta.lt))
+        if bound is not None
+    ]
+    help = about.help + (f"  [{'; '.join(notes)}]" if notes else "")
+    return click.option(flag, *about.flags, name, help=help, **settings)

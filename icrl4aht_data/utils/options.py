@@ -1,15 +1,16 @@
-"""Fields of options dataclasses: default, help text and bounds of a hyper-parameter, stated once.
+"""Options: classes whose fields state types, bounds and help texts once, and checks of single arguments.
 
-A dataclass made of such fields validates itself with `check_fields`, and `icrl4aht_data.commands.dataclass_options`
-makes command-line options from it. A module that defines one should not import JAX, so that `--help` stays fast.
+A class of options is a dataclass that checks itself. The command line (`icrl4aht_data.commands.dataclass_options`),
+TOML and JSON files and Python code all meet the same bounds. A module that defines one imports no JAX, so that `--help`
+stays fast.
 
     @dataclass(frozen=True)
     class Options:
-        steps: int = option_field(1000, "Training steps.", at_least=1)
-        positions: Literal["none", "rope"] = option_field("none", "Position embedding.")
+        steps: Annotated[Count, Option("Training steps.")] = 1000
+        positions: Annotated[Literal["none", "rope"], Option("Position embedding.")] = "none"
 
         def __post_init__(self) -> None:
-            check_fields(self)
+            check_options(self)
 """
 
 from __future__ import annotations
@@ -17,11 +18,125 @@ from __future__ import annotations
 import dataclasses
 import math
 import operator
-from collections.abc import Sequence
-from types import NoneType
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError, PositionError, PositionTypeError, unknown
+
+Count = Annotated[int, Meta(ge=1)]
+Natural = Annotated[int, Meta(ge=0)]
+Seed = Annotated[int, Meta(ge=0, lt=2**32)]
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+ShareBelowOne = Annotated[float, Meta(ge=0, lt=1)]
+
+Options = TypeVar("Options")
+
+
+class Option(NamedTuple):
+    """Annotation of a field that is an option of the command line.
+
+    Attributes:
+        help: one sentence.
+        flags: further names of the option, such as "--ta"; the first is the field's name with dashes.
+        default: text that is shown as its default, for a default that says nothing, such as None.
+    """
+
+    help: str
+    flags: tuple[str, ...] = ()
+    default: str | None = None
+
+
+@cache
+def option_hints(kind: type) -> dict[str, Any]:
+    """Return the fields of a dataclass that are options: name -> annotation."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hint for name, hint in hints.items() if any(isinstance(part, Option) for part in get_args(hint))}
+
+
+def check_options(options: Any) -> None:
+    """Check the values of a dataclass against its annotations; lists become tuples.
+
+    Raises:
+        OptionError: names the field, its value and what was expected.
+        UnknownNameError: for a value that is not among the choices; lists them.
+    """
+    for name, hint in option_hints(type(options)).items():
+        value = getattr(options, name)
+        converted = convert_option(name, value, hint)
+        if isinstance(value, list):
+            object.__setattr__(options, name, converted)
+
+
+def convert_option(name: str, value: Any, hint: Any, strict: bool = True) -> Any:
+    """Return a value as its annotation says.
+
+    Args:
+        name: name of the field, for messages.
+        value: the value.
+        hint: the annotation.
+        strict: refuse texts for numbers; False for the command line.
+
+    Raises:
+        OptionError: if the value does not fit.
+        UnknownNameError: if it is not among the choices.
+    """
+    choices = option_choices(hint)
+    if choices and value is not None and value not in choices:
+        raise unknown(name, value, choices)
+    try:
+        converted = msgspec.convert(value, hint, strict=strict)
+    except msgspec.ValidationError as error:
+        raise OptionError(f"{name} = {value!r:.100}: {str(error).replace('Expected', 'expected')}") from error
+    if isinstance(converted, float) and not math.isfinite(converted):
+        raise OptionError(f"{name} = {value!r}: expected a finite number")
+    return converted
+
+
+def annotation_parts(hint: Any) -> Iterator[Any]:
+    """Yield an annotation and everything that it is composed of: types, bounds, help."""
+    yield hint
+    for part in get_args(hint):
+        yield from annotation_parts(part)
+
+
+def option_choices(hint: Any) -> tuple[Any, ...]:
+    """Return the values of a Literal in an annotation; empty for other types."""
+    return next((get_args(part) for part in annotation_parts(hint) if get_origin(part) is Literal), ())
+
+
+def replace_options(options: Options, values: Mapping[str, Any], where: str = "") -> Options:
+    """Return a copy of a dataclass with other values for some fields, at any depth of nested dataclasses.
+
+    Args:
+        options: an instance.
+        values: field -> value, as in JSON or TOML; for a nested dataclass a mapping.
+        where: name of the instance with a dot, such as "ego.", for messages.
+
+    Raises:
+        OptionError: from the dataclass's own checks, or if a value is no mapping where one is expected.
+        UnknownNameError: for a field that does not exist.
+    """
+    instance: Any = options
+    known = [field.name for field in dataclasses.fields(instance)]
+    changes = {}
+    for name, value in values.items():
+        if name not in known:
+            raise unknown("key", where + name, [where + each for each in known])
+        before = getattr(instance, name)
+        if dataclasses.is_dataclass(before) and not isinstance(value, Mapping):
+            raise OptionError(f"{where}{name} = {value!r}: expected a table")
+        nested = dataclasses.is_dataclass(before)
+        changes[name] = replace_options(before, value, f"{where}{name}.") if nested else value
+    try:
+        return dataclasses.replace(instance, **changes)
+    except OptionError as error:
+        raise OptionError(f"{where}{error}") from error
 
 
 def check_int(name: str, value: Any, least: int) -> int:
@@ -63,142 +178,3 @@ def check_position(sequence: str, position: Any, count: int) -> int:
         within = f"a number from {-count} to {count - 1}" if count else "no position, as it is empty"
         raise PositionError(f"position {number} of {sequence}: expected {within}")
     return number
-
-
-_KEY = "option"
-
-
-class FieldBounds(NamedTuple):
-    """Metadata of an option field: its help text and valid values. A bound of None does not apply.
-
-    Attributes:
-        help: help text of the option.
-        at_least, above: lower bounds, inclusive and exclusive.
-        at_most, below: upper bounds, inclusive and exclusive.
-        flags: further names of the option, such as "--ta".
-        default_text: text shown as the default, for a default that says nothing, such as None.
-        may_be_empty: whether a tuple without values is valid.
-    """
-
-    help: str
-    at_least: float | None = None
-    above: float | None = None
-    at_most: float | None = None
-    below: float | None = None
-    flags: tuple[str, ...] = ()
-    default_text: str | None = None
-    may_be_empty: bool = False
-
-    def describe(self) -> str:
-        """Returns the bounds in words, such as "at least 0 and below 1"."""
-        names = ("at_least", "above", "at_most", "below")
-        bounds = {name.replace("_", " "): getattr(self, name) for name in names}
-        return " and ".join(f"{name} {bound}" for name, bound in bounds.items() if bound is not None)
-
-    def contain(self, value: float) -> bool:
-        """Returns whether a number is finite and within the bounds."""
-        return (
-            math.isfinite(value)
-            and (self.at_least is None or value >= self.at_least)
-            and (self.above is None or value > self.above)
-            and (self.at_most is None or value <= self.at_most)
-            and (self.below is None or value < self.below)
-        )
-
-
-class OptionField(NamedTuple):
-    """An option field with its parsed annotation: `tuple[float, ...]` has the type float and is repeated.
-
-    Attributes:
-        name: name of the field.
-        default: default value.
-        type: int, float, bool, str or Path.
-        choices: values of a Literal; empty for other types.
-        repeated: whether the field is a tuple.
-        optional: whether None is valid.
-        bounds: metadata of the field.
-    """
-
-    name: str
-    default: Any
-    type: Any
-    choices: tuple[Any, ...]
-    repeated: bool
-    optional: bool
-    bounds: FieldBounds
-
-
-def option_field(
-    default: Any,
-    help: str,
-    *,
-    at_least: float | None = None,
-    above: float | None = None,
-    at_most: float | None = None,
-    below: float | None = None,
-    flags: Sequence[str] = (),
-    default_text: str | None = None,
-    may_be_empty: bool = False,
-) -> Any:
-    """Returns a dataclass field that becomes a command-line option.
-
-    Args:
-        default: value of the field if it is not given; immutable. `dataclasses.MISSING` for a required field.
-        help: text of the option, one sentence.
-        at_least, above, at_most, below: bounds of numbers.
-        flags: further names of the option. Its first name is that of the field, with dashes.
-        default_text: shown instead of the default.
-        may_be_empty: whether a tuple without values is valid.
-    """
-    bounds = FieldBounds(help, at_least, above, at_most, below, tuple(flags), default_text, may_be_empty)
-    return dataclasses.field(default=default, metadata={_KEY: bounds})
-
-
-def option_fields(kind: type) -> list[OptionField]:
-    """Returns the fields of a dataclass that were made with `option_field`, in order of definition."""
-    hints = get_type_hints(kind)
-    found = []
-    for field in dataclasses.fields(kind):
-        if _KEY not in field.metadata:
-            continue
-        hint, repeated, choices = hints[field.name], False, ()
-        members = [member for member in get_args(hint) if member is not NoneType]
-        optional = len(members) < len(get_args(hint))
-        if optional:
-            (hint,) = members
-        if get_origin(hint) is tuple:
-            hint, repeated = get_args(hint)[0], True
-        if get_origin(hint) is Literal:
-            hint, choices = type(get_args(hint)[0]), get_args(hint)
-        found.append(OptionField(field.name, field.default, hint, choices, repeated, optional, field.metadata[_KEY]))
-    return found
-
-
-def check_fields(options: Any) -> None:
-    """Validate the values of a dataclass against the choices and bounds of its fields.
-
-    Raises:
-        OptionError: for a number of the wrong type or out of bounds, or an empty tuple where values are required; names
-            the field.
-        UnknownNameError: for a value that is not among the choices; lists them.
-    """
-    for field in option_fields(type(options)):
-        value = getattr(options, field.name)
-        if value is None and field.optional:
-            continue
-        values: Any = value if field.repeated else (value,)
-        if not values and not field.bounds.may_be_empty:
-            raise OptionError(f"{field.name} = {value}: expected one value or more")
-        for item in values:
-            _check_value(field, item)
-
-
-def _check_value(field: OptionField, value: Any) -> None:
-    if field.choices and value not in field.choices:
-        raise unknown(field.name, value, field.choices)
-    if field.type not in (int, float):
-        return
-    numbers = int if field.type is int else (int, float)
-    if not isinstance(value, numbers) or isinstance(value, bool) or not field.bounds.contain(value):
-        noun = "an integer" if field.type is int else "a number"
-        raise OptionError(f"{field.name} = {value}: expected {f'{noun} {field.bounds.describe()}'.strip()}")

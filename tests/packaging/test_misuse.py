@@ -73,10 +73,10 @@ research speed --layout x | unknown layout 'x'; valid: coord_simple,
 teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
 train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline, rl2.
 train ad --layout demo_wide --size smal | unknown size 'smal'; valid: tiny, small, medium, large.
-train ad --layout demo_wide --order rnd | 'rnd' is not one of 'contiguous', 'random'.
-train dpt --layout demo_wide --labels orcale | 'orcale' is not one of 'expert', 'oracle'.
-train ad --layout demo_wide --batch-size 0 | 0 is not in the range x>=1
-train ad --layout demo_wide --learning-rate nan | nan is not a finite number
+train ad --layout demo_wide --order rnd | unknown order 'rnd'; valid: contiguous, random.
+train dpt --layout demo_wide --labels orcale | unknown labels 'orcale'; valid: expert, oracle.
+train ad --layout demo_wide --batch-size 0 | batch_size = '0': expected `int` >= 1
+train ad --layout demo_wide --learning-rate nan | learning_rate = 'nan': expected `float` > 0
 train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
 train ad --layout demo_wide --coordinator a:1 --process 2 | --process 2: expected a number below 1
@@ -84,8 +84,13 @@ train rl2 --layout demo_wide --context 5 | --context: not with rl2, which learns
 train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
 collect --agent none --out c | A trained model is named by its folder
 collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
+<<<<<<< HEAD
 collect --agent stay --out c --noise 2 0 | 2.0 is not in the range 0<=x<=1
 research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, rl2-tests, ad-noise,
+=======
+collect --agent stay --out c --noise 2 0 | noise = '2': expected `float` <= 1
+research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, rl2-oracle, rl2-tests, ad-noise,
+>>>>>>> 92151cb (Options state bounds as annotations that msgspec checks, from TOML, JSON and the command line alike; options by topic)
 research reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states its results
 research reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 results empty | Missing option '--out'

@@ -23,7 +23,7 @@ from icrl4aht_baselines.commands.options import (
 )
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.commands.dataclass_options import FiniteRange
+from icrl4aht_data.commands.dataclass_options import OptionValue
 from icrl4aht_data.commands.options import (
     COUNT,
     COUNT_OR_NONE,
@@ -37,6 +37,7 @@ from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.new_file import check_new_files
+from icrl4aht_data.utils.options import Share
 from icrl4aht_data.utils.progress import progress_bars
 
 _console = Console(soft_wrap=True)
@@ -64,7 +65,7 @@ _console = Console(soft_wrap=True)
 @click.option(
     "--noise",
     nargs=2,
-    type=FiniteRange(min=0, max=1),
+    type=OptionValue(Share),
     default=(0.0, 0.0),
     metavar="START END",
     help="Chance of a random action in a history's first and in its last episode.",

@@ -23,9 +23,10 @@ from icrl4aht_baselines.training.options import (
 )
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.commands.dataclass_options import FiniteRange, dataclass_options
+from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options
 from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, SEED, Folder, Names, Root
 from icrl4aht_data.errors import UnknownNameError
+from icrl4aht_data.utils.options import Positive
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
@@ -127,7 +128,7 @@ tensorboard_option = click.option(
 )
 save_minutes_option = click.option(
     "--save-minutes",
-    type=FiniteRange(min=0, min_open=True),
+    type=OptionValue(Positive),
     default=SAVE_MINUTES,
     help="Most minutes between checkpoints, which are also written every --save-every steps.",
 )

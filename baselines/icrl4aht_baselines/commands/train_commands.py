@@ -44,7 +44,7 @@ from icrl4aht_baselines.commands.options import (
 from icrl4aht_baselines.training.options import HistoryOptions
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
+from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import (
     LAYOUT,
     SEED,
@@ -59,6 +59,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.new_file import check_new_file, check_new_files
+from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars
 
 _console = Console(soft_wrap=True)
@@ -228,6 +229,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
 
 @click.command(
     "train",
+    cls=TopicCommand,
     epilog=examples(
         "icrl4aht-data train ad --layout demo_wide --out runs/ad",
         "icrl4aht-data train dpt --layout demo_wide --ta --out runs/dpt-ta",
@@ -236,28 +238,35 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     ),
 )
 @click.argument("method", type=METHOD_NAME)
-@click.option(
-    "--layout",
-    "layouts",
-    type=TRAINING_LAYOUT,
-    multiple=True,
-    required=True,
-    help="Training layout, such as demo_wide; repeat for several, or all: those that the release has histories of.",
+@topic(
+    "Data",
+    click.option(
+        "--layout",
+        "layouts",
+        type=TRAINING_LAYOUT,
+        multiple=True,
+        required=True,
+        help="Training layout, such as demo_wide; repeat for several, or all: those that the release has histories of.",
+    ),
+    root_option,
+    history_filters,
+    dataclass_options(HistoryOptions, "histories"),
+    hide_recipe_option,
 )
-@root_option
-@click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD")
-@click.option("--init", type=Folder(), metavar="RUN", help="Start from the parameters of this run.")
-@size_option
-@training_options
-@model_options
-@dataclass_options(HistoryOptions, "histories")
-@hide_recipe_option
-@history_filters
-@play_options
-@manifests_option
-@save_minutes_option
-@tensorboard_option
-@process_options
+@topic("Model", size_option, model_options)
+@topic(
+    "Training",
+    click.option("--init", type=Folder(), metavar="RUN", help="Start from the parameters of this run."),
+    training_options,
+)
+@topic("Playing, of rl2 only", play_options, manifests_option)
+@topic(
+    "Run",
+    click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD"),
+    save_minutes_option,
+    tensorboard_option,
+)
+@topic("Machines", process_options)
 def train_command(
     method: str,
     layouts: tuple[str, ...],
@@ -280,10 +289,9 @@ def train_command(
 ) -> None:
     """Train a model on learning histories.
 
-    METHOD is ad, dpt, hybrid_ad or amago_offline, or rl2, which learns by playing with the teammates of the histories;
-    --epochs to --manifest are its own. Writes settings, checkpoints, metrics.jsonl and, with the extra plot, curves.png
-    into OUT; the same command resumes from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a
-    second Ctrl-C does not wait for it.
+    METHOD is ad, dpt, hybrid_ad or amago_offline, or rl2, which learns by playing with the teammates of the histories.
+    Writes settings, checkpoints, metrics.jsonl and, with the extra plot, curves.png into OUT; the same command resumes
+    from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second Ctrl-C does not wait for it.
     """
     join_processes(coordinator, processes, process)
     from icrl4aht_baselines.methods.registry import PLAYING
@@ -293,7 +301,7 @@ def train_command(
     from icrl4aht_baselines.training.trainer import train as run_training
 
     choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
-    choice = replace_given(choice, histories)
+    choice = replace_options(choice, histories)
     folder, plays = out or Path("runs") / method, method in PLAYING
     if plays and processes > 1:
         raise click.UsageError(f"--processes {processes}: {method} is trained by one process on one device")

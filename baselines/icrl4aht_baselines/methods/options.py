@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from icrl4aht_generation.learners.config import EncoderKind
+from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.options import check_fields, option_field
+from icrl4aht_data.utils.options import Count, Option, Positive, ShareBelowOne, check_options
 
 Positions = Literal["none", "rope"]
 """Position embedding of tokens: none, as published, or rotary (Su et al. 2021)."""
@@ -84,31 +85,34 @@ class ModelOptions:
         OptionError: if a value is out of bounds, or the width is not a multiple of twice the heads.
     """
 
-    layers: int = option_field(4, "Layers of the transformer.", at_least=1)
-    width: int = option_field(256, "Width of tokens and features.", at_least=1)
-    heads: int = option_field(4, "Attention heads.", at_least=1)
-    recurrent_layers: int = option_field(2, "GRU layers of Hybrid-AD, in place of the transformer.", at_least=1)
-    dropout: float = option_field(0.1, "Dropout rate in training.", at_least=0, below=1)
-    encoder: EncoderKind = option_field(
-        "paper", "Encoder of observations: paper, words (the same, faster) or mlp (one dense layer)."
+    layers: Annotated[Count, Option("Layers of the transformer.")] = 4
+    width: Annotated[Count, Option("Width of tokens and features.")] = 256
+    heads: Annotated[Count, Option("Attention heads.")] = 4
+    recurrent_layers: Annotated[Count, Option("GRU layers of Hybrid-AD, in place of the transformer.")] = 2
+    dropout: Annotated[ShareBelowOne, Option("Dropout rate in training.")] = 0.1
+    encoder: Annotated[
+        EncoderKind, Option("Encoder of observations: paper, words (the same, faster) or mlp (one dense layer).")
+    ] = "paper"
+    positions: Annotated[Positions, Option("Position embedding: none, as published, or rope.")] = "none"
+    teammate_actions: Annotated[bool, Option("+TA: input the teammate's previous action, too.", flags=("--ta",))] = (
+        False
     )
-    positions: Positions = option_field("none", "Position embedding: none, as published, or rope.")
-    teammate_actions: bool = option_field(False, "+TA: input the teammate's previous action, too.", flags=["--ta"])
-    reward_scale: float = option_field(1.0, "Factor of the rewards in tokens; a delivery earns 20.", above=0)
-    next_obs: bool = option_field(False, "+next_obs: also learn to predict the next observation.")
-    teammate_loss: bool = option_field(False, "With --ta: also learn to predict the teammate's action (ad, hybrid_ad).")
-    label_smoothing: float = option_field(0.0, "Label smoothing of the action loss.", at_least=0, below=1)
-    discounts: tuple[float, ...] = option_field(
-        (0.9, 0.95, 0.99, 0.995),
-        "Discount factor of AMAGO-Offline, which acts by the last one; repeat for several.",
-        at_least=0,
-        below=1,
-    )
-    bfloat16: bool = option_field(False, "Compute in bfloat16; parameters stay float32.")
-    remat: bool = option_field(False, "Recompute activations in the backward pass: less memory, more time.")
+    reward_scale: Annotated[Positive, Option("Factor of the rewards in tokens; a delivery earns 20.")] = 1.0
+    next_obs: Annotated[bool, Option("+next_obs: also learn to predict the next observation.")] = False
+    teammate_loss: Annotated[
+        bool, Option("With --ta: also learn to predict the teammate's action (ad, hybrid_ad).")
+    ] = False
+    label_smoothing: Annotated[ShareBelowOne, Option("Label smoothing of the action loss.")] = 0.0
+    discounts: Annotated[
+        tuple[ShareBelowOne, ...],
+        Meta(min_length=1),
+        Option("Discount factor of AMAGO-Offline, which acts by the last one; repeat for several."),
+    ] = (0.9, 0.95, 0.99, 0.995)
+    bfloat16: Annotated[bool, Option("Compute in bfloat16; parameters stay float32.")] = False
+    remat: Annotated[bool, Option("Recompute activations in the backward pass: less memory, more time.")] = False
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_options(self)
         if self.teammate_loss and not self.teammate_actions:
             raise OptionError("teammate_loss = True: expected teammate_actions as well; give --ta, or leave it out")
         if self.width % (2 * self.heads):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.reading.history import Labels, Obs
 from icrl4aht_data.sampling.dpt import ContextOrder
-from icrl4aht_data.utils.options import check_fields, option_field
+from icrl4aht_data.utils.options import Count, Natural, NotNegative, Option, Positive, Seed, Share, check_options
 
 MOST_REARRANGED = 256
 """Most rearranged versions of a layout to train on; the next ones are for validation."""
@@ -23,22 +25,22 @@ class TrainOptions:
         OptionError: if a value is out of bounds.
     """
 
-    steps: int = option_field(20_000, "Training steps.", at_least=1)
-    batch_size: int = option_field(1024, "Windows or contexts per batch, over all devices and processes.", at_least=1)
-    context: int = option_field(500, "K: steps of a window, or transitions of a context.", at_least=1)
-    learning_rate: float = option_field(1e-3, "Highest learning rate.", above=0)
-    warmup: float = option_field(0.05, "Share of the steps in which the learning rate rises.", at_least=0, at_most=1)
-    weight_decay: float = option_field(0.0, "Weight decay of AdamW.", at_least=0)
-    clip: float = option_field(1.0, "Largest global norm of the gradient.", above=0)
-    accumulate: int = option_field(1, "Parts that a batch is computed in, one after the other.", at_least=1)
-    seed: int = option_field(0, "Seed of parameters, batches and dropout.", at_least=0, below=2**32)
-    log_every: int = option_field(50, "Steps between lines of the log.", at_least=1)
-    validate_every: int = option_field(1000, "Steps between validations.", at_least=1)
-    validation_batches: int = option_field(2, "Batches of each held-out part in a validation.", at_least=0)
-    save_every: int = option_field(1000, "Steps between checkpoints.", at_least=1)
+    steps: Annotated[Count, Option("Training steps.")] = 20_000
+    batch_size: Annotated[Count, Option("Windows or contexts per batch, over all devices and processes.")] = 1024
+    context: Annotated[Count, Option("K: steps of a window, or transitions of a context.")] = 500
+    learning_rate: Annotated[Positive, Option("Highest learning rate.")] = 1e-3
+    warmup: Annotated[Share, Option("Share of the steps in which the learning rate rises.")] = 0.05
+    weight_decay: Annotated[NotNegative, Option("Weight decay of AdamW.")] = 0.0
+    clip: Annotated[Positive, Option("Largest global norm of the gradient.")] = 1.0
+    accumulate: Annotated[Count, Option("Parts that a batch is computed in, one after the other.")] = 1
+    seed: Annotated[Seed, Option("Seed of parameters, batches and dropout.")] = 0
+    log_every: Annotated[Count, Option("Steps between lines of the log.")] = 50
+    validate_every: Annotated[Count, Option("Steps between validations.")] = 1000
+    validation_batches: Annotated[Natural, Option("Batches of each held-out part in a validation.")] = 2
+    save_every: Annotated[Count, Option("Steps between checkpoints.")] = 1000
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_options(self)
 
 
 @dataclass(frozen=True)
@@ -49,28 +51,28 @@ class PlayOptions:
         OptionError: if a value is out of bounds.
     """
 
-    epochs: int = option_field(2, "Passes over the episodes of a step.", at_least=1)
-    minibatches: int = option_field(4, "Parts of a pass, each with an update of the parameters.", at_least=1)
-    discount: float = option_field(
-        0.99, "Discount of rewards, which continue over a task's episodes.", at_least=0, at_most=1
-    )
-    gae_lambda: float = option_field(0.95, "Decay of the advantage estimate's trace.", at_least=0, at_most=1)
-    entropy: float = option_field(0.01, "Weight of the entropy bonus.", at_least=0)
-    task_end: float = option_field(1 / 16, "Chance that a task ends after an episode.", above=0, at_most=1)
-    imitation: float = option_field(1.0, "Weight of imitating the oracle at the start.", at_least=0)
-    imitation_end: float = option_field(0.5, "Share of the steps at which that weight has fallen to 0.", above=0)
-    rearranged: int = option_field(
-        0,
-        "Also play on so many rearranged versions of each layout, every second one with four recipes.",
-        at_least=0,
-        at_most=MOST_REARRANGED,
-    )
-    four_recipes: bool = option_field(
-        False, "Also play on each layout with the four recipes of the protocol published, with teammates of one family."
-    )
+    epochs: Annotated[Count, Option("Passes over the episodes of a step.")] = 2
+    minibatches: Annotated[Count, Option("Parts of a pass, each with an update of the parameters.")] = 4
+    discount: Annotated[Share, Option("Discount of rewards, which continue over a task's episodes.")] = 0.99
+    gae_lambda: Annotated[Share, Option("Decay of the advantage estimate's trace.")] = 0.95
+    entropy: Annotated[NotNegative, Option("Weight of the entropy bonus.")] = 0.01
+    task_end: Annotated[float, Meta(gt=0, le=1), Option("Chance that a task ends after an episode.")] = 1 / 16
+    imitation: Annotated[NotNegative, Option("Weight of imitating the oracle at the start.")] = 1.0
+    imitation_end: Annotated[Positive, Option("Share of the steps at which that weight has fallen to 0.")] = 0.5
+    rearranged: Annotated[
+        int,
+        Meta(ge=0, le=MOST_REARRANGED),
+        Option("Also play on so many rearranged versions of each layout, every second one with four recipes."),
+    ] = 0
+    four_recipes: Annotated[
+        bool,
+        Option(
+            "Also play on each layout with the four recipes of the protocol published, with teammates of one family."
+        ),
+    ] = False
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_options(self)
 
 
 SAVE_MINUTES = 5.0
@@ -104,49 +106,49 @@ class HistoryOptions:
     teammate_family: tuple[str, ...] = ()
     algorithm: tuple[str, ...] = ()
     source: tuple[str, ...] = ()
-    order: ContextOrder = option_field("contiguous", "Order of the transitions in DPT's contexts.")
-    queries: int = option_field(1, "Queries that DPT answers with each context, posed in turn.", at_least=1)
-    labels: Labels | None = option_field(
-        None,
-        "Actions to learn: expert (greedy ones of a policy) or oracle (of a script that knows the full state).",
-        default_text="expert for dpt, the histories' own actions for the others",
-    )
-    every: int = option_field(
-        1, "Windows hold every n-th episode of a history, so that they span more of its learning.", at_least=1
-    )
-    weights: Literal["uniform", "improvement"] = option_field(
-        "uniform", "Draw histories uniformly, or by how much their returns rise (improvement)."
-    )
-    curriculum: float = option_field(
-        0.0,
-        "Share of the steps in which windows move from a history's first quarter to all of it.",
-        at_least=0,
-        at_most=1,
-    )
-    held_out: float = option_field(
-        0.1,
-        "Share of the histories to hold out; also of the tasks, if no histories of split validation pass the filters.",
-        above=0,
-        below=1,
-    )
-    obs: Obs | None = option_field(
-        None,
-        "Representation of observations in batches.",
-        default_text="state, or uint8 if there are no state records",
-    )
-    channels: Channels | None = option_field(
-        None,
-        "Channels of observations: a layout's own, or canonical, which all layouts share.",
-        default_text="canonical for --layout all and for layouts of unequal shape, or else own",
-    )
+    order: Annotated[ContextOrder, Option("Order of the transitions in DPT's contexts.")] = "contiguous"
+    queries: Annotated[Count, Option("Queries that DPT answers with each context, posed in turn.")] = 1
+    labels: Annotated[
+        Labels | None,
+        Option(
+            "Actions to learn: expert (greedy ones of a policy) or oracle (of a script that knows the full state).",
+            default="expert for dpt, the histories' own actions for the others",
+        ),
+    ] = None
+    every: Annotated[
+        Count, Option("Windows hold every n-th episode of a history, so that they span more of its learning.")
+    ] = 1
+    weights: Annotated[
+        Literal["uniform", "improvement"],
+        Option("Draw histories uniformly, or by how much their returns rise (improvement)."),
+    ] = "uniform"
+    curriculum: Annotated[
+        Share, Option("Share of the steps in which windows move from a history's first quarter to all of it.")
+    ] = 0.0
+    held_out: Annotated[
+        float,
+        Meta(gt=0, lt=1),
+        Option("Share of the histories to hold out; also of the tasks, if no validation histories pass the filters."),
+    ] = 0.1
+    obs: Annotated[
+        Obs | None,
+        Option("Representation of observations in batches.", default="state, or uint8 if there are no state records"),
+    ] = None
+    channels: Annotated[
+        Channels | None,
+        Option(
+            "Channels of observations: a layout's own, or canonical, which all layouts share.",
+            default="canonical for --layout all and for layouts of unequal shape, or else own",
+        ),
+    ] = None
 
-    mirror: bool = option_field(
-        False, "Mirror histories at random, up and down or left and right exchanged, to learn of more layouts."
-    )
+    mirror: Annotated[
+        bool, Option("Mirror histories at random, up and down or left and right exchanged, to learn of more layouts.")
+    ] = False
     hide_recipe: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_options(self)
         if ALL_LAYOUTS in self.layouts and len(self.layouts) > 1:
             raise OptionError(f"layouts = {', '.join(self.layouts)}: expected names of layouts, or {ALL_LAYOUTS} alone")
 

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from icrl4aht_data.utils.options import check_fields, option_field
+from icrl4aht_data.utils.options import Count, Natural, Option, check_options
 
 
 @dataclass(frozen=True)
 class CollectOptions:
     """Options of collecting tasks; the help text of each field describes it."""
 
-    executor: Literal["local", "ray"] = option_field("local", "Run one task at a time here, or use Ray.")
-    address: str | None = option_field(
-        None, "HOST:PORT of a running Ray cluster.", default_text="start a local Ray for this command"
-    )
-    workers: int | None = option_field(
-        None, "Tasks at a time on the local Ray.", at_least=1, default_text="one per GPU, or per core"
-    )
-    retries: int = option_field(0, "Further attempts for a task that failed.", at_least=0)
-    fail_fast: bool = option_field(False, "Start no task after one has failed.")
+    executor: Annotated[Literal["local", "ray"], Option("Run one task at a time here, or use Ray.")] = "local"
+    address: Annotated[
+        str | None, Option("HOST:PORT of a running Ray cluster.", default="start a local Ray for this command")
+    ] = None
+    workers: Annotated[
+        Count | None, Option("Tasks at a time on the local Ray.", default="one per GPU, or per core")
+    ] = None
+    retries: Annotated[Natural, Option("Further attempts for a task that failed.")] = 0
+    fail_fast: Annotated[bool, Option("Start no task after one has failed.")] = False
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_options(self)
 
 
 def request_determinism() -> None:

@@ -2,25 +2,72 @@
 
 from __future__ import annotations
 
-import math
+import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, REBUILT_SOURCES
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_generation.learners.config import PPOConfig, Widths
+from icrl4aht_data.utils.options import Count, Natural, replace_options
+from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.profiles.profile import Profile, SampledConfig, TeammateConfig
 
 FOLDER = Path(__file__).parent
 
-_LEAST = ("least_improvement", "least_rise")
+Value = TypeVar("Value")
+_Names = tuple[str, ...]
+_Return = Annotated[float, Meta(ge=-1e6, le=1e6)]  # finite
+
+
+class _Release(Struct, forbid_unknown_fields=True):
+    """Section [release]."""
+
+    data_version: str
+    keep: int = 0
+    policies: bool = False
+    oracle_actions: bool = False
+    least_improvement: _Return | None = None
+    least_rise: _Return | None = None
+
+
+class _Sampled(Struct, forbid_unknown_fields=True):
+    """Section [tasks.sampled], where every value holds for all layouts or is a table of them."""
+
+    families: _Names | dict[str, _Names]
+    per_layout: Natural | dict[str, Natural]
+    ppo: Natural | dict[str, Natural] | None = None
+    validation: Natural | dict[str, Natural] = 0
+
+
+class _Tasks(Struct, forbid_unknown_fields=True):
+    """Section [tasks]."""
+
+    layouts: _Names
+    sources: Annotated[_Names, Meta(min_length=1)] = ("ppo",)
+    learners: Count = 1
+    presets: _Names = ()
+    sampled: _Sampled | None = None
+    algorithms: _Names | dict[str, _Names] = ()
+
+
+class _ProfileFile(Struct, forbid_unknown_fields=True):
+    """A profile as TOML has it; the values of hyper-parameters are checked by the classes that they belong to."""
+
+    release: _Release
+    tasks: _Tasks
+    ego: dict[str, Any] = {}
+    teammates: dict[str, Any] = {}
+    noise: dict[str, Any] = {}
+    xla_threads: Count | None = None
 
 
 def profile_names() -> list[str]:
@@ -43,7 +90,12 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     if not path.is_file():
         raise unknown("profile", name, profile_names())
     with _named_errors(path):
-        profile = _profile(path.stem, tomllib.loads(path.read_text(encoding="utf-8")))
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        try:
+            checked = msgspec.convert(content, _ProfileFile)
+        except msgspec.ValidationError as error:
+            raise OptionError(_mismatch(error, content)) from error
+        profile = _profile(path.stem, checked)
     prepare(profile)
     with _named_errors(path):
         works = profile.works()  # raises for unknown presets, and for more sampled teammates than there are
@@ -59,175 +111,104 @@ def _named_errors(path: Path) -> Iterator[None]:
         yield
     except tomllib.TOMLDecodeError as error:
         raise OptionError(f"{path}: not TOML: {error}") from error
-    except KeyError as error:
-        raise OptionError(f"{path}: missing key {error}") from error
-    except (TypeError, ValueError, AttributeError) as error:
+    except ValueError as error:
         raise OptionError(f"{path}: {error}") from error
 
 
-def _profile(name: str, content: dict[str, Any]) -> Profile:
-    _check_keys(content, "", {"xla_threads", "ego", "teammates", "noise", "release", "tasks"})
-    for section in content.keys() - {"xla_threads"}:
-        _typed(section, content[section], dict)
-    release, tasks = content["release"], content["tasks"]
-    _check_keys(release, "release.", {"keep", "data_version", "policies", "oracle_actions", *_LEAST})
-    _check_keys(tasks, "tasks.", {"layouts", "sources", "learners", "presets", "sampled", "algorithms"})
-    layouts = _layouts("tasks.layouts", tasks["layouts"])
-    sources = _names("tasks.sources", tasks.get("sources", ["ppo"]))
-    for source in sources:
-        if source not in REBUILT_SOURCES:
-            raise OptionError(f"tasks.sources: {unknown('source', source, REBUILT_SOURCES)}")
-    if not sources:
-        raise OptionError(f"tasks.sources = []: expected at least one of {', '.join(REBUILT_SOURCES)}")
-    ego = dict(content["ego"]) if "ppo" in sources else dict(content.get("ego", {}))
-    of_layouts = _tables("ego.layouts", ego.pop("layouts", {}), layouts)
-    egos = _options(PPOConfig(), "ego", ego)
+def _mismatch(error: msgspec.ValidationError, content: Any) -> str:
+    """Return an error of msgspec with the key first, and the value if it is not a table."""
+    expected, _, path = str(error).partition(" - at `$")
+    key = path.strip(".`")
+    for part in re.findall(r"\w+", key):
+        content = content[int(part)] if isinstance(content, list) else content[part]
+    if not key:
+        return expected
+    return f"{key}: {expected}" if isinstance(content, dict) else f"{key} = {content!r}: {expected}"
+
+
+def _profile(name: str, content: _ProfileFile) -> Profile:
+    release, tasks = content.release, content.tasks
+    layouts, sources = _layouts("tasks.layouts", tasks.layouts), _distinct("tasks.sources", tasks.sources)
+    _known("source", "tasks.sources", sources, REBUILT_SOURCES)
+    ego = dict(content.ego)
+    of_layouts = _by_layout("ego.layouts", ego.pop("layouts", {}), layouts)
+    egos = replace_options(PPOConfig(), ego, "ego.")
+    algorithms = _by_layout("tasks.algorithms", tasks.algorithms, layouts)
+    for key, names in algorithms.items():
+        _known("algorithm", "tasks.algorithms", _distinct(f"tasks.algorithms.{key}", names), ALGORITHMS)
     return Profile(
         name=name,
         ego=egos,
-        ego_layouts={each: _options(egos, f"ego.layouts.{each}", values) for each, values in of_layouts.items()},
-        teammates=_teammates(content.get("teammates", {})),
-        noise=_options(NoiseConfig(), "noise", content.get("noise", {})),
-        data_version=check_version(_typed("release.data_version", release["data_version"], str)),
-        keep=_typed("release.keep", release["keep"], int) if "ppo" in sources else 0,
+        ego_layouts={each: replace_options(egos, of, f"ego.layouts.{each}.") for each, of in of_layouts.items()},
+        teammates=_teammates(content.teammates),
+        noise=replace_options(NoiseConfig(), content.noise, "noise."),
+        data_version=check_version(release.data_version),
+        keep=release.keep if "ppo" in sources else 0,
         layouts=layouts,
         sources=sources,
-        learners=_typed("tasks.learners", tasks.get("learners", 1), int),
-        presets=_names("tasks.presets", tasks.get("presets", [])),
-        sampled=_sampled(tasks["sampled"], layouts, sources) if "sampled" in tasks else None,
-        algorithms=_algorithms("tasks.algorithms", tasks.get("algorithms", []), layouts),
-        policies=_switch("release.policies", release.get("policies", False)),
-        oracle_actions=_switch("release.oracle_actions", release.get("oracle_actions", False)),
-        **{name: _number(f"release.{name}", release.get(name)) for name in _LEAST},
-        xla_threads=_typed("xla_threads", content["xla_threads"], int) if "xla_threads" in content else None,
+        learners=tasks.learners,
+        presets=_distinct("tasks.presets", tasks.presets),
+        sampled=_sampled(tasks.sampled, layouts, sources) if tasks.sampled else None,
+        algorithms={each: tuple(algorithms[each]) for each in layouts if algorithms.get(each)},
+        policies=release.policies,
+        oracle_actions=release.oracle_actions,
+        least_improvement=release.least_improvement,
+        least_rise=release.least_rise,
+        xla_threads=content.xla_threads,
     )
 
 
-def _sampled(values: dict[str, Any], layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
-    """[tasks.sampled], where every value holds for all layouts or is a table of them."""
-    _typed("tasks.sampled", values, dict)
-    _check_keys(values, "tasks.sampled.", {"families", "per_layout", "ppo", "validation"})
-    for key in ("families", "per_layout"):
-        if key not in values:
-            raise OptionError(f"missing key 'tasks.sampled.{key}'")
-
-    def names(key: str, value: Any) -> tuple[str, ...]:
-        families = _names(key, value)
-        for family in families:
-            if family not in HEURISTIC_KINDS:
-                raise OptionError(f"{key}: {unknown('family', family, HEURISTIC_KINDS)}")
-        return families
-
-    def count(key: str, value: Any) -> int:
-        if _typed(key, value, int) < 0:
-            raise OptionError(f"{key} = {value}: expected at least 0")
-        return value
-
-    families = _by_layout("tasks.sampled.families", values["families"], layouts, names, ())
-    per_layout = _by_layout("tasks.sampled.per_layout", values["per_layout"], layouts, count, 0)
-    ppo = _by_layout("tasks.sampled.ppo", values.get("ppo", per_layout), layouts, count, 0)
-    validation = _by_layout("tasks.sampled.validation", values.get("validation", 0), layouts, count, 0)
+def _sampled(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
+    given = {"families": values.families, "per_layout": values.per_layout, "validation": values.validation}
+    given["ppo"] = values.per_layout if values.ppo is None else values.ppo
+    tables: dict[str, Any] = {key: _by_layout(f"tasks.sampled.{key}", value, layouts) for key, value in given.items()}
+    chosen = tables.pop("families")
+    families = {name: _distinct("tasks.sampled.families", chosen.get(name, ())) for name in layouts}
+    counts = {key: {name: table.get(name, 0) for name in layouts} for key, table in tables.items()}
     for name in layouts:
-        if (per_layout[name] or validation[name]) and not families[name]:
+        _known("family", "tasks.sampled.families", families[name], HEURISTIC_KINDS)
+        if (counts["per_layout"][name] or counts["validation"][name]) and not families[name]:
             raise OptionError(f"tasks.sampled.families: none for {name}, which has teammates in tasks.sampled")
-        if ppo[name] > per_layout[name]:
+        if counts["ppo"][name] > counts["per_layout"][name]:
             raise OptionError(
-                f"tasks.sampled.ppo = {ppo[name]} on {name}: expected at most per_layout = {per_layout[name]}"
+                f"tasks.sampled.ppo = {counts['ppo'][name]} on {name}: expected at most per_layout = "
+                f"{counts['per_layout'][name]}"
             )
-    if any(validation.values()) and "noise" not in sources:
+    if any(counts["validation"].values()) and "noise" not in sources:
         raise OptionError("tasks.sampled.validation: validation teammates need 'noise' among tasks.sources")
-    return SampledConfig(families, per_layout, ppo, validation)
-
-
-def _by_layout(
-    key: str, value: Any, layouts: tuple[str, ...], check: Callable[[str, Any], Any], absent: Any
-) -> dict[str, Any]:
-    """Layout -> value, which is one for all layouts, or a table of them."""
-    if not isinstance(value, dict):
-        return dict.fromkeys(layouts, check(key, value))
-    found = _tables(key, value, layouts)
-    return {name: check(f"{key}.{name}", found[name]) if name in found else absent for name in layouts}
-
-
-def _tables(key: str, value: Any, layouts: tuple[str, ...]) -> dict[str, Any]:
-    """A table of some of the profile's layouts, by short name."""
-    typed = _typed(key, value, dict)
-    found = dict(zip(_layouts(key, list(typed)), typed.values(), strict=True))
-    for name in found:
-        if name not in layouts:
-            raise OptionError(f"{key}.{name}: expected one of tasks.layouts, {', '.join(layouts)}")
-    return found
+    return SampledConfig(families, **counts)
 
 
 def _teammates(values: dict[str, Any]) -> TeammateConfig:
     """[teammates] holds the sizes of the suite next to the hyper-parameters of its policies."""
     sizes = {name: values[name] for name in ("members", "train", "heldout") if name in values}
     rest = {name: value for name, value in values.items() if name not in sizes}
-    defaults = TeammateConfig()
-    return replace(_options(defaults, "teammates", sizes), ppo=_options(defaults.ppo, "teammates", rest))
+    ppo = replace_options(TeammateConfig().ppo, rest, "teammates.")
+    return replace_options(TeammateConfig(ppo=ppo), sizes, "teammates.")
 
 
-def _options(defaults: Any, section: str, values: dict[str, Any]) -> Any:
-    """Hyper-parameters with the values of a TOML section, whose checks name the key."""
-    known = {known.name for known in fields(defaults)}
-    _check_keys(values, f"{section}.", known)
-    values = dict(values)
-    if "widths" in values:
-        _check_keys(values["widths"], f"{section}.widths.", {known.name for known in fields(Widths)})
-        try:
-            values["widths"] = Widths.from_json(values["widths"])
-        except OptionError as error:
-            raise OptionError(f"{section}.widths.{error}") from error
-    try:
-        return replace(defaults, **values)
-    except OptionError as error:
-        raise OptionError(f"{section}.{error}") from error
+def _by_layout(key: str, value: Mapping[str, Value] | Value, layouts: tuple[str, ...]) -> dict[str, Value]:
+    """Layout -> value, which is one for all layouts, or a table of some of them."""
+    if not isinstance(value, Mapping):
+        return dict.fromkeys(layouts, value)
+    found = dict(zip(_layouts(key, list(value)), value.values(), strict=True))
+    for name in found:
+        if name not in layouts:
+            raise OptionError(f"{key}.{name}: expected one of tasks.layouts, {', '.join(layouts)}")
+    return found
 
 
-def _names(key: str, value: Any) -> tuple[str, ...]:
-    """A list of different names."""
-    names = _typed(key, value, list)
-    if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+def _distinct(key: str, names: Sequence[str]) -> tuple[str, ...]:
+    if len(set(names)) < len(names):
         raise OptionError(f"{key} = {names!r}: expected names, none twice")
     return tuple(names)
 
 
-def _algorithms(key: str, value: Any, layouts: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
-    """Layout -> algorithms, in the order of the layouts; a list applies to all of them."""
-    found = _by_layout(key, value, layouts, _names, ())
-    for algorithms in found.values():
-        for algorithm in algorithms:
-            if algorithm not in ALGORITHMS:
-                raise OptionError(f"{key}: {unknown('algorithm', algorithm, ALGORITHMS)}")
-    return {name: found[name] for name in layouts if found[name]}
+def _known(what: str, key: str, names: Sequence[str], valid: Sequence[str] | Mapping[str, Any]) -> None:
+    for name in names:
+        if name not in valid:
+            raise OptionError(f"{key}: {unknown(what, name, valid)}")
 
 
-def _layouts(key: str, value: Any) -> tuple[str, ...]:
-    layouts = [get_layout(name).name for name in _names(key, value)]
-    return _names(key, layouts)
-
-
-def _typed(key: str, value: Any, kind: type) -> Any:
-    if isinstance(value, bool) or not isinstance(value, kind):
-        raise OptionError(f"{key} = {value!r}: expected {'a table' if kind is dict else kind.__name__}")
-    return value
-
-
-def _number(key: str, value: Any) -> float | None:
-    if value is None:
-        return None
-    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-        return float(value)
-    raise OptionError(f"{key} = {value!r}: expected a finite number")
-
-
-def _switch(key: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise OptionError(f"{key} = {value!r}: expected true or false")
-    return value
-
-
-def _check_keys(section: dict[str, Any], prefix: str, known: set[str]) -> None:
-    for key in section:
-        if key not in known:
-            raise unknown("key", prefix + key, [prefix + name for name in sorted(known)])
+def _layouts(key: str, names: Sequence[str]) -> tuple[str, ...]:
+    return _distinct(key, [get_layout(name).name for name in names])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 from icrl4aht_data.benchmark.facts import (
     HEURISTIC_KINDS,
@@ -15,10 +15,9 @@ from icrl4aht_data.benchmark.facts import (
     track_of,
 )
 from icrl4aht_data.benchmark.tasks import Task, make_task
-from icrl4aht_data.commands.dataclass_options import replace_given
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import json_hash
-from icrl4aht_data.utils.options import check_fields, option_field
+from icrl4aht_data.utils.options import Count, Natural, Option, check_options, replace_options
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.profiles.work import Work
@@ -46,9 +45,9 @@ class TeammateConfig:
         ppo: hyper-parameters of every policy.
     """
 
-    members: int = option_field(10, "Policies of each population.", at_least=1)
-    train: int = option_field(PAPER_TEAMMATES, "Teammates of each algorithm for training tasks.", at_least=1)
-    heldout: int = option_field(5, "Held-out teammates of each algorithm.", at_least=0)
+    members: Annotated[Count, Option("Policies of each population.")] = 10
+    train: Annotated[Count, Option("Teammates of each algorithm for training tasks.")] = PAPER_TEAMMATES
+    heldout: Annotated[Natural, Option("Held-out teammates of each algorithm.")] = 5
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             total_steps=PAPER_TEAMMATE_STEPS, environments=256, warmup=0.05, shaping_horizon=15_000_000
@@ -56,7 +55,7 @@ class TeammateConfig:
     )
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_options(self)
 
 
 @dataclass(frozen=True)
@@ -162,14 +161,14 @@ class Profile:
                 )
 
     def with_ego(self, given: Mapping[str, Any]) -> Profile:
-        """Returns the profile with some of the ego's hyper-parameters replaced, at any depth and on every layout.
+        """Return the profile with some of the ego's hyper-parameters replaced on every layout, nested as in TOML.
 
         Raises:
             OptionError: if they do not fit.
         """
         try:
-            egos = {layout: replace_given(ego, given) for layout, ego in self.ego_layouts.items()}
-            return replace(self, ego=replace_given(self.ego, given), ego_layouts=egos)
+            egos = {layout: replace_options(ego, given) for layout, ego in self.ego_layouts.items()}
+            return replace(self, ego=replace_options(self.ego, given), ego_layouts=egos)
         except ValueError as error:
             raise OptionError(f"profile {self.name} with the given options: {error}") from error
 

@@ -4,44 +4,47 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import click
 import pytest
 from click.testing import CliRunner
+from msgspec import Meta
 
-from icrl4aht_data.commands.dataclass_options import dataclass_options, replace_given
+from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.errors import OptionError, UnknownNameError
-from icrl4aht_data.utils.options import check_fields, option_field
+from icrl4aht_data.utils.options import Count, Option, Positive, ShareBelowOne, check_options, replace_options
 
 
 @dataclass(frozen=True)
 class Widths:
-    hidden: int = option_field(64, "Hidden width.", at_least=1)
+    hidden: Annotated[Count, Option("Hidden width.")] = 64
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
 
 @dataclass(frozen=True)
 class Options:
-    steps: int = option_field(10, "Training steps.", at_least=1)
-    learning_rate: float = option_field(1e-3, "Learning rate.", above=0)
-    dropout: float = option_field(0.1, "Dropout rate.", at_least=0, below=1)
-    discounts: tuple[float, ...] = option_field((0.9, 0.99), "Discount; repeatable.", at_least=0, below=1)
-    positions: Literal["none", "rope"] = option_field("none", "Position embedding.")
-    teammate_actions: bool = option_field(False, "Also input actions.", flags=("--ta",))
-    normalize: bool = option_field(True, "Normalize.")
-    limit: int | None = option_field(None, "Most steps.", at_least=1, default_text="no limit")
-    folder: Path | None = option_field(None, "A folder.")
+    steps: Annotated[Count, Option("Training steps.")] = 10
+    learning_rate: Annotated[Positive, Option("Learning rate.")] = 1e-3
+    dropout: Annotated[ShareBelowOne, Option("Dropout rate.")] = 0.1
+    discounts: Annotated[tuple[ShareBelowOne, ...], Meta(min_length=1), Option("Discount; repeatable.")] = (0.9, 0.99)
+    positions: Annotated[Literal["none", "rope"], Option("Position embedding.")] = "none"
+    teammate_actions: Annotated[bool, Option("Also input actions.", flags=("--ta",))] = False
+    normalize: Annotated[bool, Option("Normalize.")] = True
+    limit: Annotated[Count | None, Option("Most steps.", default="no limit")] = None
+    excluded: Annotated[Count, Option("Not an option of this command.")] = 1
     internal: int = 3
     widths: Widths = field(default_factory=Widths)
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_options(self)
 
 
-@click.command(context_settings={"show_default": True})
+@click.command(cls=TopicCommand, context_settings={"show_default": True})
 @click.argument("name")
-@dataclass_options(Options, "given", exclude=["folder"], default_text={"steps": "the size's"})
+@topic("Training", dataclass_options(Options, "given", exclude=["excluded"], default_text={"steps": "the size's"}))
 @click.option("--out", default="runs")
 def command(name: str, given: dict[str, Any], out: str) -> None:
     click.echo(json.dumps({"given": given, "name": name, "out": out}))
@@ -61,7 +64,7 @@ def call(*words: str) -> tuple[int, str]:
         ("--discounts 0.5 --discounts 0.6", {"discounts": [0.5, 0.6]}),
         ("--ta --no-normalize", {"teammate_actions": True, "normalize": False}),
         ("--teammate-actions --normalize", {"teammate_actions": True, "normalize": True}),
-        ("--positions rope --limit 3 --hidden 8", {"positions": "rope", "limit": 3, "hidden": 8}),
+        ("--positions rope --limit 3 --hidden 8", {"positions": "rope", "limit": 3, "widths": {"hidden": 8}}),
     ],
 )
 def test_given_values_alone_reach_the_command(words, given):
@@ -73,16 +76,16 @@ def test_given_values_alone_reach_the_command(words, given):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--steps 0", "0 is not in the range x>=1"),
-        ("--steps 1.5", "not a valid integer"),
-        ("--learning-rate 0", "0.0 is not in the range x>0"),
-        ("--learning-rate nan", "nan is not a finite number"),
-        ("--learning-rate inf", "inf is not a finite number"),
-        ("--dropout 1", "1.0 is not in the range 0<=x<1"),
-        ("--discounts 0.5 --discounts 2", "2.0 is not in the range 0<=x<1"),
-        ("--positions ropes", "'ropes' is not one of 'none', 'rope'"),
-        ("--hidden 0", "0 is not in the range x>=1"),
-        ("--folder x", "No such option"),
+        ("--steps 0", "steps = '0': expected `int` >= 1"),
+        ("--steps 1.5", "steps = '1.5': expected `int`"),
+        ("--learning-rate 0", "expected `float` > 0"),
+        ("--learning-rate nan", "learning_rate = 'nan': expected"),
+        ("--learning-rate inf", "learning_rate = 'inf': expected a finite number"),
+        ("--dropout 1", "expected `float` < 1.0"),
+        ("--discounts 0.5 --discounts 2", "discounts = '2': expected `float` < 1.0"),
+        ("--positions ropes", "unknown positions 'ropes'; valid: none, rope"),
+        ("--hidden 0", "hidden = '0': expected `int` >= 1"),
+        ("--excluded 1", "No such option"),
         ("--internal 1", "No such option"),
     ],
 )
@@ -92,34 +95,45 @@ def test_invalid_values_are_a_misuse(words, message):
     assert message in " ".join(output.split())
 
 
-def test_help_shows_each_default_once():
+def test_help_has_topics_and_shows_each_default_once():
     text = " ".join(call("--help")[1].split())
-    assert "Training steps. [default: (the size's); x>=1]" in text
-    assert "Discount; repeatable. [default: (0.9, 0.99); 0<=x<1]" in text
+    assert "Options: --out TEXT [default: runs] --help" in text
+    assert "Training: --steps INTEGER Training steps. [default: the size's; >= 1]" in text
+    assert "--discounts FLOAT Discount; repeatable. [default: 0.9, 0.99; >= 0; < 1]" in text
+    assert "--positions none|rope Position embedding. [default: none]" in text
     assert "--teammate-actions, --ta Also input actions. -" in text
-    assert "--normalize / --no-normalize Normalize. [default: (normalize)]" in text
-    assert "Most steps. [default: (no limit); x>=1]" in text
+    assert "--normalize / --no-normalize Normalize. [default: normalize]" in text
+    assert "--limit INTEGER Most steps. [default: no limit; >= 1]" in text
 
 
-def test_given_values_replace_fields_of_nested_dataclasses():
+def test_values_of_tables_replace_fields_of_nested_dataclasses():
     base = Options(steps=7)
-    changed = replace_given(base, {"dropout": 0.2, "hidden": 8, "discounts": (0.5,)})
+    changed = replace_options(base, {"dropout": 0.2, "widths": {"hidden": 8}, "discounts": [0.5]})
     assert asdict(changed) == asdict(base) | {"dropout": 0.2, "widths": {"hidden": 8}, "discounts": (0.5,)}
-    assert replace_given(base, {}) == base
-    with pytest.raises(OptionError, match="steps = 0"):
-        replace_given(base, {"steps": 0})
+    assert replace_options(base, {}) == base
+    for values, message in (
+        ({"steps": 0}, "ego.steps = 0: expected `int` >= 1"),
+        ({"widths": {"hidden": 0}}, "ego.widths.hidden = 0: expected `int` >= 1"),
+        ({"widths": 3}, "ego.widths = 3: expected a table"),
+        ({"step": 3}, "unknown key 'ego.step'; .*Did you mean 'ego.steps'"),
+        ({"widths": {"hiden": 8}}, "unknown key 'ego.widths.hiden'"),
+    ):
+        with pytest.raises((OptionError, UnknownNameError), match=message):
+            replace_options(base, values, "ego.")
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"steps": 0}, "steps = 0: expected an integer at least 1"),
-        ({"steps": 1.5}, "steps = 1.5: expected an integer at least 1"),
-        ({"steps": True}, "steps = True"),
-        ({"learning_rate": float("nan")}, "learning_rate = nan: expected a number above 0"),
-        ({"dropout": 1}, "dropout = 1: expected a number at least 0 and below 1"),
-        ({"discounts": ()}, r"discounts = \(\): expected one value or more"),
-        ({"discounts": (0.5, -1.0)}, "discounts = -1.0"),
+        ({"steps": 0}, "steps = 0: expected `int` >= 1"),
+        ({"steps": 1.5}, "steps = 1.5: expected `int`, got `float`"),
+        ({"steps": True}, "steps = True: expected `int`, got `bool`"),
+        ({"steps": "5"}, "steps = '5': expected `int`, got `str`"),
+        ({"learning_rate": float("nan")}, "learning_rate = nan: expected"),
+        ({"learning_rate": float("inf")}, "learning_rate = inf: expected a finite number"),
+        ({"dropout": 1}, "dropout = 1: expected `float` < 1.0"),
+        ({"discounts": ()}, r"discounts = \(\): expected `array` of length >= 1"),
+        ({"discounts": (0.5, -1.0)}, r"discounts = \(0.5, -1.0\): expected `float` >= 0.0 - at `\$\[1\]`"),
         ({"limit": 0}, "limit = 0"),
     ],
 )
