@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack
 
@@ -13,6 +14,7 @@ import numpy as np
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, teammate_id
 from icrl4aht_data.environments import make_environment
 from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError, unknown
+from icrl4aht_data.fetch import ReleaseLocation, open_root
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
 from icrl4aht_data.format.provenance import Provenance
@@ -27,14 +29,11 @@ from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.reading.splitting import SPLIT_BY, SplitBy, choose_histories, choose_teammates
-from icrl4aht_data.remote.remote_release import ReleaseLocation, open_root
 from icrl4aht_data.sampling.ad import ADSampler
-from icrl4aht_data.sampling.base import Sampler, SamplerOptions, warn_of_mixed_splits
+from icrl4aht_data.sampling.base import SamplerOptions, warn_of_mixed_splits
 from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 from icrl4aht_data.sampling.draws import draw_subset
-from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.options import check_int
-from icrl4aht_data.utils.signatures import show_method_types, show_types
 from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.utils.text import counted_histories, counted_noun, facts_html
 
@@ -443,12 +442,6 @@ class Dataset(Selection):
         return DPTSampler(
             self, batch_size=batch_size, context=context, order=order, labels=labels, queries=queries, **options
         )
-
-
-for _function in (Dataset.ad, Dataset.dpt):
-    show_types(_function, Sampler.__init__, SamplerOptions.__annotations__)
-show_types(load_icrl4aht)
-show_method_types(Dataset)
 
 
 def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:

@@ -95,11 +95,12 @@ class RemoteError(ReleaseError, OSError):
     Args:
         message: names the address.
         missing: whether the remote has no such file.
+        is_content: whether the remote answered, without the file or with another content.
     """
 
-    def __init__(self, message: str, missing: bool = False) -> None:
+    def __init__(self, message: str, missing: bool = False, is_content: bool = False) -> None:
         super().__init__(message)
-        self.missing = missing
+        self.missing, self.is_content = missing, missing or is_content
 
 
 class OfflineError(ReleaseError):

@@ -11,12 +11,12 @@ import numpy as np
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Finding, NamedProgress, Report
 from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.fetch import ReleaseLocation
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import EXPERTS, INFO, MANIFEST, PROVENANCE, TEAMMATES
-from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.utils.files import LARGEST, files_below, plain_size, resolve_inside
 from icrl4aht_data.utils.hashes import file_hash
 
@@ -127,18 +127,16 @@ def check_references(
 def check_shard_sizes(origin: ReleaseLocation, index: Index, shards: list[str], report: Report) -> None:
     """Check that local and remote shards have the sizes that meta/info.json records."""
     known = set(report.findings)  # `check_files` has the sizes of very large shards
-    for name in shards:
-        path, found = resolve_inside(index.root, name), None
-        if path.exists():
-            found = path.stat().st_size
-        elif origin.remote is not None:
-            try:
-                found = origin.remote.store.size(name)
-            except Icrl4ahtError as error:
-                report.add(name, str(error))
-                continue
+    paths = {name: resolve_inside(index.root, name) for name in shards}
+    sizes = {name: path.stat().st_size for name, path in paths.items() if path.exists()}
+    if origin.remote is not None:
+        try:
+            sizes |= origin.remote.sizes(name for name in shards if name not in sizes)
+        except Icrl4ahtError as error:
+            report.add("data", str(error))
+    for name, found in sizes.items():
         expected = index.info.shards.get(name)
-        if found is None or found == expected:
+        if found == expected:
             continue
         problem = (
             "meta/info.json has no size of it" if expected is None else f"expected {expected:,} bytes, found {found:,}"

@@ -49,7 +49,6 @@ class Report:
         histories: number of histories checked.
         transitions: number of steps of these histories.
         fetched_bytes: bytes fetched from a remote.
-        requests: number of requests to the remote.
     """
 
     root: str
@@ -63,7 +62,6 @@ class Report:
     histories: int = 0
     transitions: int = 0
     fetched_bytes: int = 0
-    requests: int = 0
 
     def __repr__(self) -> str:
         number = len(self.findings)
@@ -109,7 +107,7 @@ def verdict_in_words(report: Report) -> str:
     if report.level == "quick":
         return f"{verdict}; checked names, sizes and the index of {counted_noun(report.files, 'file')}, no contents"
     physics = " and their physics" if report.replayed else ""
-    fetched = f"; fetched {report.fetched_bytes:,} bytes in {report.requests} requests" * (report.requests > 0)
+    fetched = f"; fetched {report.fetched_bytes:,} bytes" * (report.fetched_bytes > 0)
     return (
         f"{verdict}; checked {counted_noun(report.files, 'file')}, {counted_noun(report.chunks, 'chunk')}, "
         f"{counted_histories(report.histories)}, {counted_noun(report.transitions, 'transition')}{physics}{fetched}"

@@ -7,6 +7,7 @@ cell.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import get_args
 
@@ -20,7 +21,9 @@ from icrl4aht_data.checking.provenance import check_provenance
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
 from icrl4aht_data.checking.structure import check_bytes_between, check_structure, has_grown
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, unknown
+from icrl4aht_data.download import chosen_files
+from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, RemoteError, UnknownNameError, unknown
+from icrl4aht_data.fetch import ReleaseLocation, Remote, check_credentials, open_root, without_credentials
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
@@ -28,12 +31,7 @@ from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
-from icrl4aht_data.remote.addresses import check_credentials, without_credentials
-from icrl4aht_data.remote.download import chosen_files
-from icrl4aht_data.remote.remote_release import ReleaseLocation, Remote, open_root
-from icrl4aht_data.remote.store import Traffic
 from icrl4aht_data.utils.files import resolve_inside
-from icrl4aht_data.utils.signatures import show_types
 
 _NOT_RECOMPUTED = {
     "oracle_actions": "oracle actions of {count} histories: only their range was checked, not the script's choices",
@@ -81,7 +79,7 @@ def verify_release(
     if not origin.folder.is_dir():
         report.add(".", f"{origin.folder}: no such folder; give the folder or the address of a release")
         return report
-    before = origin.remote.store.traffic if origin.remote else Traffic()
+    before = origin.remote.fetched if origin.remote else 0
     report.root = str(origin)
     try:
         _verify(origin, report, advance, wanted)
@@ -90,12 +88,8 @@ def verify_release(
             raise  # the caller's mistake, not the release's
         report.add("meta", str(error))
     if origin.remote is not None:
-        traffic = origin.remote.store.traffic - before
-        report.fetched_bytes, report.requests = traffic.bytes, traffic.requests
+        report.fetched_bytes = origin.remote.fetched - before
     return report
-
-
-show_types(verify_release)
 
 
 def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wanted: dict[str, FilterValues]) -> None:
@@ -160,10 +154,20 @@ def _read_provenance(origin: ReleaseLocation, report: Report) -> dict[str, Prove
 
 
 def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgress) -> None:
-    for number, name in enumerate(names, start=1):  # one at a time, so that every file that fails is reported
+    """Fetch files, all at once; if one fails, one at a time, so that every damaged one is reported.
+
+    Raises:
+        RemoteError: if the remote cannot be reached: the others would fail as well.
+    """
+    with suppress(RemoteError):
+        remote.fetch(names)
+        return
+    for number, name in enumerate(names, start=1):
         try:
             remote.fetch([name])
-        except Icrl4ahtError as error:
+        except RemoteError as error:
+            if not error.is_content:
+                raise
             report.add(name, str(error))
         advance("fetched", number, len(names))
 
@@ -188,6 +192,6 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Name
         contents: dict[tuple[str, bytes], int] = {}
         for entry in entries:
             if entry.history_id not in damaged:
-                check_history(History(entry, shard, "uint8"), index.info, contents, report)
+                check_history(History(entry, lambda name, shard=shard: shard, "uint8"), index.info, contents, report)
             report.histories += 1
             advance("histories", report.histories, total)

@@ -12,8 +12,8 @@ from click.shell_completion import CompletionItem
 
 from icrl4aht_data.benchmark.facts import SPLITS, TRACKS, all_families
 from icrl4aht_data.errors import unknown
+from icrl4aht_data.fetch import is_address
 from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout_names
-from icrl4aht_data.remote.remote_release import is_address
 
 
 class Names(click.ParamType):

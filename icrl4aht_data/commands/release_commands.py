@@ -38,6 +38,8 @@ from icrl4aht_data.commands.summaries import (
     task_table,
 )
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
+from icrl4aht_data.download import fetch_planned, plan_download
+from icrl4aht_data.download import repair as repair_files
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
@@ -45,8 +47,6 @@ from icrl4aht_data.format.schema import ALL_KINDS, OBSERVATIONS
 from icrl4aht_data.plotting import PICTURES, plot_learning_curves
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
-from icrl4aht_data.remote.download import fetch_planned, plan_download
-from icrl4aht_data.remote.download import repair as repair_files
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.text import counted_noun
@@ -180,16 +180,15 @@ def download(
         plan = plan_download(str(root), to=to, advance=show, **wanted_filters(filters))
         facts = plan.to_json()
         if not dry_run:
-            traffic = fetch_planned(plan, counted(show, "download", plan.size))
-            facts |= {"fetched_bytes": traffic.bytes, "requests": traffic.requests}
+            facts["fetched_bytes"] = fetch_planned(plan, counted(show, "download", plan.size))
     if as_json:
         click.echo(json.dumps(facts, indent=2))
     elif not quiet:
         if dry_run:
             for name in sorted((*plan.absent, *plan.changed)):
                 click.echo(f"{plan.files[name]:>15,}  {name}")
-        for name in plan.replaced:
-            click.echo(f"{name}: had changed, was fetched again")
+        for name in plan.changed:
+            click.echo(f"{name}: had changed{'' if dry_run else ', was fetched again'}")
         verb = "to download" if dry_run else "downloaded"
         fetched = len(plan.absent) + len(plan.changed)
         here = f"{counted_noun(len(plan.files) - fetched, 'file')} present already, with the right hashes"
@@ -219,7 +218,7 @@ def verify(
     """Verify a release: every byte, count and range.
 
     Prints one line per problem, and exits with 1 if there is one. Writes nothing without --repair. A remote release is
-    fetched first, unless --quick; repairing a shard fetches only its damaged parts.
+    fetched first, unless --quick.
     """
     if quick and (deep or repair):
         raise click.UsageError("--quick reads no contents: give --deep or --repair without it")
@@ -233,12 +232,11 @@ def verify(
             if root is None and origin is None:
                 raise OptionError("the bundled release is repaired by installing the package again")
             first = report
-            outcome, traffic = repair_files(MINI if root is None else root, first.files_at_fault, source=origin)
+            outcome, fetched = repair_files(MINI if root is None else root, first.files_at_fault, source=origin)
             report = verify_release(root, level=level, advance=advance, **wanted)
             report.repaired = [name for name, error in outcome.items() if error is None]
             report.notes += [f"{name}: not repaired: {error}" for name, error in outcome.items() if error is not None]
-            report.fetched_bytes += first.fetched_bytes + traffic.bytes
-            report.requests += first.requests + traffic.requests
+            report.fetched_bytes += first.fetched_bytes + fetched
     if as_json:
         click.echo(json.dumps(report.to_json(), indent=2))
     else:

@@ -13,12 +13,12 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import check_family, check_membership
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError
+from icrl4aht_data.format.cached_arrays import cached_arrays
 from icrl4aht_data.format.schema import ENTRY_HINTS, Entry, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.cached_arrays import cached_arrays
 from icrl4aht_data.utils.files import LARGEST, LINE_BYTES, plain_size, wrap_read_errors
-from icrl4aht_data.utils.remembered import remembered_hash
+from icrl4aht_data.utils.hashes import file_hash
 
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source")
 """The entry fields that can be filtered by."""
@@ -125,7 +125,7 @@ def read_columns(path: Path) -> Columns:
         size = plain_size(path, LARGEST)
         if size < _UNCACHED:
             return Columns(_parse(path))
-        key = f"index-{_VERSION}-{remembered_hash(path)}"
+        key = f"index-{_VERSION}-{file_hash(path)}"  # as the manifest lists it
     parsed: dict[str, np.ndarray] = {}
 
     def build(folder: Path) -> None:

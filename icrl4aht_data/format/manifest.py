@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 
-from icrl4aht_data.errors import ChunkTableError, IndexFormatError, OptionError, UnsafePathError
+from icrl4aht_data.errors import ChunkTableError, IndexFormatError, UnsafePathError
 from icrl4aht_data.format.schema import (
     EXPERTS,
     HISTORIES,
@@ -28,8 +28,6 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.utils.files import (
     LARGEST,
     atomic_write,
-    files_below,
-    final_name,
     is_inside,
     plain_size,
     read_text,
@@ -37,7 +35,6 @@ from icrl4aht_data.utils.files import (
     wrap_read_errors,
 )
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.remembered import remembered_hash
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
@@ -75,7 +72,9 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         IndexFormatError: if it lists nothing, or a line is wrong, which it names.
         UnsafePathError: for a path that leads out of the release, or is not that of a file which releases have.
     """
-    if text and not text.endswith("\n"):
+    if not text:
+        raise IndexFormatError(f"{path}: empty: expected a line for each file of the release; fetch it again")
+    if not text.endswith("\n"):
         raise IndexFormatError(f"{path}: cut off: its last line has no end; fetch it again")
     listed: dict[str, str] = {}
     folded: dict[str, str] = {}  # names as a disk compares them that ignores case
@@ -124,8 +123,6 @@ def _parsed_once(text: str, path: Path) -> Mapping[str, str]:
 def check_against_manifest(root: Path, names: Iterable[str]) -> None:
     """Check that files of a release folder are those that its manifest lists.
 
-    A large file is hashed once until it changes or the machine restarts; see `utils.remembered`.
-
     Args:
         root: the release folder.
         names: paths in it.
@@ -141,7 +138,7 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
         try:
             with wrap_read_errors(path):
                 plain_size(path, LARGEST)
-                found = remembered_hash(path) if name in listed else None
+                found = file_hash(path) if name in listed else None
         except IndexFormatError as error:
             raise kind(str(error)) from error
         if found is None:
@@ -187,15 +184,3 @@ def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
     lines = [f"{known.get(name) or file_hash(root / name)}  {name}\n" for name in names if name != MANIFEST]
     with atomic_write(root / MANIFEST) as partial:
         partial.write_text("".join(lines), encoding="utf-8")
-
-
-def check_only_files_of(folder: Path, manifest: Mapping[str, str]) -> None:
-    """Check that a folder, which need not exist, has files of a release only.
-
-    Raises:
-        OptionError: names a file that the manifest does not list.
-    """
-    for name in files_below(folder):
-        file = final_name(name)  # of a file that is being written, or whose writer was killed
-        if file != MANIFEST and file not in manifest:
-            raise OptionError(f"{folder / name}: not a file of this release: move it elsewhere, or give another folder")

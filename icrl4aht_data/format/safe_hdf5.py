@@ -7,9 +7,7 @@ any error of h5py; callers add the file's name.
 from __future__ import annotations
 
 import math
-import mmap
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -26,8 +24,6 @@ OLDEST_HDF5 = (1, 10, 5)
 
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
-_HEAP = b"GCOL\x01"  # first bytes of a global heap, which stores texts
-_HEAPS, _HEAP_BYTES = 16, 2**16
 _CHUNK_BYTES = 256 * 2**20
 _ELEMENT_BYTES = 2**16
 _ATTRIBUTES = 16
@@ -77,42 +73,8 @@ def attributes(file: h5py.File) -> dict[str, Any]:
         attribute = file.attrs.get_id(name)
         if number == _ATTRIBUTES or attribute.shape or _type_class(attribute) not in (h5t.INTEGER, h5t.STRING):
             raise ValueError(f"attribute {name!r}: expected few attributes, single numbers and texts")
-        if _type_class(attribute) == h5t.STRING:
-            _check_heaps(Path(file.filename))
         found[name] = file.attrs[name]
     return found
-
-
-def _check_heaps(path: Path) -> None:
-    """Check that the heaps of texts are small and consistent: libhdf5 loops for ever at an object of size 0.
-
-    Raises:
-        ValueError: if they are not.
-    """
-    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        start, heaps = data.find(_HEAP), 0
-        while start >= 0:
-            size = int.from_bytes(data[start + 8 : start + 16], "little")
-            if size <= len(data) - start:  # otherwise these bytes are not a heap
-                heaps += 1
-                if heaps > _HEAPS or size > _HEAP_BYTES or not _is_consistent(data[start : start + size]):
-                    raise ValueError(f"texts at byte {start}: not stored as libhdf5 stores them")
-            start = data.find(_HEAP, start + 1)
-
-
-def _is_consistent(heap: bytes) -> bool:
-    """Whether the sizes of a heap's objects add up.
-
-    An object is its number (2 bytes), 6 other bytes, its size (8 bytes) and its content; number 0 is the free space.
-    """
-    offset = 16
-    while offset + 16 <= len(heap):
-        number = int.from_bytes(heap[offset : offset + 2], "little")
-        size = int.from_bytes(heap[offset + 8 : offset + 16], "little")
-        if number == 0:
-            return offset + size == len(heap)
-        offset += 16 + -(-size // 8) * 8
-    return offset <= len(heap)
 
 
 def filters(dataset: Any) -> list[int]:

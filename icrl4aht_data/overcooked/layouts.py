@@ -8,13 +8,13 @@ a digit = ingredient pile, a space = floor. Source: paper, App. A.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from string import digits
 
 import numpy as np
 
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.actions import ACTIONS
-from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.plugins import Plugins
 
 EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from collections import OrderedDict
 
 import numpy as np
-
-from icrl4aht_data.utils.forks import ForkSafeLock
 
 _CACHE_BYTES = 256 * 2**20
 
@@ -25,8 +25,7 @@ class ChunkCache:
     def clear(self) -> None:
         """Drop all chunks."""
         self._chunks: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
-        self._bytes = 0
-        self._lock = ForkSafeLock()
+        self._bytes, self._process, self._lock = 0, os.getpid(), threading.Lock()
 
     def __getstate__(self) -> int:
         return self._size  # a pickled cache is empty: the receiver reads what it needs
@@ -35,7 +34,9 @@ class ChunkCache:
         self.__init__(size)
 
     def get(self, key: tuple[str, int]) -> np.ndarray | None:
-        """The chunk with the key (shard, row of its chunk table), or None."""
+        """Return the chunk with the key (shard, row of its chunk table), or None."""
+        if self._process != os.getpid():  # a fork, where the lock may be held by a thread that does not exist
+            self.clear()
         with self._lock:
             rows = self._chunks.get(key)
             if rows is not None:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Self, overload
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Self, overload
 
 import numpy as np
 
-from icrl4aht_data.format.schema import Entry, episode_returns
 from icrl4aht_data.plotting import curve_svg
-from icrl4aht_data.reading.lazy_array import LazyArray
 from icrl4aht_data.utils.options import check_position
-from icrl4aht_data.utils.signatures import show_method_types
 from icrl4aht_data.utils.text import facts_html
 
-ReadField = Callable[[str], LazyArray]
-"""Function from the name of a history's field to its lazy array."""
+if TYPE_CHECKING:
+    from icrl4aht_data.reading.history import History
 
 
 class Episode:
@@ -25,11 +22,8 @@ class Episode:
     `episode["actions"]` is the same as `episode.actions`.
 
     Args:
-        entry: the history's entry of the index.
+        history: its history.
         number: number of the episode in its history, from 0.
-        start: the episode's first step in its history.
-        stop: the step after its last one.
-        field: reads a field of the history.
 
     Attributes:
         entry: the history's entry of the index.
@@ -37,9 +31,10 @@ class Episode:
         start, stop: the episode's first step in its history, and the one after its last.
     """
 
-    def __init__(self, entry: Entry, number: int, start: int, stop: int, field: ReadField) -> None:
-        self.entry, self.number, self.start, self.stop = entry, number, start, stop
-        self._field = field
+    def __init__(self, history: History, number: int) -> None:
+        ends = history.episode_ends
+        self._history, self.entry, self.number = history, history.entry, number
+        self.start, self.stop = int(ends[number - 1]) if number else 0, int(ends[number])
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -65,10 +60,9 @@ class Episode:
         return facts_html(title, facts, curve_svg({"return": np.cumsum(rewards)}, "step"))
 
     def __getitem__(self, name: str) -> np.ndarray:
-        array = self._field(name)
         if name == "episode_end_state":
-            return array[self.number]
-        return array[self.start : self.stop]
+            return self._history.rows(name, self.number, self.number + 1)[0]
+        return self._history.rows(name, self.start, self.stop)
 
     __iter__ = None
     """Disabled: Python would otherwise count through `episode[0]`, `episode[1]`, which are no fields."""
@@ -131,23 +125,19 @@ class Episodes(Sequence[Episode]):
     order. Nothing but the ends of episodes is read before an episode's arrays are used.
 
     Args:
-        entry: the history's entry of the index.
-        field: reads a field of the history.
-        ends: returns the step after each of the history's episodes, int64 (E,).
+        history: the history.
         numbers: numbers of the episodes in their history; all of them by default.
     """
 
-    def __init__(
-        self, entry: Entry, field: ReadField, ends: Callable[[], np.ndarray], numbers: range | None = None
-    ) -> None:
-        self._entry, self._field, self._ends = entry, field, ends
-        self.numbers = range(entry.episodes) if numbers is None else numbers
+    def __init__(self, history: History, numbers: range | None = None) -> None:
+        self._history = history
+        self.numbers = range(history.entry.episodes) if numbers is None else numbers
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     def __repr__(self) -> str:
-        e, n = self._entry, len(self)
+        e, n = self._history.entry, len(self)
         part = "" if n == e.episodes else f" of {e.episodes}"
         return f"Episodes({n}{part} of history {e.history_id}: {e.layout} with {e.teammate_kind})"
 
@@ -159,19 +149,12 @@ class Episodes(Sequence[Episode]):
 
     def __getitem__(self, position: int | slice) -> Episode | Self:
         if isinstance(position, slice):
-            return type(self)(self._entry, self._field, self._ends, self.numbers[position])
-        number = self.numbers[check_position(repr(self), position, len(self))]
-        ends = self._ends()
-        start = int(ends[number - 1]) if number else 0
-        return Episode(self._entry, number, start, int(ends[number]), self._field)
+            return type(self)(self._history, self.numbers[position])
+        return Episode(self._history, self.numbers[check_position(repr(self), position, len(self))])
 
     def __iter__(self) -> Iterator[Episode]:
         return (self[position] for position in range(len(self)))
 
     def returns(self) -> np.ndarray:
         """Return the sum of the rewards of each of these episodes, float64 (E,)."""
-        returns = episode_returns(self._field("rewards")[:], self._field("dones")[:])
-        return returns[np.array(self.numbers, np.int64)]
-
-
-show_method_types(Episode)
+        return self._history.returns()[np.array(self.numbers, np.int64)]

@@ -1,8 +1,9 @@
-"""One learning history with its fields as lazy arrays."""
+"""One learning history, whose fields are NumPy arrays that are read at their first use."""
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -12,13 +13,9 @@ from icrl4aht_data.errors import LabelsMissingError, NotStoredError, OptionError
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
 from icrl4aht_data.overcooked.channels import Channels, observation_shape, to_canonical
 from icrl4aht_data.overcooked.fast_observe import fast_observe
-from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import Picture, animate_episode, curve_svg, plot_history
 from icrl4aht_data.reading.episodes import Episodes
-from icrl4aht_data.reading.lazy_array import LazyArray
-from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
-from icrl4aht_data.utils.forks import cached_property
-from icrl4aht_data.utils.signatures import show_method_types
+from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.system import new_array
 from icrl4aht_data.utils.text import counted_noun, facts_html
 
@@ -37,14 +34,13 @@ They are the fields `expert_actions` and `oracle_actions`."""
 class History:
     """One learning history: an ego that learns with one fixed teammate, T steps in E episodes.
 
-    `history.actions`, `.rewards`, `.obs` and so on are lazy arrays, which behave as NumPy arrays: indexing them reads
-    only the chunks it needs, anything else (`history.actions == history.expert_actions`) reads the field.
-    `history["actions"]` is the same as `history.actions`, and `history.episodes[-1].actions` are those of the last
-    episode.
+    `history.actions`, `.rewards`, `.obs` and so on are read-only NumPy arrays, read at first use and kept with the
+    history; `history["actions"]` is the same as `history.actions`. `history.read("obs", 0, 100)` reads only some rows,
+    and `history.episodes[-1].actions` are those of the last episode.
 
     Args:
         entry: the history's entry of the index.
-        shard: the shard that stores the history.
+        open_shard: returns the release's shard of a name, which is called at the first use of a field.
         obs: presentation of observations in `History.obs`; see `OBS`.
         channels: channels of `History.obs`, the layout's own or the canonical ones; see `channels.CHANNELS`.
 
@@ -52,11 +48,14 @@ class History:
         entry: the history's entry of the index: ids, layout, teammate, T, returns and others.
     """
 
-    def __init__(self, entry: Entry, shard: Shard, obs: Obs, channels: Channels = "own") -> None:
+    def __init__(self, entry: Entry, open_shard: Callable[[str], Shard], obs: Obs, channels: Channels = "own") -> None:
         self.entry = entry
-        self._shard = shard
-        self._obs: Obs = obs
-        self._canonical = channels == "canonical"
+        self._open_shard, self._obs, self._canonical = open_shard, obs, channels == "canonical"
+        self._arrays: dict[str, np.ndarray] = {}
+
+    @property
+    def _shard(self) -> Shard:
+        return self._open_shard(self.entry.shard)
 
     def __len__(self) -> int:
         return self.entry.T
@@ -86,10 +85,12 @@ class History:
         }
         return facts_html(f"History {e.history_id}", facts, curve_svg({e.source: self.returns()}))
 
-    def __getitem__(self, name: str) -> LazyArray:
-        if name == "obs":
-            return self.obs
-        return self._lazy(name)
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._arrays:
+            array = self.rows(name, 0, self.entry.T if name == "obs" else self.entry.rows(self._field(name)))
+            array.flags.writeable = False  # every later access returns the same array
+            self._arrays[name] = array
+        return self._arrays[name]
 
     __iter__ = None
     """Disabled: Python would otherwise count through `history[0]`, `history[1]`, which are no fields."""
@@ -110,18 +111,33 @@ class History:
 
         Raises:
             UnknownNameError: for a name that is not a field.
+            OptionError: if `start` or `stop` is not an integer.
             LabelsMissingError: for expert, oracle or teammate actions of a history without them.
             NotStoredError: for states of a release without state records.
             ShardCorruptError: names the chunk whose checksum is wrong.
         """
         field = self._field(name)
-        rows = self.entry.rows(field)
-        start, stop, _ = slice(start, stop).indices(rows)
+        try:
+            start, stop, _ = slice(start, stop).indices(self.entry.rows(field))
+        except TypeError as error:
+            raise OptionError(f"rows {start!r} to {stop!r} of {name}: expected integers, as in a slice") from error
         stop = max(start, stop)
         if self.kind in field.absent:
             return self._rendered(start, stop, np.uint8, canonical=False)
-        fetch_rows([RowRange(self._shard, self.entry.history_id, field, start, stop)])
         return self._shard.read(self.entry.history_id, field, start, stop)
+
+    def rows(self, name: str, start: int, stop: int) -> np.ndarray:
+        """Return rows start..stop of a field as its property has them, which differs from `read` for "obs"."""
+        if name in self._arrays:
+            return self._arrays[name][start:stop]
+        if name != "obs":
+            return self.read(name, start, stop)
+        if self._obs == "state":
+            return self.read("state", start, stop)
+        if self.kind in FIELDS["obs"].absent:
+            return self._rendered(start, stop, self._obs, self._canonical)
+        rows = self.read("obs", start, stop)
+        return (to_canonical(self._shard.layout, rows) if self._canonical else rows).astype(self._obs, copy=False)
 
     def _rendered(self, start: int, stop: int, dtype: DTypeLike, canonical: bool) -> np.ndarray:
         """Observations (stop - start, 5, 5, C) of a release that stores states only."""
@@ -146,81 +162,61 @@ class History:
             )
         return field
 
-    def _lazy(self, name: str, dtype: DTypeLike | None = None) -> LazyArray:
-        """A field that is read when it is used, in the field's dtype or another one."""
-        field = self._field(name)
-        dtype = np.dtype(field.dtype if dtype is None else dtype)
-        layout, is_obs = get_layout(self.entry.layout), field.row == "obs"
-        row = observation_shape(layout, self._canonical) if is_obs else field.element(layout, "full").shape
-        read = partial(self._rows, name, dtype)
-        return LazyArray(f"{name} of history {self.entry.history_id}", (self.entry.rows(field), *row), dtype, read)
-
-    def _rows(self, name: str, dtype: np.dtype, start: int, stop: int) -> np.ndarray:
-        field = FIELDS[name]
-        if self.kind in field.absent:
-            return self._rendered(start, stop, dtype, self._canonical)
-        rows = self.read(name, start, stop)
-        if field.row == "obs" and self._canonical:
-            rows = to_canonical(self._shard.layout, rows)
-        return rows.astype(dtype, copy=False)
-
     @property
-    def obs(self) -> LazyArray:
+    def obs(self) -> np.ndarray:
         """(T, 5, 5, C) float32 or uint8: observations; or (T, S) uint8: state records, if the dataset's obs="state".
 
         With channels="canonical", C is 46 on every layout.
         """
-        if self._obs == "state":
-            return self._lazy("state")
-        return self._lazy("obs", self._obs)
+        return self["obs"]
 
     @property
-    def state(self) -> LazyArray:
+    def state(self) -> np.ndarray:
         """(T, S) uint8: the state record before each step; see `overcooked.state`."""
-        return self._lazy("state")
+        return self["state"]
 
     @property
-    def actions(self) -> LazyArray:
+    def actions(self) -> np.ndarray:
         """(T,) int32: the ego's actions, 0..5."""
-        return self._lazy("actions")
+        return self["actions"]
 
     @property
-    def rewards(self) -> LazyArray:
+    def rewards(self) -> np.ndarray:
         """(T,) float32: the team's reward of each step, without shaping."""
-        return self._lazy("rewards")
+        return self["rewards"]
 
     @property
-    def dones(self) -> LazyArray:
+    def dones(self) -> np.ndarray:
         """(T,) bool: True at the last kept step of each episode."""
-        return self._lazy("dones")
+        return self["dones"]
 
     @property
-    def teammate_actions(self) -> LazyArray:
+    def teammate_actions(self) -> np.ndarray:
         """(T,) int32: the teammate's actions, 0..5."""
-        return self._lazy("teammate_actions")
+        return self["teammate_actions"]
 
     @property
-    def expert_actions(self) -> LazyArray:
+    def expert_actions(self) -> np.ndarray:
         """(T,) int32: greedy actions of one policy at the same steps, 0..5; what it earns is `entry.expert_return`.
 
         The policy is the learner's last checkpoint, as in the paper (App. D.1), or an earlier one that earns more: see
         `entry.expert_step`.
         """
-        return self._lazy("expert_actions")
+        return self["expert_actions"]
 
     @property
-    def oracle_actions(self) -> LazyArray:
+    def oracle_actions(self) -> np.ndarray:
         """(T,) int32: actions of the scripted oracle at the same steps, 0..5; it knows the full state.
 
         In a history of source "noise" these are what the ego meant to do, its actions without the noise, and they equal
         `expert_actions`, where they are read from if the release does not store them twice.
         """
-        return self._lazy("oracle_actions")
+        return self["oracle_actions"]
 
     @property
-    def episode_end_state(self) -> LazyArray:
+    def episode_end_state(self) -> np.ndarray:
         """(E, S) uint8: the state after each episode's last kept step."""
-        return self._lazy("episode_end_state")
+        return self["episode_end_state"]
 
     def returns(self) -> np.ndarray:
         """Return the learning curve, float64 (E,): each episode's return over its kept steps."""
@@ -229,10 +225,10 @@ class History:
     @property
     def episodes(self) -> Episodes:
         """The episodes, a sequence: `history.episodes[-1].actions` are the actions of the last one."""
-        return Episodes(self.entry, self.__getitem__, lambda: self._ends)
+        return Episodes(self)
 
     @cached_property
-    def _ends(self) -> np.ndarray:
+    def episode_ends(self) -> np.ndarray:
         """int64 (E,): the step after each episode."""
         return np.flatnonzero(self.read("dones")) + 1
 
@@ -267,6 +263,3 @@ class History:
             )
         chosen = self.episodes[int(episode)]
         return animate_episode(self._shard.layout, chosen.state, chosen.rewards, repr(chosen), cell=cell, fps=fps)
-
-
-show_method_types(History)

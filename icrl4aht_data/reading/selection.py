@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
 
 from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, unknown
+from icrl4aht_data.fetch import ReleaseLocation
 from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.provenance import ProvenanceByTask, read_provenance
@@ -28,9 +30,6 @@ from icrl4aht_data.reading.sources import (
     decoded_size,
     open_source,
 )
-from icrl4aht_data.remote.remote_release import ReleaseLocation
-from icrl4aht_data.remote.store import Traffic
-from icrl4aht_data.utils.forks import ForkSafeLock, cached_property
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.options import check_int, check_position
 from icrl4aht_data.utils.system import usable_cores
@@ -106,7 +105,7 @@ class Selection:
         self.origin, self.index, self._shards = location, index, shards
         self.options = options
         self.ids = np.arange(len(index.entries)) if ids is None else ids
-        self._lock = ForkSafeLock()
+        self._source: HistorySource | None = None
         if self.obs == "state" and not self.has_states:
             raise OptionError(
                 f'obs = "state": {location} has observations only, no state records; take float32 or uint8'
@@ -153,12 +152,6 @@ class Selection:
     def root(self) -> Path:
         """The release's folder on this machine; for a remote release the folder of downloaded files."""
         return self.origin.folder
-
-    @property
-    def traffic(self) -> Traffic:
-        """Requests sent to the release's remote and bytes received from it so far; zero for a local release."""
-        remote = self.origin.remote
-        return Traffic() if remote is None else remote.store.traffic
 
     @property
     def info(self) -> ReleaseInfo:
@@ -253,7 +246,7 @@ class Selection:
             UnknownNameError: if the release has no history with that id.
         """
         entry = self.index.entry(history_id)
-        return History(entry, self._shards.open(entry.shard), self.obs, self.channels)
+        return History(entry, self._shards.open, self.obs, self.channels)
 
     def column(self, name: str) -> np.ndarray:
         """Return one index field of the selected histories: a field of `Entry`, such as "layout" or "return_end".
@@ -339,9 +332,6 @@ class Selection:
     @cached_property
     def cache(self) -> CacheChoice:
         """The cache mode that samplers use for this selection, and the reason; see `sources.CACHE_MODES`."""
-        absent = [name for name in self.shards if not self.origin.is_here(name)]
-        if self.options.cache == "auto" and absent:
-            return CacheChoice("stream", f"{len(absent)} of {len(self.shards)} shards are not downloaded")
         size = 0
         for number, layout in enumerate(self.layouts):
             members = self.layout_numbers == number
@@ -352,14 +342,9 @@ class Selection:
     @property
     def storage(self) -> HistorySource:
         """Source of the selection's rows in the mode `cache`; `ram` and `mmap` decode them at the first access."""
-        with self._lock:
-            return self._storage
-
-    @cached_property
-    def _storage(self) -> HistorySource:
-        if self.origin.remote is not None and self.cache.cache != "stream":
-            self.origin.remote.fetch(self.shards)
-        return open_source(self.cache.cache, self.entries, self._shards.open, self.threads)
+        if self._source is None:  # no lock, which a fork could leave held: two threads at once would both decode
+            self._source = open_source(self.cache.cache, self.entries, self._shards, self.threads)
+        return self._source
 
     def forget_chunks(self) -> None:
         """Clear the cache of decoded chunks that all selections of this release share."""

@@ -7,17 +7,18 @@ reads a chunk's bytes at the offset in the chunk table, checks their hash and in
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from icrl4aht_data.errors import (
+    ReleaseError,
     ShardCorruptError,
     ShardMismatchError,
     ShardMissingError,
     ShardTruncatedError,
     ShardUnreadableError,
 )
+from icrl4aht_data.fetch import ReleaseLocation
 from icrl4aht_data.format.chunks import (
     DEFLATE_RATIO,
     check_chunk,
@@ -30,8 +31,6 @@ from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.chunk_cache import ChunkCache
-from icrl4aht_data.remote.partial_file import PartialFile, fetch_chunks
-from icrl4aht_data.remote.remote_release import ReleaseLocation
 from icrl4aht_data.utils.files import resolve_inside
 from icrl4aht_data.utils.system import new_array
 
@@ -40,7 +39,7 @@ class Shard:
     """One shard of a release: reads rows of its histories. May be shared between threads and pickled.
 
     Args:
-        location: the release. If it is remote, opening downloads the chunk table, and reading the chunks it needs.
+        location: the release. If it is remote, opening downloads the shard and its chunk table.
         name: path of the shard in the release.
         info: the release's info.
         entries: all histories of the shard, in index order.
@@ -70,10 +69,11 @@ class Shard:
         self.format_version = info.format_version
         self.layout = get_layout(entries[0].layout)
         self.entries = {entry.history_id: entry for entry in entries}
-        self._remote = location.remote
         self._cache = cache or ChunkCache()
         self._elements = {field.name: field.element(self.layout, self.kind) for field in FIELDS.values()}
         self._first: dict[tuple[int, str], int] = {}  # (history id, field) -> row of its first chunk in the table
+        if location.remote is not None:
+            location.remote.fetch([chunk_table_name(name), name])
         self.table = read_table(location.file(chunk_table_name(name)))
         self._check_table()
         self.table = np.array(self.table)  # only now: before the check the file might be far too large for memory
@@ -111,15 +111,10 @@ class Shard:
 
     def _check_size(self) -> None:
         """Check that the file is long enough for every chunk."""
-        if self._remote is not None:
-            size = self._remote.size(self.name)
-        else:
-            try:
-                size = self.path.stat().st_size
-            except FileNotFoundError as error:
-                raise self._missing() from error
-            except OSError as error:
-                raise self._unreadable(error) from error
+        try:
+            size = self.path.stat().st_size
+        except OSError as error:
+            raise self._unreadable(error) from error
         offset, length = self.table["offset"], self.table["size"]
         if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
             raise ShardMismatchError(f"{self.path}: has {size} bytes, of which the chunk table gives some twice")
@@ -130,18 +125,12 @@ class Shard:
                 f"fetch the shard again, then run `icrl4aht-data verify`"
             )
 
-    def _missing(self) -> ShardMissingError:
-        return ShardMissingError(f"{self.path}: the index names this shard, but there is no such file")
-
-    def _unreadable(self, error: OSError) -> ShardUnreadableError:
+    def _unreadable(self, error: OSError) -> ReleaseError:
+        if isinstance(error, FileNotFoundError):
+            return ShardMissingError(f"{self.path}: the index names this shard, but there is no such file")
         return ShardUnreadableError(
             f"{self.path}: cannot be read: {error.strerror or error}; check its permissions and the disk"
         )
-
-    @property
-    def is_remote(self) -> bool:
-        """Whether reading may download chunks."""
-        return self._remote is not None
 
     def read(self, history_id: int, field: Field, start: int, stop: int) -> np.ndarray:
         """Rows start..stop of a field, in the field's dtype. The range must be within the history.
@@ -209,30 +198,20 @@ class Shard:
         Raises:
             ShardCorruptError: if they are damaged; names the chunk.
         """
-        data = self.stored_bytes(self.table[row])
-        try:
-            check_chunk(data, self.table[row])
-        except ValueError as error:
-            if self._remote is not None:
-                return self._remote.part(self.name).chunk(self.table[row])
-            raise ShardCorruptError(
-                f"{self.path}: {self.describe(row)}: {error}; the file is damaged, fetch the shard again"
-            ) from error
-        return data
-
-    def stored_bytes(self, row: np.void) -> bytes:
-        """Bytes of the file, unchecked; a remote's are downloaded if those here are not the ones of the chunk table."""
-        offset, size = row.item()[:2]
+        offset, size = self.table[row].item()[:2]
         try:
             with self.path.open("rb", buffering=0) as stream:
                 stream.seek(offset)
-                return stream.read(size)
-        except FileNotFoundError as error:
-            if self._remote is None:
-                raise self._missing() from error
-            return self._remote.part(self.name).chunk(row)
+                data = stream.read(size)
+            check_chunk(data, self.table[row])
         except OSError as error:
             raise self._unreadable(error) from error
+        except ValueError as error:
+            raise ShardCorruptError(
+                f"{self.path}: {self.describe(row)}: {error}; the file is damaged: `icrl4aht-data verify --repair` "
+                f"fetches it again"
+            ) from error
+        return data
 
     def _first_chunk(self, history_id: int, field: Field) -> int:
         """Row in the chunk table of the first chunk with a field's values."""
@@ -240,20 +219,6 @@ class Shard:
 
     def _chunk_rows(self, history_id: int, field: Field) -> int:
         return min(field.chunk, self.entries[history_id].rows(field))
-
-    def missing_chunks(self, ranges: Iterable[RowRange]) -> list[tuple[PartialFile, np.ndarray]]:
-        """The chunks of a remote shard with some rows that are not in memory, as `fetch_chunks` takes them.
-
-        Empty for a shard on this machine's disk.
-        """
-        if self._remote is None or self._remote.is_here(self.name):
-            return []
-        wanted = set()
-        for _, history_id, field, start, stop in ranges:
-            first, length = self._first_chunk(history_id, field), self._chunk_rows(history_id, field)
-            wanted.update(range(first + start // length, first + -(-stop // length)))
-        rows = [row for row in sorted(wanted) if self._cache.get((self.name, row)) is None]
-        return [(self._remote.part(self.name), self.table[rows])] if rows else []
 
     def fingerprint(self, history_id: int) -> bytes:
         """Names of a history's fields and hashes of its chunks, which differ where its stored content differs."""
@@ -280,36 +245,6 @@ class Shard:
         return f"chunk {row - first} of {name} in history {history_id} (bytes {offset}..{offset + size})"
 
 
-class RowRange(NamedTuple):
-    """Rows start..stop of one field of a history.
-
-    Attributes:
-        shard: the shard that stores the history.
-        history_id: id of the history.
-        field: the field.
-        start: first row.
-        stop: row after the last one.
-    """
-
-    shard: Shard
-    history_id: int
-    field: Field
-    start: int
-    stop: int
-
-
-def fetch_rows(ranges: Iterable[RowRange]) -> None:
-    """Download the chunks with these rows that are missing on this machine, from all shards in parallel.
-
-    Raises:
-        RemoteError: if a chunk cannot be downloaded.
-    """
-    of_shard: dict[Shard, list[RowRange]] = {}
-    for one in ranges:
-        of_shard.setdefault(one.shard, []).append(one)
-    fetch_chunks(part for shard, some in of_shard.items() for part in shard.missing_chunks(some))
-
-
 class Shards:
     """The shards of a release, each opened when it is first read.
 
@@ -324,9 +259,15 @@ class Shards:
         self.cache = ChunkCache()
 
     def open(self, name: str) -> Shard:
-        """The shard with that path in the release."""
+        """The shard with that path in the release, fetched first if the release is remote."""
         if name not in self._open:
             entries = self._index.entries
             members = [entries[row] for row in entries.shard_rows(name).tolist()]
             self._open[name] = Shard(self._location, name, self._index.info, members, self.cache)
         return self._open[name]
+
+    def fetch(self, names: Iterable[str]) -> None:
+        """Fetch shards of a remote release and their chunk tables, several at once, before they are opened."""
+        closed = [name for name in dict.fromkeys(names) if name not in self._open]
+        if self._location.remote is not None and closed:
+            self._location.remote.fetch([*map(chunk_table_name, closed), *closed])

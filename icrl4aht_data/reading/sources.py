@@ -11,16 +11,16 @@ records the observation itself; see `schema.record_field`.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from icrl4aht_data.format.cached_arrays import cache_room, cached_arrays, new_mapped_array
 from icrl4aht_data.format.schema import FIELDS, Entry, Kind, held_fields
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.reading.shard import RowRange, Shard, fetch_rows
-from icrl4aht_data.utils.cached_arrays import cache_room, cached_arrays, new_mapped_array
+from icrl4aht_data.reading.shard import Shard, Shards
 from icrl4aht_data.utils.system import free_memory, gigabytes, in_slices
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
@@ -67,11 +67,11 @@ class HistorySource(Protocol):
     """Reader of rows of the histories of a selection; requests refer to histories by their positions in it."""
 
     def read(self, requests: Sequence[ReadRequest]) -> None:
-        """Carry out requests, in parallel. Chunks of a remote release that they need are downloaded first, all at once.
+        """Carry out requests, in parallel. Shards of a remote release that they need are downloaded first.
 
         Raises:
             ShardCorruptError: names the chunk whose checksum is wrong.
-            RemoteError: if a chunk cannot be downloaded.
+            RemoteError: if a shard cannot be downloaded.
         """
         ...
 
@@ -97,26 +97,24 @@ def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episode
     return sum(rows[field.axis] * field.held(layout).itemsize for field in held_fields(kind))
 
 
-def open_source(
-    cache: CacheMode, entries: Sequence[Entry], open_shard: Callable[[str], Shard], threads: int
-) -> HistorySource:
+def open_source(cache: CacheMode, entries: Sequence[Entry], shards: Shards, threads: int) -> HistorySource:
     """Open the histories of a selection; `ram` and `mmap` decode them.
 
     Args:
         cache: "ram", "mmap" or "stream".
         entries: index entries, (H,), in the selection's order; a history may occur more than once.
-        open_shard: shard name -> shard.
+        shards: the release's shards.
         threads: how many decode and copy.
     """
     if cache == "stream":
-        return StreamedSource(entries, [open_shard(entry.shard) for entry in entries], threads)
+        return StreamedSource(entries, shards, threads)
+    shards.fetch(entry.shard for entry in entries)
     hold = _arrays_in_memory if cache == "ram" else _mapped_arrays
     source = FlatSource(entries, threads)
     for name in dict.fromkeys(entry.layout for entry in entries):
         by_id = {entry.history_id: entry for entry in entries if entry.layout == name}
         members = [by_id[history_id] for history_id in sorted(by_id)]
-        shards = [open_shard(entry.shard) for entry in members]
-        source.add(members, hold(members, shards, threads))
+        source.add(members, hold(members, [shards.open(entry.shard) for entry in members], threads))
     return source
 
 
@@ -206,39 +204,42 @@ class FlatSource:
     def _read(self, request: ReadRequest) -> None:
         name, histories, rows, out = request
         if len(self._arrays) == 1:
-            self._copy(self._arrays[0][name], *request)
+            self._read_layout(self._arrays[0][name], request)
             return
         layout = self._layout[histories]
-        for number, arrays in enumerate(self._arrays):
-            chosen = np.flatnonzero(layout == number)
-            if not len(chosen):
-                continue
-            array = arrays[name]
+        for number in np.unique(layout).tolist():
+            chosen, array = np.flatnonzero(layout == number), self._arrays[number][name]
             part = np.empty((len(chosen), out.shape[1], *array.shape[1:]), out.dtype)
-            self._copy(array, name, histories[chosen], rows[chosen], part)
-            if part.shape == (len(chosen), *out.shape[1:]):
+            self._read_layout(array, ReadRequest(name, histories[chosen], rows[chosen], part))
+            if out.ndim == 2:
                 out[chosen] = part
-            else:  # a shorter state record, or an observation of fewer channels
+            else:  # a state record may be shorter than the longest one, an observation may have fewer channels
                 out[chosen, ..., : part.shape[-1]] = part
                 out[chosen, ..., part.shape[-1] :] = 0
 
-    def _copy(self, array: np.ndarray, name: str, histories: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
-        axis, length = FIELDS[name].axis, out.shape[1]
-        first = self._first[axis][histories]
+    def _read_layout(self, array: np.ndarray, request: ReadRequest) -> None:
+        """Carry out a request for histories that are all in one array."""
+        name, histories, rows, out = request
+        first, count, length = self._first[FIELDS[name].axis][histories], self._rows[FIELDS[name].axis], out.shape[1]
         if rows.ndim == 2:
-            if out.dtype == array.dtype:
-                np.take(array, first[:, None] + rows, axis=0, out=out, mode="clip")  # other modes copy once more
-            else:
-                out[...] = array[first[:, None] + rows]
+            gather_rows(array, first[:, None] + rows, out)
             return
-        first = first + rows
-        beyond = rows + length - self._rows[axis][histories]
-        if length <= len(array) and (beyond <= 1).all():  # one step beyond is the row of zeros
-            _copy_windows(array, first, out)
+        # Windows that end at most one step behind their history, at its row of zeros, are contiguous in the array.
+        # Copied as blocks, 64 windows of 500 state records take 0.2 ms; gathered row by row 2 ms.
+        if length <= len(array) and (rows + length - count[histories] <= 1).all():
+            _copy_windows(array, first + rows, out)
             return
-        for row, (begin, missing) in enumerate(zip(first.tolist(), np.maximum(beyond, 0).tolist(), strict=True)):
-            kept = max(length - missing, 0)
-            out[row, :kept], out[row, kept:] = array[begin : begin + kept], 0
+        steps = rows[:, None] + np.arange(length)
+        gather_rows(array, first[:, None] + steps, out)
+        out[steps >= count[histories][:, None]] = 0
+
+
+def gather_rows(array: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
+    """Copy array[rows[i, j]] to out[i, j], cast to its dtype; rows beyond the array are replaced by its nearest one."""
+    if out.dtype == array.dtype:
+        np.take(array, rows, axis=0, out=out, mode="clip")  # other modes copy once more
+    else:
+        out[...] = np.take(array, rows, axis=0, mode="clip")
 
 
 def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
@@ -255,34 +256,28 @@ def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None
 
 
 class StreamedSource:
-    """Histories in their shards, read a few chunks at a time."""
+    """Histories in their shards, read a few chunks at a time; a shard is opened when it is first needed."""
 
-    def __init__(self, entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> None:
+    def __init__(self, entries: Sequence[Entry], shards: Shards, threads: int) -> None:
         self._entries, self._shards, self._threads = entries, shards, threads
-        self._remote = any(shard.is_remote for shard in shards)
 
     def __repr__(self) -> str:
-        shards = counted_noun(len({shard.path for shard in self._shards}), "shard")
+        shards = counted_noun(len({entry.shard for entry in self._entries}), "shard")
         return f"{type(self).__name__}({counted_histories(len(self._entries))} in {shards})"
 
     def read(self, requests: Sequence[ReadRequest]) -> None:
-        if self._remote:
-            fetch_rows(part for request in requests for part in self._ranges(request))
+        positions = {position for request in requests for position in request.histories.tolist()}
+        names = sorted({self._entries[position].shard for position in positions})
+        self._shards.fetch(names)
+        for name in names:  # before the threads start, so that each shard is opened once
+            self._shards.open(name)
         _on_threads(self._read, requests, self._threads)
-
-    def _ranges(self, request: ReadRequest) -> Iterator[RowRange]:
-        """The rows that a request reads of each history."""
-        field, rows = FIELDS[request.field], request.rows
-        low, high = (rows.min(axis=1), rows.max(axis=1) + 1) if rows.ndim == 2 else (rows, rows + request.out.shape[1])
-        for position, start, stop in zip(request.histories.tolist(), low.tolist(), high.tolist(), strict=True):
-            entry = self._entries[position]
-            stop = min(stop, entry.rows(field))
-            yield RowRange(self._shards[position], entry.history_id, field, max(start, 0), stop)
 
     def _read(self, request: ReadRequest) -> None:
         field = FIELDS[request.field]
         for position, rows, out in zip(request.histories.tolist(), request.rows, request.out, strict=True):
-            history_id, shard = self._entries[position].history_id, self._shards[position]
+            entry = self._entries[position]
+            history_id, shard = entry.history_id, self._shards.open(entry.shard)
             if field.row != "scalar":
                 size = field.held(shard.layout).shape[-1]
                 out[..., size:] = 0
@@ -292,7 +287,7 @@ class StreamedSource:
                 out[...] = shard.read(history_id, field, low, int(rows.max()) + 1)[rows - low]
                 continue
             begin = int(rows)
-            low, high = max(begin, 0), min(begin + len(out), self._entries[position].rows(field))
+            low, high = max(begin, 0), min(begin + len(out), entry.rows(field))
             if high - low < len(out):
                 out[...] = 0
             if low < high:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, Unpack, cast
 
 import numpy as np
@@ -14,9 +15,7 @@ from icrl4aht_data.sampling.base import Sampler, SamplerOptions, batch_repr, des
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
-from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.options import check_int
-from icrl4aht_data.utils.signatures import show_types
 
 if TYPE_CHECKING:
     import jax  # noqa: F401 - in the sampler's base class
@@ -239,6 +238,3 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
             for array in (batch.obs, *(read.out for read in reads[1:])):
                 array[~batch.attention_mask] = 0
         return batch
-
-
-show_types(ADSampler.__init__, Sampler.__init__, SamplerOptions.__annotations__)

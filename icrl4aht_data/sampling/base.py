@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Iterator
+from functools import cached_property
 from textwrap import indent
 from typing import Any, Generic, SupportsIndex, TypedDict, TypeVar, overload
 
@@ -15,7 +16,6 @@ from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.sampling.draws import Curriculum, EpisodeRange, HistoryDraws, Weights, random_uint32
 from icrl4aht_data.sampling.observer import ArraySpec, Observer
-from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.system import array_bytes, fits, free_memory, gigabytes
 from icrl4aht_data.utils.text import counted_histories, counted_noun

@@ -12,7 +12,6 @@ from typing import Any, Generic, Protocol, TypeVar
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.utils.options import check_int
-from icrl4aht_data.utils.signatures import show_method_types
 
 B = TypeVar("B")
 
@@ -219,6 +218,3 @@ def _device_put(device: Any) -> Callable[[Any], Any]:
         return jax.block_until_ready(jax.tree.map(one, batch))
 
     return put
-
-
-show_method_types(Batches)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, Unpack
 
 import numpy as np
@@ -14,9 +15,7 @@ from icrl4aht_data.sampling.base import Sampler, SamplerOptions, batch_repr, des
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
 from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
-from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.options import check_int
-from icrl4aht_data.utils.signatures import show_types
 
 if TYPE_CHECKING:
     import jax  # noqa: F401 - in the sampler's base class
@@ -240,6 +239,3 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
     def _step_of(self, transition: np.ndarray) -> np.ndarray:
         """Return numbers of steps for numbers of transitions, both counted from the first one of the history."""
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)
-
-
-show_types(DPTSampler.__init__, Sampler.__init__, SamplerOptions.__annotations__)

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from icrl4aht_data.errors import PluginError
-from icrl4aht_data.utils.forks import cached_property
 from icrl4aht_data.utils.installation import PACKAGE
 
 METHOD_GROUP = "icrl4aht.methods"

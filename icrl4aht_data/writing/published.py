@@ -44,7 +44,6 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import resolve_inside, write_json
 from icrl4aht_data.utils.options import check_int
-from icrl4aht_data.writing.hdf5_sink import new_hdf5
 from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
 from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
@@ -88,12 +87,11 @@ def to_published(
     recorded = read_provenance(dataset.origin.file(PROVENANCE))
     provenance = {name: with_source(of_task, sources[name]) for name, of_task in recorded.items() if name in sources}
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
-        with new_hdf5(folder / HISTORIES_H5) as new, (folder / HISTORIES_INDEX).open("w") as index:
+        with h5py.File(folder / HISTORIES_H5, "w") as new, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
-                group = new.file.create_group(f"/{number}")
+                group = new.create_group(f"/{number}")
                 for field in (one for one in history.entry.stored_fields(kind) if one.name != "oracle_actions"):
                     _write_published(group, field.name, history.read(field.name), chunk)
-                    new.check()
                 line = history.entry.to_json() | {"history_id": number, "h5_group": f"/{number}"}
                 line["env_idx"] += history.entry.learner * _streams_each(provenance.get(history.entry.task_id))
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")

@@ -11,9 +11,9 @@ from pathlib import Path
 from filelock import Timeout
 
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.fetch import is_address
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.remote.remote_release import is_address
 from icrl4aht_data.utils.files import explain_full_disk, files_below, lock_path, process_lock
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"

@@ -8,33 +8,23 @@ import shutil
 import subprocess
 import sys
 
-import numpy as np
 import pytest
-from filelock import FileLock
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.manifest import parse_manifest, write_manifest
-from icrl4aht_data.utils.cached_arrays import cached_arrays
 from icrl4aht_data.utils.files import atomic_write
 from tests.helpers.paths import ROOT
 from tests.robustness.faults.series import FAMILIES, run
 from tests.robustness.faults.workspace import Workspace
 from tests.robustness.limits import file_size_limit
 
-SLOW = {"slow server", "cache build killed", "download killed", "two readers at once", "two cache builds at once"}
+SLOW = {"cache build killed", "two readers at once", "two cache builds at once"}
 """Families of which one attempt takes more than a second."""
-QUICK = {"bit flips": 9, "mutated index or manifest": 5, "disk full": 2, "cache's disk full": 2, "damaged caches": 3}
+QUICK = {"bit flips": 9, "mutated index or manifest": 5, "disk full": 2, "damaged caches": 3}
 """Attempts in the default tests; one of every other family."""
-LONG = {
-    "bit flips": 1000,
-    "damaged caches": 20,
-    "mapped arrays' disk full": 1,
-    "mutated index or manifest": 25,
-    "slow server": 8,
-    "429 with Retry-After": 3,
-}
-"""Attempts in the slow tests; two of the families in `SLOW`, of S3 and of version changes, four of every other."""
+LONG = {"bit flips": 1000, "damaged caches": 20, "mapped arrays' disk full": 1, "mutated index or manifest": 25}
+"""Attempts in the slow tests; two of the families in `SLOW`, four of every other."""
 
 
 @pytest.fixture(scope="module")
@@ -43,12 +33,12 @@ def workspace(tmp_path_factory) -> Workspace:
 
 
 def _attempts(name: str) -> int:
-    return LONG.get(name, 2 if name in SLOW or name.startswith(("s3", "version", "two")) else 4)
+    return LONG.get(name, 2 if name in SLOW else 4)
 
 
 @pytest.mark.parametrize(
     ("name", "count"),
-    [(name, QUICK.get(name, 1)) for name in FAMILIES if name not in SLOW and not name.startswith("s3")]
+    [(name, QUICK.get(name, 1)) for name in FAMILIES if name not in SLOW]
     + [pytest.param(name, _attempts(name), marks=pytest.mark.slow) for name in FAMILIES],
 )
 def test_nothing_is_lost(workspace, name, count, capsys):
@@ -83,17 +73,6 @@ def test_a_manifest_without_its_last_byte_is_cut_off(workspace):
     text = (workspace.small / "MANIFEST.sha256").read_text()
     with pytest.raises(IndexFormatError, match=r"MANIFEST: cut off: its last line has no end"):
         parse_manifest(text[:-1], "MANIFEST")
-
-
-def test_leftovers_of_killed_builds_are_removed(tmp_path, monkeypatch):
-    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path))
-    for name in (".one.partial", ".two.removed-1", ".building.partial"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "a.npy").write_bytes(bytes(100))
-    key = f"three-{0:032x}"
-    with FileLock(tmp_path / ".building.lock"):
-        cached_arrays(key, 8, lambda folder: np.save(folder / "b.npy", np.zeros(1)))
-    assert {path.name for path in tmp_path.iterdir()} == {".building.lock", ".building.partial", key}
 
 
 def test_an_error_of_the_disk_names_the_file(tmp_path):

@@ -67,7 +67,8 @@ def info(call: Call) -> Answer:
     commit = repo.resolve(call.names.get("revision", "main"))
     data = {"_id": "0" * 24, "id": repo.id, "author": repo.id.split("/")[0], "sha": commit.oid, "gated": False}
     data |= {"lastModified": commit.date, "private": repo.private, "disabled": False, "downloads": 0, "likes": 0}
-    return answer(data | {"tags": [], "siblings": [{"rfilename": path} for path in commit.files]})
+    siblings = [{"rfilename": path, "size": file.size} for path, file in commit.files.items()]
+    return answer(data | {"tags": [], "siblings": siblings})
 
 
 def tree(call: Call) -> Answer:

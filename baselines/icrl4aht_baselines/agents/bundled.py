@@ -20,7 +20,7 @@ from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, CONFIG, RUN_CURVES, read_config
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.remote.remote_release import is_address
+from icrl4aht_data.fetch import is_address
 from icrl4aht_data.utils.files import parse_json, read_text
 
 MODELS = Path(__file__).parents[1] / "models"

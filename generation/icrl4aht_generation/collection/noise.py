@@ -25,10 +25,10 @@ import jax
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.format.cached_arrays import new_mapped_array
 from icrl4aht_data.format.schema import curve_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.cached_arrays import new_mapped_array
 from icrl4aht_generation.collection.noise_rollout import (
     EPISODES_AT_ONCE,
     NoisyEpisodes,

@@ -28,7 +28,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import DiskFullError, IndexFormatError
-from icrl4aht_data.utils.cached_arrays import new_mapped_array
+from icrl4aht_data.format.cached_arrays import new_mapped_array
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 from icrl4aht_generation.collection.record import HistoryArrays, array_shapes, record_rollout

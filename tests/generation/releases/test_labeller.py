@@ -26,12 +26,12 @@ from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LABEL_EPISODES
+from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.remote.download import fetch_planned, plan_download
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release

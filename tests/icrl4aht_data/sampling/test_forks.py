@@ -8,7 +8,6 @@ import sys
 
 import pytest
 
-from icrl4aht_data.utils.forks import ForkSafeLock, cached_property
 from tests.helpers.paths import ROOT
 
 FORK = """
@@ -76,24 +75,3 @@ def test_a_child_makes_batches(lite, tmp_path):
     )
     assert run.returncode == 0, run.stderr
     assert run.stdout.splitlines() == ["ram 0", "mmap 0", "stream 0"]
-
-
-def test_a_cached_property_is_computed_once_without_a_lock():
-    class Once:
-        calls = 0
-
-        @cached_property
-        def value(self) -> int:
-            self.calls += 1
-            return 7
-
-    one = Once()
-    assert (one.value, one.value, one.calls) == (7, 7, 1)
-
-
-def test_a_renewed_lock_is_free():
-    lock = ForkSafeLock()
-    lock.__enter__()
-    lock.renew()
-    with lock:
-        pass

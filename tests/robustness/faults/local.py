@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
@@ -22,57 +21,38 @@ import numpy as np
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.errors import CacheError, Icrl4ahtError
 from icrl4aht_data.format import columns
-from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.reading.sources import CacheMode
-from icrl4aht_data.remote.download import fetch_planned, plan_download
-from icrl4aht_data.remote.partial_file import PartialFile
-from icrl4aht_data.remote.store import Store
-from icrl4aht_data.utils import remembered
 from tests.helpers.damages import DAMAGES, contents
 from tests.helpers.paths import ROOT
-from tests.robustness.faults.remote import ALWAYS, ANY, on_http
-from tests.robustness.faults.workspace import (
-    PIECE,
-    RETRIES,
-    Attempt,
-    FaultRule,
-    Target,
-    Workspace,
-    check,
-    hash_arrays,
-    hash_batches,
-    received,
-)
+from tests.robustness.faults.workspace import Attempt, Workspace, check, hash_arrays, hash_batches
 from tests.robustness.limits import PAGE, can_mount, file_size_limit, memory_limit, small_disk, time_limit
-from tests.servers.common import Request, Slow
+from tests.servers.common import Slow, http_server
 from tests.servers.process import environment
 
 
 def full_disk(workspace: Workspace, n: int) -> Iterator[Attempt]:
-    """A download fills the disk, or its files reach a limit of size; it is resumed when there is room."""
+    """A download fills the disk, or its files reach a limit of size; it is resumed by file when there is room."""
 
-    def attempt(target: Target, share: float, mounted: bool) -> None:
+    def attempt(url: str, share: float, mounted: bool) -> None:
         sizes = [len(data) for data in workspace.content.values()]
         size = int(share * (sum(sizes) if mounted else max(sizes))) // PAGE * PAGE + PAGE
-        began = len(target.log)
         with workspace.fresh_folders() as to, _limited(to.parent, size, mounted) as enlarge:
             try:
-                workspace.download(target.url, to)
+                workspace.download(url, to)
             except (Icrl4ahtError, OSError) as error:
-                workspace.check_error(error)
                 check(isinstance(error, Icrl4ahtError) or error.errno in (errno.ENOSPC, errno.EFBIG), repr(error))
                 workspace.check_files(to)
                 enlarge()
-                _resume(workspace, target, to)
-            check(len(target.log) > began, "no request was sent")
+                workspace.download(url, to)
 
-    with on_http(workspace) as target:
+    with http_server(workspace.release) as server:
         for number in range(n):
-            yield partial(attempt, target, workspace.rng.random(), number % 2 > 0 and can_mount())
+            yield partial(attempt, server.url, workspace.rng.random(), number % 2 > 0 and can_mount())
 
 
 def _limited(folder: Path, size: int, mounted: bool) -> AbstractContextManager[Callable[[], None]]:
@@ -80,75 +60,17 @@ def _limited(folder: Path, size: int, mounted: bool) -> AbstractContextManager[C
     return small_disk(folder, size) if mounted else file_size_limit(size)
 
 
-def _resume(workspace: Workspace, target: Target, to: Path) -> None:
-    """Download again, and check that nothing is fetched that the folder has."""
-    kept, again = _kept_ranges(workspace, to), len(target.log)
-    workspace.download(target.url, to)
-    for path, start, stop in received(target.log[again:]):
-        twice = [part for part in kept.get(path, []) if start <= part[0] and part[1] <= stop]
-        check(not twice, f"fetched again: {path}, {twice[:3]}")
-
-
-def _kept_ranges(workspace: Workspace, to: Path) -> dict[str, list[tuple[int, int]]]:
-    """Return the byte ranges (start, stop) of each file that a complete or interrupted download has."""
-    found = {f"/{name}": [(0, len(data))] for name, data in workspace.content.items() if (to / name).exists()}
-    for name in (name for name in workspace.content if name.startswith("data/") and f"/{name}" not in found):
-        table = np.array(read_table(workspace.release / chunk_table_name(name)))
-        part = PartialFile(Store("file://"), name, to.with_name(f"{to.name}.partial") / name)
-        missing = set(part.missing_chunks(table)["offset"].tolist())
-        chunks = table[["offset", "size"]].tolist()
-        found[f"/{name}"] = [(start, start + size) for start, size in chunks if start not in missing]
-    return found
-
-
-def full_cache(workspace: Workspace, n: int) -> Iterator[Attempt]:
-    """A stream has no room for its cache: it keeps chunks in memory and fetches none twice."""
-
-    def attempt(target: Target, size: int, mounted: bool) -> None:
-        with workspace.fresh_folders() as to:
-            dataset = workspace.open_stream(target.url)
-            for history in dataset:
-                history.read("dones", 0, 1)  # fetches the chunk table
-            began = len(target.log)
-            with _limited(to.parent, 64 * 2**20 if mounted else size, mounted):
-                if mounted:
-                    _fill(to.parent / "filler")
-                workspace.check_batches(dataset)
-            _check_fetched_once(target.log[began:])
-
-    with on_http(workspace) as target:
-        for number in range(n):
-            yield partial(attempt, target, int(workspace.rng.integers(PIECE)), number % 2 > 0 and can_mount())
-
-
-def _fill(path: Path) -> None:
-    try:
-        with path.open("wb", buffering=0) as stream:
-            while True:
-                stream.write(bytes(PAGE))
-    except OSError:
-        return
-
-
-def _check_fetched_once(log: list[Request]) -> None:
-    counts = Counter((r.path, r.start) for r in log if r.method == "GET" and not r.path.endswith(MANIFEST))
-    check(max(counts.values()) == 1, f"fetched again: {counts.most_common(1)}")
-
-
 _DOWNLOAD = """
 import sys
 from pathlib import Path
-from icrl4aht_data.remote import partial_file
-from icrl4aht_data.reading.sources import CacheMode
-from icrl4aht_data.remote.download import fetch_planned, plan_download
+from icrl4aht_data.download import fetch_planned, plan_download
 
-partial_file._REQUEST_BYTES = int(sys.argv[3])
 fetch_planned(plan_download(sys.argv[1], to=Path(sys.argv[2])))
 """
 
 _OPEN = """
 import sys
-from icrl4aht_data.remote.remote_release import open_root
+from icrl4aht_data.fetch import open_root
 
 print(flush=True)
 sys.stdin.readline()
@@ -160,9 +82,8 @@ _BUILD = """
 import itertools, os, sys
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.format import columns
-from icrl4aht_data.utils import remembered
 
-columns._UNCACHED = remembered._SMALL = 0
+columns._UNCACHED = 0
 for number in itertools.count():
     os.environ["ICRL4AHT_CACHE_DIR"] = f"{sys.argv[2]}/{number}"
     print(number, flush=True)
@@ -198,31 +119,6 @@ def _check_success(processes: list[subprocess.Popen[str]], text: str | None = No
     check([process.returncode for process in processes] == [0] * len(processes), "\n".join(errors))
 
 
-def killed_downloads(workspace: Workspace, n: int) -> Iterator[Attempt]:
-    """kill -9 of a download at a random moment; the next download resumes it."""
-
-    def attempt(target: Target, requests: int, moment: float) -> None:
-        target.faults.clear()
-        target.faults.add(FaultRule(Slow(0.02), times=ALWAYS))
-        began = len(target.log)
-        with workspace.fresh_folders() as to:
-            process = _start(_DOWNLOAD, target.url, to, PIECE)
-            while len(target.log) - began < requests and process.poll() is None:
-                time.sleep(0.001)
-            time.sleep(moment)
-            process.kill()
-            _, errors = process.communicate()
-            check(process.returncode in (0, -signal.SIGKILL), errors)
-            target.faults.clear()
-            workspace.check_files(to)
-            _resume(workspace, target, to)
-
-    with on_http(workspace) as target:
-        most = workspace.count_requests(target, ANY)
-        for _ in range(n):
-            yield partial(attempt, target, int(workspace.rng.integers(1, most)), 0.03 * workspace.rng.random())
-
-
 def killed_builds(workspace: Workspace, n: int) -> Iterator[Attempt]:
     """kill -9 of a process that builds the caches of index and arrays; another process uses what it left."""
 
@@ -237,8 +133,6 @@ def killed_builds(workspace: Workspace, n: int) -> Iterator[Attempt]:
         with environment({"ICRL4AHT_CACHE_DIR": str(last)}), patch.object(columns, "_UNCACHED", 0):
             for _ in range(2):  # the first builds what is missing, the second finds it
                 workspace.check_batches(load_icrl4aht(workspace.release, obs="uint8", cache="mmap"))
-        left = [path.name for path in last.iterdir() if path.name.startswith(".") and path.suffix == ".partial"]
-        check(not left, f"left behind: {left}")
 
     for _ in range(n):
         yield partial(attempt, 0.5 * workspace.rng.random())
@@ -247,29 +141,27 @@ def killed_builds(workspace: Workspace, n: int) -> Iterator[Attempt]:
 def two_readers(workspace: Workspace, n: int) -> Iterator[Attempt]:
     """Two processes open the same release at the same time, 20 times."""
 
-    def attempt(target: Target) -> None:
+    def attempt(url: str) -> None:
         with workspace.fresh_folders():
-            _check_success([_start(_OPEN, target.url, wait=True) for _ in range(2)], "\n")
+            _check_success([_start(_OPEN, url, wait=True) for _ in range(2)], "\n")
 
-    with on_http(workspace) as target:
+    with http_server(workspace.release) as server:
         for _ in range(n):
-            yield partial(attempt, target)
+            yield partial(attempt, server.url)
 
 
 def two_downloads(workspace: Workspace, n: int) -> Iterator[Attempt]:
     """Two processes download the same release into the same folder at the same time."""
 
-    def attempt(target: Target) -> None:
-        began = len(target.log)
+    def attempt(url: str) -> None:
         with workspace.fresh_folders() as to:
-            _check_success([_start(_DOWNLOAD, target.url, to, PIECE) for _ in range(2)])
+            _check_success([_start(_DOWNLOAD, url, to) for _ in range(2)])
             workspace.check_files(to, complete=True)
-            _check_fetched_once(target.log[began:])
 
-    with on_http(workspace) as target:
-        target.faults.add(FaultRule(Slow(0.01), times=ALWAYS))
+    with http_server(workspace.release) as server:
+        server.faults.next(Slow(0.01), times=10**9)
         for _ in range(n):
-            yield partial(attempt, target)
+            yield partial(attempt, server.url)
 
 
 def full_mmap(workspace: Workspace, n: int) -> Iterator[Attempt]:
@@ -288,7 +180,7 @@ def full_mmap(workspace: Workspace, n: int) -> Iterator[Attempt]:
                     return "fits"
                 except CacheError as error:
                     check(f"{caches}: the cache folder has no room for arrays of " in str(error), repr(error))
-                    left = [path for path in caches.iterdir() if not path.name.startswith(("index-", ".hashes"))]
+                    left = [path for path in caches.iterdir() if not path.name.startswith("index-")]
                     check(all(path.name.startswith("histories-") for path in left), f"left behind: {left}")
                 enlarge()
                 workspace.check_batches(dataset)
@@ -303,30 +195,25 @@ def full_mmap(workspace: Workspace, n: int) -> Iterator[Attempt]:
 
 
 def damaged_caches(workspace: Workspace, n: int) -> Iterator[Attempt]:
-    """A file of the caches of index and arrays, or of the notes about hashes, is damaged in one of many ways."""
+    """A file of the caches of index and arrays is damaged in a way that its size or its header shows."""
     caches = workspace.new_path()
 
     def read() -> None:
         with (
             environment({"ICRL4AHT_CACHE_DIR": str(caches)}),
             patch.object(columns, "_UNCACHED", 0),
-            patch.object(remembered, "_SMALL", 0),
-            patch.object(remembered, "_TICK_NS", 2 * 10**7),
         ):
             workspace.check_batches(load_icrl4aht(workspace.release, obs="uint8", cache="mmap"))
 
     def attempt(name: str, damage: str) -> None:
         DAMAGES[damage](caches / name)
         read()
-        if name.endswith((".npy", "contents.json")):
-            check((caches / name).read_bytes() == right[name], f"{name}: not rebuilt")
-        shutil.rmtree(caches / name, ignore_errors=True)  # a folder where a note was
-        read()
+        check((caches / name).read_bytes() == right[name], f"{name}: not rebuilt")
 
     read()
-    right = contents(caches)
+    right, shown = contents(caches), [name for name in DAMAGES if "bit" not in name]
     for _ in range(n):
-        yield partial(attempt, str(workspace.rng.choice(list(right))), str(workspace.rng.choice(list(DAMAGES))))
+        yield partial(attempt, str(workspace.rng.choice(list(right))), str(workspace.rng.choice(shown)))
 
 
 def two_builds(workspace: Workspace, n: int) -> Iterator[Attempt]:
@@ -336,7 +223,7 @@ def two_builds(workspace: Workspace, n: int) -> Iterator[Attempt]:
         caches = workspace.new_path()
         _check_success([_start(_BUILD_ONCE, workspace.release, caches, wait=True) for _ in range(2)], "\n")
         names = {path.name.split("-")[0] for path in caches.iterdir()}
-        check(names <= {"index", "histories", ".hashes"}, f"left behind: {names}")
+        check(names <= {"index", "histories"}, f"left behind: {names}")
         with environment({"ICRL4AHT_CACHE_DIR": str(caches)}), patch.object(columns, "_UNCACHED", 0):
             made = contents(caches)
             workspace.check_batches(load_icrl4aht(workspace.release, obs="uint8", cache="mmap"))
@@ -427,9 +314,9 @@ def mutations(workspace: Workspace, n: int) -> Iterator[Attempt]:
         return None
 
     def check_manifest() -> str | None:
-        with on_http(workspace, release.root) as target, workspace.fresh_folders() as to:
+        with http_server(release.root) as server, workspace.fresh_folders() as to:
             try:
-                fetch_planned(plan_download(target.url, to=to, retry=RETRIES))
+                fetch_planned(plan_download(server.url, to=to))
                 check(release.read(to) == release.before, "other data, downloaded")
             except Icrl4ahtError:
                 pass

@@ -1,9 +1,8 @@
 """Series of faults: `make bench-faults`.
 
-Servers on loopback, disks, processes and files fail at random moments. An attempt survives if the result is right byte
+Disks, processes and files fail at random moments. An attempt survives if the result is right byte
 for byte; or, where that is impossible, if one of our errors names the file, no incomplete file has the name of a file
-of the release, and a second call after the fault succeeds without fetching again what had arrived. Everything else
-counts as lost. Prints one JSON line a family; the reason of each loss goes to standard error. Exit code 1 if anything
+of the release, and a second call after the fault succeeds. Everything else counts as lost. Prints one JSON line a family; the reason of each loss goes to standard error. Exit code 1 if anything
 was lost.
 """
 
@@ -15,29 +14,20 @@ import tempfile
 import time
 import traceback
 from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 
-from tests.robustness.faults import local, remote
-from tests.robustness.faults.remote import anywhere, flipped_manifest, on_hub, on_s3
-from tests.robustness.faults.workspace import Workspace
+from tests.robustness.faults import local
+from tests.robustness.faults.workspace import Attempt, Workspace
 
-FAMILIES: dict[str, tuple[remote.Family, int]] = {
-    "connection cut": (anywhere(remote.cut), 50),
-    "429 with Retry-After": (remote.too_many_requests, 6),
-    "bursts of 5xx": (anywhere(remote.busy, longest=3, methods=remote.ANY), 24),
-    "slow server": (remote.slow, 8),
-    "wrong length": (anywhere(remote.wrong_length, methods=remote.ANY), 24),
-    "wrong bytes": (anywhere(remote.flip), 24),
-    "wrong manifest": (flipped_manifest(), 24),
-    "ETag changed": (remote.changed_etags, 6),
-    "version changed": (remote.replaced_release, 10),
-    "ranges ignored": (remote.ignored_ranges, 4),
+Family = Callable[[Workspace, int], Iterator[Attempt]]
+"""Yields n attempts."""
+
+FAMILIES: dict[str, tuple[Family, int]] = {
     "disk full": (local.full_disk, 20),
-    "cache's disk full": (local.full_cache, 8),
-    "download killed": (local.killed_downloads, 10),
     "cache build killed": (local.killed_builds, 10),
     "two downloads at once": (local.two_downloads, 5),
     "two readers at once": (local.two_readers, 5),
@@ -46,18 +36,11 @@ FAMILIES: dict[str, tuple[remote.Family, int]] = {
     "damaged caches": (local.damaged_caches, 100),
     "bit flips": (local.bit_flips, 1000),
     "mutated index or manifest": (local.mutations, 200),
-    "hub: connection cut": (anywhere(remote.cut, on_hub), 12),
-    "hub: bursts of 5xx": (anywhere(remote.busy, on_hub, longest=3, methods=remote.ANY, hub_retries=False), 9),
-    "hub: wrong bytes": (anywhere(remote.flip, on_hub, hub_retries=False), 12),
-    "hub: wrong manifest": (flipped_manifest(on_hub), 12),
-    "s3: connection cut": (anywhere(remote.cut, on_s3), 6),
-    "s3: bursts of 5xx": (anywhere(remote.busy, on_s3, longest=3, methods=remote.ANY), 4),
-    "s3: wrong bytes": (anywhere(remote.flip, on_s3), 6),
 }
 """Name -> family, and the number of its attempts."""
 
 
-def run(name: str, family: remote.Family, workspace: Workspace, count: int) -> dict[str, Any]:
+def run(name: str, family: Family, workspace: Workspace, count: int) -> dict[str, Any]:
     """Return the JSON line of a family: counts of attempts and of their remarks, and seconds."""
     began, survived, remarks = time.perf_counter(), [], Counter()
     for attempt in family(workspace, count):

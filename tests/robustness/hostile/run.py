@@ -22,11 +22,10 @@ import numpy as np
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
+from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, TEAMMATES
-from icrl4aht_data.remote.download import fetch_planned, plan_download
-from icrl4aht_data.remote.store import RetryPolicy
 from icrl4aht_data.utils.files import files_below
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.combine import combine_releases
@@ -127,12 +126,12 @@ def findings(root: Path) -> str:
 
 
 def download(root: Path, out: Path, case: Case) -> None:
-    """Download from a server with the faults of a case, with two attempts for each request."""
+    """Download from a server with the faults of a case."""
     faults = Faults()
     for path, fault in case.rules.items():
         faults.every(1, fault, path=path, method=None)
     with http_server(root, faults) as server:
-        fetch_planned(plan_download(server.url, to=out / "mirror", retry=RetryPolicy(2, 0.01)))
+        fetch_planned(plan_download(server.url, to=out / "mirror"))
 
 
 def steps_of(case: Case, root: Path, out: Path) -> Steps:

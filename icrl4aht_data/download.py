@@ -1,0 +1,246 @@
+"""`download` of a remote release or a part of it, and `repair` of damaged files from the address they came from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.fetch import Advance, ReleaseLocation, Remote, is_address, open_root, short_hash, without_credentials
+from icrl4aht_data.format.chunks import chunk_table_name
+from icrl4aht_data.format.index import read_index
+from icrl4aht_data.format.manifest import read_manifest
+from icrl4aht_data.format.schema import MANIFEST, PARQUET_EPISODES
+from icrl4aht_data.utils.files import atomic_write, has_content, json_hash
+from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.system import data_folder
+
+
+@dataclass(frozen=True)
+class DownloadPlan:
+    """Files that a download fetches.
+
+    Args:
+        root: the remote release.
+        files: name -> bytes of all files requested.
+        absent: names of those that are not downloaded yet.
+        changed: names of those that were downloaded and are not what the manifest lists any more.
+    """
+
+    root: ReleaseLocation
+    files: dict[str, int]
+    absent: list[str]
+    changed: list[str]
+
+    @property
+    def size(self) -> int:
+        """Bytes of the absent and the changed files."""
+        return sum(self.files[name] for name in (*self.absent, *self.changed))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the plan as `download --dry-run --json` prints it."""
+        facts = {"root": str(self.root), "folder": str(self.root.folder), "files": self.files}
+        return facts | {"absent": self.absent, "changed": self.changed, "bytes": self.size}
+
+
+def default_remote() -> str | None:
+    """Return the address in $ICRL4AHT_REMOTE, the default of commands."""
+    return os.environ.get("ICRL4AHT_REMOTE") or None
+
+
+def plan_download(
+    url: str,
+    *,
+    to: Path | None = None,
+    advance: Callable[[str, int, int], None] = lambda what, done, total: None,
+    **wanted: str | Iterable[str] | None,
+) -> DownloadPlan:
+    """Plan a download; fetches the index of the release only, and compares the files that are here with the manifest.
+
+    Args:
+        url: address of the release.
+        to: folder for the files, which must not exist, be empty, or have this release; by default the Hub's cache, or a
+            folder in `system.data_folder`.
+        advance: called with the name of a stage, and the bytes compared so far and in total.
+        wanted: filters as in `load_icrl4aht`: only the shards with matching histories are fetched, with their chunk
+            tables and all files that belong to no shard, except the Parquet copy of the episodes.
+
+    Raises:
+        OptionError: if `url` is no address, or `to` has files of something else.
+        RemoteError, OfflineError: if the index cannot be fetched.
+        EmptySelectionError, UnknownNameError: if no history matches the filters, or a filter has no such value.
+    """
+    if not is_address(url):
+        found = without_credentials(url)
+        raise OptionError(f"{found}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...")
+    root = open_root(url, to)
+    remote, index = _remote(root), read_index(root.folder)
+    names = sorted(chosen_files(root, **wanted))
+    present = {name: remote.path(name).stat().st_size for name in names if remote.path(name).exists()}
+    sizes = {name: index.info.shards[name] for name in names if name in index.info.shards}
+    unknown = [name for name in names if name not in sizes and name not in present]
+    sizes = present | sizes | remote.sizes(unknown)
+    total, done, changed = sum(sizes[name] for name in present), 0, []
+    for name in present:
+        if not remote.is_unchanged(name):
+            changed.append(name)
+        done += sizes[name]
+        advance("compare", done, total)
+    return DownloadPlan(root, sizes, sorted(sizes.keys() - present), changed)
+
+
+def _remote(root: ReleaseLocation) -> Remote:
+    assert root.remote is not None
+    return root.remote
+
+
+def fetch_planned(plan: DownloadPlan, advance: Advance | None = None) -> int:
+    """Download the files of a plan; changed files are replaced. Return the bytes of the fetched files.
+
+    Raises:
+        RemoteError: if a file cannot be fetched; a second call resumes.
+        OSError: if the disk is full or not writable.
+    """
+    remote = _remote(plan.root)
+    before = remote.fetched
+    if not remote.in_hub_cache:
+        _write_note(remote, plan.files)
+    remote.fetch([*plan.changed, *plan.absent], advance, again=True)
+    return remote.fetched - before
+
+
+def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) -> set[str]:
+    """Return the files of a selection: its shards, their chunk tables, and all files that belong to no shard.
+
+    With filters, the Parquet copy of the episodes is left out: it repeats the shards, of all histories.
+
+    Args:
+        root: an opened release.
+        wanted: filters as in `load_icrl4aht`. Without any, all files; of a folder that `download` filled those that
+            the downloads requested, see `DownloadNote`.
+    """
+    index = read_index(root.folder)
+    listed = root.remote.manifest if root.remote is not None else read_manifest(root.folder)
+    all_shards = index.values("shard")
+    chosen = {*listed, *all_shards}
+    if any(wanted.values()):
+        rows = index.query(**{name: value or None for name, value in wanted.items()})  # type: ignore[arg-type]
+        codes = np.unique(index.entries.column("shard")[rows]).tolist()
+        others = set(all_shards) - {all_shards[code] for code in codes}
+        chosen -= others | {chunk_table_name(name) for name in others}
+        return {name for name in chosen if not name.startswith(f"{PARQUET_EPISODES}/")}
+    note = None if root.remote is not None else read_note(root.folder)
+    if note is None or note.release != json_hash(listed):
+        return chosen
+    return {name for name in chosen if name in note.files or (root.folder / name).exists()}
+
+
+class DownloadNote(msgspec.Struct):
+    """Note of a download into a folder, kept in the data folder: one in the release could name any address.
+
+    Args:
+        url: address of the release, without credentials.
+        release: hash of the manifest's content.
+        files: names of all files requested so far.
+    """
+
+    url: str
+    release: str
+    files: list[str]
+
+
+def read_note(folder: Path) -> DownloadNote | None:
+    """Return the note on a folder; None if nothing was downloaded into it, or the note cannot be read."""
+    with suppress(OSError, msgspec.MsgspecError):
+        return msgspec.json.decode(_note_path(folder).read_bytes(), type=DownloadNote)
+    return None
+
+
+def _write_note(remote: Remote, files: Iterable[str]) -> None:
+    """Note the files of a download; nothing is noted where the data folder cannot be written."""
+    before, release = read_note(remote.folder), json_hash(remote.manifest)
+    requested = {*files, *(before.files if before is not None and before.release == release else ())}
+    path = _note_path(remote.folder)
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as partial:
+            partial.write_bytes(msgspec.json.encode(DownloadNote(remote.url, release, sorted(requested))))
+
+
+def _note_path(folder: Path) -> Path:
+    return data_folder() / "downloads" / f"{short_hash(os.fsencode(folder.resolve()), 32)}.json"
+
+
+def repair(root: str | Path, damaged: Iterable[str], *, source: str | None = None) -> tuple[dict[str, str | None], int]:
+    """Fetch damaged files of a release again.
+
+    Args:
+        root: the release, a folder or an address.
+        damaged: names of files; other files are not touched, unless the manifest itself is damaged.
+        source: address to repair from; by default the root itself, the address that `download` noted, or
+            $ICRL4AHT_REMOTE.
+
+    Returns:
+        name -> None, or why the file could not be repaired; and the bytes fetched.
+
+    Raises:
+        OptionError: if no source is known, or it has another release.
+        RemoteError, OfflineError: if the source cannot be reached.
+    """
+    remote = _remote(open_root(_repair_source(root, source)))
+    names = set(damaged) & remote.manifest.keys()
+    if not is_address(root):
+        manifest = (remote.folder / MANIFEST).read_bytes()
+        remote = replace(remote, folder=Path(root), in_hub_cache=False)
+        if not has_content(remote.folder / MANIFEST, manifest):
+            names |= _replace_manifest(remote, manifest)
+    before, outcome = remote.fetched, dict.fromkeys(sorted(names, key=lambda name: name.startswith("data/")))
+    for name in outcome:  # shards last, whose sizes are in meta/info.json
+        try:
+            remote.fetch([name], again=True)
+        except (Icrl4ahtError, OSError) as error:
+            outcome[name] = str(error)
+    return outcome, remote.fetched - before
+
+
+def _replace_manifest(remote: Remote, manifest: bytes) -> set[str]:
+    """Replace a folder's damaged manifest; return the names of the files that are not as the new one lists them.
+
+    Raises:
+        OptionError: if most files are other ones, so that the remote has another release.
+    """
+    listed = {remote.folder / name: (name, digest) for name, digest in remote.manifest.items()}
+    wrong = {name for path, (name, digest) in listed.items() if not path.is_file() or file_hash(path) != digest}
+    if 2 * len(wrong) > len(listed):
+        raise OptionError(
+            f"{remote.url}: {len(wrong)} of its {len(listed)} files are not those of {remote.folder}: it has another "
+            f"release or version; give the address that this one came from"
+        )
+    with atomic_write(remote.folder / MANIFEST) as partial:
+        partial.write_bytes(manifest)
+    return wrong
+
+
+def _repair_source(root: str | Path, source: str | None) -> str:
+    """Return the address to repair from: the given one, the release's own, the noted one, or the default."""
+    if source is None and is_address(root):
+        return str(root)
+    note, default = read_note(Path(root)), default_remote()
+    noted = None if note is None else note.url
+    if default is not None and noted == without_credentials(default).rstrip("/"):
+        noted = default  # the address with its credentials
+    url = source or noted or default
+    if url is None or not is_address(url):
+        found = url and without_credentials(url)
+        raise OptionError(
+            f"{root}: repairing needs the address of a complete copy, found {found!r}: give --from, or set "
+            f"ICRL4AHT_REMOTE"
+        )
+    return url

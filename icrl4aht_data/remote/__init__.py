@@ -1,1 +1,0 @@
-"""Releases at an address: byte ranges, partially downloaded files, downloads."""

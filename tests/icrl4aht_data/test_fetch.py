@@ -1,0 +1,564 @@
+"""Releases at an address: opening, reading, downloading, faults of servers; over HTTP, S3 and the Hub's protocol, all
+served on loopback to the real clients."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from huggingface_hub import file_download
+from huggingface_hub.utils import _http
+
+from icrl4aht_data import download, fetch, load_icrl4aht, verify_release
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.download import fetch_planned, plan_download, repair
+from icrl4aht_data.errors import (
+    Icrl4ahtError,
+    IndexFormatError,
+    OfflineError,
+    OptionError,
+    RemoteError,
+    RootNotFoundError,
+    UnknownNameError,
+)
+from icrl4aht_data.fetch import check_credentials, without_credentials
+from icrl4aht_data.format.chunks import chunk_table_name
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
+from tests.helpers.batches import assert_equal
+from tests.helpers.damages import contents, flip_bit
+from tests.helpers.random_releases import SHARD
+from tests.servers.common import (
+    Cut,
+    Fault,
+    Flip,
+    Hub,
+    Long,
+    Redirect,
+    Server,
+    Short,
+    Slow,
+    Status,
+    http_server,
+    hub_server,
+    s3_server,
+)
+from tests.servers.http import Answer
+from tests.servers.process import hub_environment, hub_settings
+
+TABLE = chunk_table_name(SHARD)
+HUB = "hf://datasets/org/name"
+ALWAYS = 10**9
+
+
+@pytest.fixture(autouse=True)
+def data(tmp_path, monkeypatch) -> Path:
+    """The data folder, empty at first. Waits before retries are short."""
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
+    monkeypatch.delenv("ICRL4AHT_REMOTE", raising=False)
+    monkeypatch.setattr(fetch, "_WAITS", (0.01, 0.01, 0.01))
+    hurried = SimpleNamespace(**vars(time) | {"sleep": lambda seconds: time.sleep(seconds / 500)})
+    monkeypatch.setattr(_http, "time", hurried)
+    monkeypatch.setattr(file_download, "time", hurried)
+    return tmp_path / "data"
+
+
+@contextmanager
+def served(kind: str, folder: Path) -> Iterator[tuple[str, Server | Hub | None]]:
+    """Serve a release; yield its address, and the server if it can inject faults."""
+    if kind == "http":
+        with http_server(folder) as server:
+            yield server.url, server
+    elif kind == "s3":
+        with s3_server(folder) as bucket:
+            yield bucket.url, None
+    else:
+        with tempfile.TemporaryDirectory() as root, hub_server(Path(root)) as hub:
+            hub.add_repo("org/name", folder)
+            yield HUB, hub
+
+
+KINDS = pytest.mark.parametrize("kind", ["http", "hub", pytest.param("s3", marks=pytest.mark.slow)])
+
+
+def batch(root, layout="demo_wide", **options):
+    return load_icrl4aht(root, layout=layout, **options).ad(batch_size=8, length=30)[0]
+
+
+def shards_in(folder: Path) -> set[str]:
+    return {path.name for path in (folder / "data").rglob("*.h5")}
+
+
+# Reading
+
+
+@KINDS
+def test_a_remote_release_reads_as_its_local_twin(kind, lite, monkeypatch):
+    local = load_icrl4aht(lite[0])
+    with served(kind, lite[0]) as (url, _):
+        remote = load_icrl4aht(url)
+        assert [h.entry for h in remote] == [h.entry for h in local]
+        assert remote.info == local.info and remote.recover_teammate(3) == local.recover_teammate(3)
+        assert not shards_in(remote.root), "opening fetches the index only"
+        one = remote.filter(layout="demo_wide")
+        assert np.array_equal(one[0].expert_actions, local.filter(layout="demo_wide")[0].expert_actions)
+        assert len(shards_in(remote.root)) == 1, "a shard is fetched when one of its histories is read"
+        assert_equal(batch(pickle.loads(pickle.dumps(one)).origin.folder), batch(lite[0]))
+        for cache in ("auto", "ram", "mmap", "stream"):
+            assert_equal(batch(url, "coord_simple", cache=cache), batch(lite[0], "coord_simple"))
+        monkeypatch.setenv("ICRL4AHT_OFFLINE", "1")
+        assert_equal(batch(url), batch(lite[0]))
+    assert not [path for path in remote.root.parent.rglob("*") if "partial" in path.name or path.suffix == ".lock"]
+
+
+@KINDS
+@pytest.mark.parametrize("variable", ["HF_HUB_OFFLINE", "ICRL4AHT_OFFLINE"])
+def test_offline(kind, lite, variable, monkeypatch):
+    with served(kind, lite[0]) as (url, _):
+        monkeypatch.setenv(variable, "1")
+        with pytest.raises(OfflineError, match="offline, and no version of it is downloaded"):
+            load_icrl4aht(url)
+        monkeypatch.delenv(variable)
+        fetch_planned(plan_download(url, layout="demo_wide"))
+        monkeypatch.setenv(variable, "1")
+        assert_equal(batch(url), batch(lite[0]))
+        with pytest.raises(OfflineError, match=r"not downloaded.*: .*data/teammate/coord_simple/train-0"):
+            batch(url, "coord_simple", cache="ram")
+
+
+def test_a_new_version_at_the_same_address(lite, full, tmp_path):
+    shutil.copytree(lite[0], tmp_path / "served")
+    with http_server(tmp_path / "served") as server:
+        first = load_icrl4aht(server.url)
+        shutil.rmtree(tmp_path / "served")
+        shutil.copytree(full[0], tmp_path / "served")
+        second = load_icrl4aht(server.url)
+        assert (first.info.kind, second.info.kind) == ("lite", "full") and first.root != second.root
+        with pytest.raises(RemoteError, match=r"(expected sha256|the server sent more|no such file)"):
+            _ = first[0].actions
+
+
+def test_the_revision_is_pinned_and_shown(lite, full, tmp_path):
+    with hub_server(tmp_path / "hub") as hub:
+        first = hub.add_repo("org/name", lite[0], tag="v0.0.1")
+        hub.add_repo("org/name", full[0])
+        tagged, newest = load_icrl4aht(f"{HUB}@v0.0.1"), load_icrl4aht(HUB)
+        assert (tagged.info.kind, newest.info.kind) == ("lite", "full")
+        assert str(tagged.origin) == f"{HUB}@{first}"
+        shown = json.loads(CliRunner().invoke(cli, ["show", f"{HUB}@v0.0.1", "--json"]).output)
+        assert (shown["revision"], shown["data_version"]) == (first, tagged.info.data_version)
+
+
+# Downloading
+
+
+@KINDS
+def test_a_download_of_a_part_and_then_of_the_rest(kind, lite, tmp_path):
+    target = tmp_path / "mine"
+    with served(kind, lite[0]) as (url, _):
+        plan = plan_download(url, to=target, layout="demo_wide")
+        assert sum(name.endswith(".h5") for name in plan.files) == 1
+        advanced: list[int] = []
+        fetched = fetch_planned(plan, advanced.append)
+        assert fetched == sum(advanced) == plan.size == sum(plan.files[name] for name in plan.absent) > 0
+        assert verify_release(target).ok, "it has the part that was requested"
+        fetch_planned(plan_download(url, to=target))
+        assert plan_download(url, to=target).size == 0
+        report = verify_release(url, level="deep", layout="demo_wide")
+        assert report.ok and report.fetched_bytes > 0, report.findings
+        assert verify_release(url, level="quick").ok
+    assert verify_release(target, level="deep").notes == []
+    assert contents(target) == contents(lite[0])
+    (target / SHARD).unlink()
+    assert verify_release(target).files_at_fault == {SHARD}
+    assert {path.name for path in tmp_path.iterdir()} <= {"mine", "data", "hub"}, "no locks"
+
+
+def test_the_command(lite, tmp_path, monkeypatch):
+    run, target = CliRunner(), tmp_path / "mine"
+    with http_server(lite[0]) as server:
+        plan = json.loads(
+            run.invoke(cli, ["download", server.url, "--layout", "demo_wide", "--dry-run", "--json"]).output
+        )
+        assert plan["bytes"] == sum(plan["files"][name] for name in plan["absent"]) > 0
+        monkeypatch.setenv("ICRL4AHT_REMOTE", server.url)
+        result = run.invoke(cli, ["download", "--to", str(target)], catch_exceptions=False)
+        assert result.exit_code == 0 and "bytes downloaded" in result.output
+        files = len(contents(target)) - 1
+        for name in (SHARD, "README.md"):
+            flip_bit(target / name)
+        again = run.invoke(cli, ["download", "--to", str(target)], catch_exceptions=False).output
+        assert f"{SHARD}: had changed, was fetched again" in again
+        assert "2 files," in again and f"{files - 2} files present already, with the right hashes" in again
+        result = run.invoke(cli, ["convert", server.url, "--out", str(tmp_path / "full"), "--to", "full"])
+        assert result.exit_code == 0 and verify_release(tmp_path / "full", level="deep").ok
+    assert contents(target) == contents(lite[0])
+
+
+def test_folders_with_other_content_are_refused(lite, full, tmp_path):
+    target = tmp_path / "home"
+    target.mkdir()
+    (target / ".bashrc").write_text("mine")
+    with http_server(lite[0]) as server:
+        with pytest.raises(OptionError, match="not empty, and not a release"):
+            plan_download(server.url, to=target)
+        assert [path.name for path in target.iterdir()] == [".bashrc"]
+        shutil.rmtree(target)
+        shutil.copytree(full[0], target)
+        with pytest.raises(OptionError, match="holds another release or version"):
+            plan_download(server.url, to=target)
+    assert contents(target) == contents(full[0])
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from icrl4aht_data.download import fetch_planned, plan_download
+fetch_planned(plan_download(sys.argv[1], to=Path(sys.argv[2]) if len(sys.argv) > 2 else None))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["http", "hub"])
+@pytest.mark.parametrize("to", [None, "mine"])
+def test_a_killed_download_is_resumed_by_file(kind, to, lite, tmp_path):
+    arguments = [str(tmp_path / to)] if to else []
+    with served(kind, lite[0]) as (url, server):
+        assert server is not None
+        server.faults.next(Slow(bytes_per_second=2000), times=ALWAYS, path="*.h5")
+        environment = os.environ | (server.environment if isinstance(server, Hub) else {})
+        running = subprocess.Popen([sys.executable, "-c", KILLED, url, *arguments], env=environment)
+        while not [request for request in server.log if request.path.endswith(".h5") and request.sent > 4000]:
+            assert running.poll() is None
+            time.sleep(0.02)
+        running.send_signal(signal.SIGKILL)
+        running.wait()
+        server.faults.clear()
+        plan = plan_download(url, to=tmp_path / to if to else None)
+        folder = plan.root.folder
+        assert not shards_in(folder), "no shard under its name"
+        assert len(plan.absent) < len(plan.files) - 4, "complete files are kept"
+        fetch_planned(plan)
+        assert contents(folder).items() >= contents(lite[0]).items()
+        assert not to or contents(folder) == contents(lite[0])
+
+
+# Faults
+
+
+WRONG: dict[str, tuple[Fault, str]] = {
+    "other bytes": (Flip(100), "expected sha256"),
+    "too few": (Short(7), "expected sha256|Consistency"),
+    "too many": (Long(7), "the server sent more|Consistency|RemoteProtocolError"),
+    "nothing": (Short(ALWAYS), "expected sha256|Consistency"),
+    "another file": (Redirect(f"/{INFO}"), "expected sha256|the server sent more|no such file"),
+    "a loop": (Redirect(f"/{SHARD}"), "TooManyRedirects|no such file"),
+    "absent": (Status(404), "no such file"),
+    "forbidden": (Status(403), "403"),
+    "busy for ever": (Status(503), "503"),
+    "cut for ever": (Cut(1000), "Error"),
+}
+
+
+@pytest.mark.parametrize("fault", WRONG)
+@pytest.mark.parametrize("kind", ["http", "hub"])
+def test_a_server_that_is_wrong_for_good(kind, fault, lite, tmp_path):
+    wrong, message = WRONG[fault]
+    with served(kind, lite[0]) as (url, server):
+        assert server is not None
+        server.faults.next(wrong, times=ALWAYS, path="*.h5")
+        began = time.monotonic()
+        for use in (
+            lambda: fetch_planned(plan_download(url, to=tmp_path / "mine")),
+            lambda: batch(url, cache="stream"),
+        ):
+            with pytest.raises(RemoteError, match=message) as caught:
+                use()
+            assert ".h5: " in str(caught.value), "the message names the file"
+        assert time.monotonic() - began < 5
+        assert not shards_in(tmp_path / "mine") and not shards_in(load_icrl4aht(url).root)
+        assert not list((tmp_path / "mine").glob(".partial-*"))
+        server.faults.clear()
+        seen = len(server.log)
+        fetch_planned(plan_download(url, to=tmp_path / "mine"))
+        assert not [request for request in server.log[seen:] if request.path.endswith("README.md")] or kind == "hub"
+        assert_equal(batch(url), batch(lite[0]))
+    assert contents(tmp_path / "mine") == contents(lite[0])
+
+
+@pytest.mark.parametrize(
+    "fault", [Status(503), Status(429, {"Retry-After": "1"}), Status(500), Cut(1000), Cut(0)], ids=str
+)
+@pytest.mark.parametrize("kind", ["http", "hub"])
+def test_transient_errors_are_retried(kind, fault, lite, tmp_path):
+    with served(kind, lite[0]) as (url, server):
+        assert server is not None
+        for method in ("GET", "HEAD"):
+            for path in ("*.h5", f"*{MANIFEST}", "*/api/*"):
+                if isinstance(fault, Status) or method == "GET":
+                    server.faults.next(fault, path=path, method=method)
+        plan = plan_download(url, to=tmp_path / "mine")
+        fetch_planned(plan)
+    assert contents(tmp_path / "mine") == contents(lite[0])
+
+
+def test_a_redirect_to_another_host_is_followed(lite, tmp_path):
+    with http_server(lite[0]) as other, http_server(lite[0]) as server:
+        server.faults.next(Redirect(f"{other.url}/{SHARD}?X-Amz-Signature=x"), path="*.h5", method=None, times=ALWAYS)
+        fetch_planned(plan_download(server.url, to=tmp_path / "mine", layout="coord_simple"))
+        assert (tmp_path / "mine" / SHARD).read_bytes() == (lite[0] / SHARD).read_bytes()
+
+
+def test_the_first_file_that_fails_ends_a_download(lite, tmp_path):
+    with http_server(lite[0]) as server:
+        plan = plan_download(server.url, to=tmp_path / "mine")
+        server.faults.next(Flip(3), times=ALWAYS)
+        seen = len(server.log)
+        with pytest.raises(RemoteError, match="expected sha256"):
+            fetch_planned(plan)
+        assert len(server.log) - seen <= min(len(plan.files), fetch._THREADS + 2)
+    assert set(contents(tmp_path / "mine")) - set(plan.absent) == set(contents(tmp_path / "mine"))
+
+
+def silent_server() -> socket.socket:
+    """A server that accepts connections and never answers."""
+    server = socket.socket()
+    server.bind(("127.0.0.1", 0))
+    server.listen()
+    return server
+
+
+@pytest.mark.parametrize("what", ["http", "hub", pytest.param("s3", marks=pytest.mark.slow), "refused", "hub refused"])
+def test_no_answer_is_an_error_soon(what, tmp_path, monkeypatch):
+    monkeypatch.setattr(fetch, "_TIMEOUT", 0.5)
+    with silent_server() as server:
+        endpoint = f"http://127.0.0.1:{9 if 'refused' in what else server.getsockname()[1]}"
+        url = {"http": endpoint, "refused": endpoint, "s3": "s3://bucket/x"}.get(what, HUB)
+        for name in ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3"):
+            monkeypatch.setenv(name, endpoint)
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            monkeypatch.setenv(name, "test")
+        began = time.monotonic()
+        with hub_settings(hub_environment(endpoint, tmp_path, "token")), pytest.raises(RemoteError, match=MANIFEST):
+            load_icrl4aht(url)
+    assert time.monotonic() - began < 5, "by default 15 s instead of 0.5 s"
+
+
+@pytest.mark.parametrize("kind", ["http", "hub"])
+@pytest.mark.parametrize("path", ["*.h5", "*/api/*", f"*{INFO}"])
+def test_a_server_that_stops_answering(kind, path, lite, tmp_path, monkeypatch):
+    monkeypatch.setattr(fetch, "_TIMEOUT", 0.5)
+    with served(kind, lite[0]) as (url, server):
+        assert server is not None
+        server.faults.next(Slow(60), times=ALWAYS, path=path, method=None)
+        began = time.monotonic()
+        if kind == "hub" or "api" not in path:
+            with pytest.raises(RemoteError):
+                fetch_planned(plan_download(url, to=tmp_path / "mine"))
+        assert time.monotonic() - began < 5
+        server.faults.clear()
+        fetch_planned(plan_download(url, to=tmp_path / "mine"))
+    assert contents(tmp_path / "mine") == contents(lite[0])
+
+
+def test_a_hub_that_has_become_unreachable_serves_its_cache(lite, tmp_path):
+    with hub_server(tmp_path / "hub") as hub:
+        hub.add_repo("org/name", lite[0])
+        fetch_planned(plan_download(HUB, layout="demo_wide"))
+        hub.close()
+        assert_equal(batch(HUB), batch(lite[0]))
+        with pytest.raises(RemoteError, match=f"/{SHARD}: .*ConnectError|/{TABLE}: .*ConnectError"):
+            batch(HUB, "coord_simple")
+
+
+# Trust
+
+
+@pytest.mark.parametrize("kind", ["http", "hub"])
+@pytest.mark.parametrize("name", [INFO, HISTORIES, TABLE, SHARD])
+def test_a_changed_copy_is_fetched_again(kind, name, lite):
+    with served(kind, lite[0]) as (url, _):
+        assert_equal(batch(url, "coord_simple"), batch(lite[0], "coord_simple"))
+        path = load_icrl4aht(url).root / name
+        path.resolve().write_bytes(path.read_bytes()[:-5])
+        assert_equal(batch(url, "coord_simple"), batch(lite[0], "coord_simple"))
+        assert path.read_bytes() == (lite[0] / name).read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["http", "hub"])
+def test_damaged_manifests(kind, lite, tmp_path):
+    root = tmp_path / "release"
+    shutil.copytree(lite[0], root)
+    (root / MANIFEST).write_text("")
+    for use in (load_icrl4aht, lambda url: plan_download(str(url))):
+        with (
+            served(kind, root) as (url, _),
+            pytest.raises(IndexFormatError, match="empty: expected a line for each file"),
+        ):
+            use(url)
+    with pytest.raises(IndexFormatError, match="empty: expected a line for each file"):
+        load_icrl4aht(root)
+    with served(kind, lite[0]) as (url, server):
+        assert server is not None
+        server.faults.next(Flip(70), path=f"*{MANIFEST}")
+        with pytest.raises(Icrl4ahtError):
+            fetch_planned(plan_download(url))
+        assert_equal(batch(url), batch(lite[0]))
+
+
+def damage_nothing_else(root: Path, names: tuple[str, ...]) -> None:
+    for name in names:
+        if name == MANIFEST:
+            (root / name).write_text("nonsense\n")
+        elif name.startswith("missing "):
+            (root / name.removeprefix("missing ")).unlink()
+        else:
+            flip_bit(root / name, (root / name).stat().st_size // 2, 3)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [(SHARD,), (f"missing {SHARD}",), (HISTORIES, INFO), (TABLE, SHARD), (MANIFEST,), (MANIFEST, SHARD, INFO)],
+)
+@pytest.mark.parametrize("kind", ["http", "hub"])
+def test_repair(kind, damaged, lite, tmp_path):
+    root, run = tmp_path / "copy", CliRunner()
+    with served(kind, lite[0]) as (url, _):
+        fetch_planned(plan_download(url, to=root))
+        damage_nothing_else(root, damaged)
+        assert run.invoke(cli, ["verify", str(root), "--json"]).exit_code == 1
+        result = run.invoke(cli, ["verify", str(root), "--repair", "--json"])
+        assert result.exit_code == 0, result.output
+        assert json.loads(result.output)["repaired"]
+    assert contents(root) == contents(lite[0])
+
+
+def test_repair_needs_the_right_source(lite, full, tmp_path, monkeypatch):
+    root = tmp_path / "copy"
+    shutil.copytree(lite[0], root)
+    with pytest.raises(OptionError, match="needs the address of a complete copy, found None: give --from"):
+        repair(root, ["README.md"])
+    with http_server(full[0]) as server, pytest.raises(OptionError, match="it has another release or version"):
+        repair(root, ["README.md"], source=server.url)
+    flip_bit(root / SHARD, 500)
+    before = contents(root)
+    with http_server(lite[0]) as server:
+        server.faults.next(Flip(3), path="*.h5")
+        outcome, _ = repair(root, [SHARD], source=server.url)
+        assert "expected sha256" in str(outcome[SHARD]) and contents(root) == before, "the damaged file is kept"
+        monkeypatch.setenv("ICRL4AHT_REMOTE", server.url)
+        assert repair(root, [SHARD])[0] == {SHARD: None}
+    assert contents(root) == contents(lite[0])
+
+
+def test_a_note_is_about_one_folder_and_release(lite, tmp_path, data):
+    target = tmp_path / "mine"
+    with http_server(lite[0]) as server:
+        fetch_planned(plan_download(server.url, to=target, layout="demo_wide"))
+    shutil.copytree(target, tmp_path / "copy")
+    assert verify_release(target).ok
+    assert verify_release(tmp_path / "copy").files_at_fault == {SHARD, TABLE}
+    for note in data.glob("downloads/*.json"):
+        note.write_text('{"url": 3}')
+    assert download.read_note(target) is None and SHARD in verify_release(target).files_at_fault
+
+
+def test_verification_reports_every_file_that_a_remote_serves_damaged(lite, tmp_path):
+    root = tmp_path / "served"
+    shutil.copytree(lite[0], root)
+    for name in ("README.md", SHARD):
+        flip_bit(root / name)
+    with http_server(root) as server:
+        assert verify_release(server.url).files_at_fault == {"README.md", SHARD}
+
+
+@pytest.mark.parametrize(
+    ("url", "error", "message"),
+    [
+        ("{server}/nowhere", RootNotFoundError, r"no release there, expected MANIFEST\.sha256"),
+        ("{hub}", RootNotFoundError, r"no release there, expected MANIFEST\.sha256"),
+        ("hf://datasets/org/absent", RootNotFoundError, "no release there"),
+        ("hf://datasets/org/empty@v9", RootNotFoundError, "no release there"),
+        ("hf://org/name", OptionError, "expected hf://datasets/<org>/<repo>"),
+        ("gopher://old/times", OptionError, "not an address that fsspec opens"),
+        ("http:///x", RemoteError, "(?i)InvalidUrl"),
+        ("http://127.0.0.1:9/release", RemoteError, r"MANIFEST\.sha256: .*repeat the command"),
+    ],
+)
+def test_bad_addresses(url, error, message, lite, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "README.md").write_text("hello")
+    with http_server(lite[0]) as server, hub_server(tmp_path / "hub") as hub:
+        hub.add_repo("org/empty", tmp_path / "empty")
+        with pytest.raises(error, match=message):
+            load_icrl4aht(url.format(server=server.url, hub="hf://datasets/org/empty"))
+        with pytest.raises(UnknownNameError, match="unknown layout 'demo_wid'; valid: coord_simple"):
+            plan_download(server.url, layout="demo_wid")
+
+
+def test_the_token_does_not_leave_the_hub(lite):
+    with served("hub", lite[0]) as (url, hub):
+        batch(url)
+        assert isinstance(hub, Hub)
+        sent = {(request.path.startswith("/cdn/"), request.headers["Authorization"]) for request in hub.log}
+        assert sent == {(False, f"Bearer {hub.token}"), (True, None)}
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("https://u:p@h.test/a?token=t", "https://h.test/a"),
+        ("GET https://u:p@h.test:8/a?x=1&y=2, then", "GET https://h.test:8/a then"),
+        ("hf://datasets/org/name@v1", "hf://datasets/org/name@v1"),
+        ("https://u:p@ss@h.test/a@b", "https://h.test/a@b"),
+    ],
+)
+def test_texts_without_credentials(text, expected):
+    assert without_credentials(text) == expected
+
+
+def test_credentials_that_are_not_encoded_are_refused_unseen():
+    for address in ("http://user:hunter2/RET@127.0.0.1:9/x", "http://user:1/hunter2@127.0.0.1:9/x"):
+        with pytest.raises(OptionError, match="percent-encode the user name and password") as caught:
+            load_icrl4aht(address)
+        assert "hunter2" not in str(caught.value)
+    for address in ("https://h.test/a@v1", "http://127.0.0.1:80/a@v1", "https://u:p%2F@h.test:8/x", "s3://bucket/x@1"):
+        check_credentials(address)
+
+
+def test_credentials_in_an_address_are_used_and_never_kept_or_shown(lite, tmp_path):
+    def route(request, body) -> Answer:
+        allowed = request.headers["Authorization"] == "Basic bWU6aHVudGVyMg==" and request.target.endswith("?key=t0ken")
+        path = lite[0] / request.path.lstrip("/")
+        return Answer(path, etag='"x"') if allowed and path.is_file() else Answer(b"", 404 if allowed else 401)
+
+    said, server = [], Server(route)
+    url = f"{server.url.replace('http://', 'http://me:hunter2@')}?key=t0ken"
+    try:
+        assert_equal(batch(url), batch(lite[0]))
+        said.append(repr(load_icrl4aht(url)))
+        for command in (["download", url, "--to", str(tmp_path / "mine")], ["show", url], ["verify", url]):
+            said.append(CliRunner().invoke(cli, command, catch_exceptions=False).output)
+        for wrong in (url.replace("?", "/nowhere?"), url.replace("hunter2", "hunter2x")):
+            with pytest.raises(Icrl4ahtError) as caught:
+                load_icrl4aht(wrong)
+            said += [str(caught.value), str(caught.value.__cause__)]
+    finally:
+        server.close()
+    said += [data.decode(errors="replace") for data in contents(tmp_path).values()]
+    said += [str(path) for path in tmp_path.rglob("*")]
+    assert not [text for text in said if "hunter2" in text or "t0ken" in text]
