@@ -1,9 +1,9 @@
 """Series of faults: `make bench-faults`.
 
-Disks, processes and files fail at random moments. An attempt survives if the result is right byte
-for byte; or, where that is impossible, if one of our errors names the file, no incomplete file has the name of a file
-of the release, and a second call after the fault succeeds. Everything else counts as lost. Prints one JSON line a family; the reason of each loss goes to standard error. Exit code 1 if anything
-was lost.
+Disks, processes and files fail at random moments. An attempt survives if the result is right byte for byte; or, where
+that is impossible, if one of our errors names the file, no incomplete file has the name of a file of the release, and a
+second call after the fault succeeds. Everything else counts as lost. Prints one JSON line a family; the reason of each
+loss goes to standard error. Exit code 1 if anything was lost.
 """
 
 from __future__ import annotations
