@@ -6,13 +6,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from itertools import islice
-from typing import Any
 
 from icrl4aht_data.benchmark.facts import kind_family
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
-from icrl4aht_data.format.info import LayoutStatistics, ReleaseInfo, describe
+from icrl4aht_data.format.info import ReleaseInfo, describe
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, TASKS, Entry
 from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
@@ -98,15 +97,6 @@ def _check_disjoint_teammates(tasks: list[Task], report: Report) -> None:
             report.add(TASKS, f"task {task.task_id!r} ({task.split}) has the teammate of {seen[key]!r} (train)")
 
 
-def _as_old_as(found: dict[str, Any], expected: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return statistics without the fields that releases of earlier versions of this package do not have."""
-    new = [field.name for field in fields(LayoutStatistics) if field.default is None]
-    return {
-        layout: {name: value for name, value in of_layout.items() if name not in new or name in found.get(layout, ())}
-        for layout, of_layout in expected.items()
-    }
-
-
 def _check_info(index: Index, tasks: list[Task], provenance: Mapping[str, Provenance] | None, report: Report) -> None:
     """Check that meta/info.json has the totals and statistics of the index, with the sizes of shards that it says."""
     root, info, shards = index.root, index.info, index.values("shard")
@@ -122,7 +112,5 @@ def _check_info(index: Index, tasks: list[Task], provenance: Mapping[str, Proven
     for name in sorted(found.keys() - {field.name for field in fields(ReleaseInfo)}):
         report.add(INFO, f"{name}: an unknown field")
     for name, expected in described.to_json().items():
-        if name == "statistics" and isinstance(found.get(name), dict):
-            expected = _as_old_as(found[name], expected)
         if found.get(name) != expected:
             report.add(INFO, f"{name}: expected {expected!r}, found {found.get(name)!r}")

@@ -58,8 +58,7 @@ def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> It
         yield f"ego_hash: expected {json_hash(found.ego)} of `ego`, found {found.ego_hash}"
     if found.source not in (None, entries[0].source):
         yield f"source: expected {entries[0].source!r} as in the index, found {found.source!r}"
-    names = found.suite and found.suite.algorithms
-    names = names.get(entries[0].layout) if isinstance(names, dict) else names
+    names = found.suite and found.suite.algorithms.get(entries[0].layout)
     if names is not None and entries[0].teammate_kind not in names:
         yield f"suite.algorithms: {names}, but the teammate is of {entries[0].teammate_kind}"
     yield from _noise_faults(found, entries)

@@ -16,7 +16,7 @@ from icrl4aht_data.reading.shard import Shard
 
 
 def check_bytes_between(shard: Shard) -> list[str]:
-    """Faults in the bytes between the chunks, and bytes of the file that the chunk table does not list exactly once."""
+    """Return faults in the bytes between the chunks, and bytes that the chunk table does not list exactly once."""
     ordered = np.sort(shard.table, order="offset")
     stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
     size = shard.path.stat().st_size
@@ -38,7 +38,7 @@ def has_grown(shard: Shard) -> bool:
 
 
 def check_structure(shard: Shard, values: bool = False) -> list[str]:
-    """Differences between what another HDF5 reader sees and what `Shard` reads.
+    """Return the differences between what another HDF5 reader sees and what `Shard` reads.
 
     Args:
         shard: the shard.
@@ -83,7 +83,7 @@ def _structure_faults(shard: Shard, file: h5py.File) -> list[str]:
 
 
 def _dataset_faults(shard: Shard, file: h5py.File, entry: Entry, field: Field, stacked: int) -> list[str]:
-    """Faults in filters, chunks, shape and dtype of one dataset, in whose group `stacked` histories are."""
+    """Return faults in filters, chunks, shape and dtype of a dataset, whose group has `stacked` histories."""
     faults = []
     dataset = safe_hdf5.member(file, f"{entry.h5_group}/{field.name}")
     used, rows = safe_hdf5.filters(dataset), entry.rows(field)

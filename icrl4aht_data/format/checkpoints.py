@@ -15,7 +15,7 @@ CHECKPOINT_BYTES = 64 * 2**20
 
 
 def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
-    """Folder of a learned teammate's checkpoint: named by its hash in a release, by its path in a suite.
+    """Return the folder of a learned teammate's checkpoint: named by its hash in a release, by its path in a suite.
 
     Args:
         folder: TEAMMATES of a release, or a suite.
@@ -26,7 +26,7 @@ def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
 
 
 def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict[str, Path]:
-    """The files of a task's learned teammate.
+    """Return the files of a task's learned teammate.
 
     Args:
         folder: see `checkpoint_folder`.
@@ -47,12 +47,12 @@ def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict
 
 
 def expert_folder(sha256: str) -> str:
-    """Path in a release of the ego's checkpoint that expert actions come from, by the SHA-256 of its weights."""
+    """Return the folder of an ego's checkpoint in a release, by the SHA-256 of its weights."""
     return f"{EXPERTS}/{sha256}"
 
 
 def expert_files(folder: Path, sha256: str, root: Path | None = None) -> dict[str, Path]:
-    """The files of the ego's checkpoint that the expert actions of a task come from.
+    """Return the files of the ego's checkpoint that the expert actions of a task come from.
 
     Args:
         folder: the checkpoint's folder, in a release `expert_folder`.

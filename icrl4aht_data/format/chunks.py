@@ -35,7 +35,7 @@ _ROW_BYTES = 16 * 2**20  # most stored bytes that one row may cover, thirty time
 
 
 def chunk_table_name(shard: str) -> str:
-    """Path in the release of a shard's chunk table.
+    """Return the path in the release of a shard's chunk table.
 
     Args:
         shard: path in the release, `data/...h5`.
@@ -44,7 +44,7 @@ def chunk_table_name(shard: str) -> str:
 
 
 def chunk_table_path(root: Path, shard: str) -> Path:
-    """Path of a shard's chunk table below the release folder `root`."""
+    """Return the path of a shard's chunk table below the release folder `root`."""
     return root / chunk_table_name(shard)
 
 
@@ -70,7 +70,7 @@ def read_table(path: Path) -> np.ndarray:
 
 
 def chunk_locations(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
-    """(offset, size, rows) of a history's chunks according to HDF5, in the order of the chunk table."""
+    """Return (offset, size, rows) of a history's chunks according to HDF5, in the order of the chunk table."""
     locations = []
     for field in entry.stored_fields(kind):
         dataset: Any = file[f"{entry.h5_group}/{field.name}"]
@@ -82,7 +82,7 @@ def chunk_locations(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int
 
 
 def chunk_hash(data: bytes) -> bytes:
-    """The hash of stored bytes in a chunk table: BLAKE2b of 16 bytes."""
+    """Return the hash of stored bytes in a chunk table: BLAKE2b of 16 bytes."""
     return hashlib.blake2b(data, digest_size=16).digest()
 
 
@@ -107,7 +107,7 @@ def check_chunk(data: bytes, row: np.void) -> None:
 
 
 def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
-    """The bytes of a chunk after HDF5's shuffle and deflate filters.
+    """Return the bytes of a chunk after HDF5's shuffle and deflate filters.
 
     Args:
         rows: the chunk's rows, C-contiguous; may be fewer than `length`, then zeros follow.

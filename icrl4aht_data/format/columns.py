@@ -66,15 +66,15 @@ class Columns(Sequence[Entry]):
         self.__init__(arrays)
 
     def column(self, name: str) -> np.ndarray:
-        """A number column's values (H,), or a string column's codes (H,)."""
+        """Return a number column's values (H,), or a string column's codes (H,)."""
         return self._arrays[name]
 
     def values(self, name: str) -> list[str]:
-        """A string column's distinct values by code, in order of first appearance."""
+        """Return the distinct values of a string column, by code, in order of first appearance."""
         return [value.decode() for value in self._arrays[f"{name}.values"].tolist()]
 
     def code(self, name: str, value: str) -> int | None:
-        """The code of a string column's value, found by bisection; None if no line has it."""
+        """Return the code of a string column's value, found by bisection; None if no line has it."""
         values, ascending = self._arrays[f"{name}.values"], self._arrays[f"{name}.sorted"]
         wanted = value.encode()
         if len(wanted) > values.itemsize:
@@ -85,11 +85,11 @@ class Columns(Sequence[Entry]):
         return int(ascending[position])
 
     def rows(self, combination: int) -> np.ndarray:
-        """The rows of one combination, ascending."""
+        """Return the rows of one combination, ascending."""
         return self.order[self.starts[combination] : self.starts[combination + 1]]
 
     def shard_rows(self, shard: str) -> np.ndarray:
-        """The rows of one shard, ascending."""
+        """Return the rows of one shard, ascending."""
         code = self.code("shard", shard)
         if code is None:
             return self.order[:0]
@@ -116,7 +116,7 @@ class Columns(Sequence[Entry]):
 
 
 def read_columns(path: Path) -> Columns:
-    """The columns of an index file: from the cache folder if the file is large and its content was seen before.
+    """Return the columns of an index file, from the cache folder if the file is large and was read before.
 
     Raises:
         IndexFormatError: names the file and the line.
@@ -140,7 +140,7 @@ def read_columns(path: Path) -> Columns:
 
 
 def _parse(path: Path) -> dict[str, np.ndarray]:
-    """Every array of `Columns`."""
+    """Return every array of `Columns`."""
     codes = {name: _Codes() for name in (*_STRINGS, "obs_shape")}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
     first = 0
@@ -163,7 +163,7 @@ def _parse(path: Path) -> dict[str, np.ndarray]:
 
 
 def _blocks(path: Path) -> Iterator[bytes]:
-    """The file in blocks of complete lines, without the newline after the last one."""
+    """Yield the file in blocks of complete lines, without the newline after the last one."""
     with wrap_read_errors(path), path.open("rb") as stream:
         while text := stream.read(_BLOCK):
             text += stream.readline(LINE_BYTES)
@@ -173,7 +173,7 @@ def _blocks(path: Path) -> Iterator[bytes]:
 
 
 def _decode(text: bytes, first: int, path: Path) -> list[Entry]:
-    """The entries of a block of lines, of which the first has number `first`, counted from 0."""
+    """Return the entries of a block of lines, the first of which has number `first`, from 0."""
     newlines = text.count(b"\n")
     # Every line starts an object. Without this the decoder would accept an object that spans two lines.
     if text.count(b"\n{") == newlines:
@@ -213,7 +213,7 @@ class _Codes(dict[Any, int]):
 
 
 def _encode(entries: list[Entry], codes: dict[str, _Codes], first: int) -> dict[str, np.ndarray]:
-    """The columns of a block of entries, checked.
+    """Return the columns of a block of entries, after checking them.
 
     Args:
         entries: valid one by one, as far as types and bounds go.
@@ -276,7 +276,7 @@ def _check_related(
 
 
 def _group_rows(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The rows of every combination of the query fields, and of every shard."""
+    """Return the rows of every combination of the query fields, and of every shard."""
     sizes = [max(1, len(arrays[f"{name}.values"])) for name in QUERY_FIELDS]
     keys = np.zeros(len(arrays["T"]), np.int64)
     for name, size in zip(QUERY_FIELDS, sizes, strict=True):

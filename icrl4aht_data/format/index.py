@@ -48,7 +48,7 @@ class Index:
         return f"Index({counted_histories(len(self.entries))} at {self.root})"
 
     def entry(self, history_id: int) -> Entry:
-        """The entry of one history.
+        """Return the entry of one history.
 
         Raises:
             UnknownNameError: if there is none.
@@ -60,11 +60,11 @@ class Index:
         return self.entries[number]
 
     def values(self, name: str) -> list[str]:
-        """The values of a string field in this release, in order of first appearance."""
+        """Return the values of a string field in this release, in order of first appearance."""
         return self.entries.values(name)
 
     def query(self, **wanted: str | Sequence[str] | None) -> np.ndarray:
-        """Ids int64 (N,), ascending, of the histories whose fields have one of the wanted values; None means any.
+        """Return the ids int64 (N,), ascending, of the histories with the wanted values of fields; None means any.
 
         The time grows with the number of combinations of fields and of ids found, not with the number of histories.
 
@@ -100,7 +100,7 @@ class Index:
         return ids if (np.diff(ids) > 0).all() else np.sort(ids)
 
     def _code(self, name: str, value: str, given: str) -> int:
-        """The code of a value, also of a layout's alias; -1 for a valid value that no history has.
+        """Return the code of a value, also of a layout's alias; -1 for a valid value that no history has.
 
         Args:
             name, value: of `QUERY_FIELDS`, and the wanted value.
@@ -116,7 +116,7 @@ class Index:
         return -1
 
     def summary(self) -> str:
-        """The combinations of split, layout and family that exist, in one line."""
+        """Return the combinations of split, layout and family that exist, in one line."""
         counts: Counter[tuple[str, str, str]] = Counter()
         names = {name: self.values(name) for name in ("split", "layout", "teammate_family")}
         histories = np.diff(self.entries.starts).tolist()

@@ -44,8 +44,7 @@ _Number = Annotated[int, Meta(ge=0, lt=2**31)]
 _Return = Annotated[float, Meta(gt=-1e15, lt=1e15)]
 
 
-@dataclass(frozen=True)
-class EpisodeLengths:
+class EpisodeLengths(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Steps per episode.
 
     Args:
@@ -97,7 +96,7 @@ class LayoutStatistics:
         mean_final_return: mean of `Entry.return_end` over the histories.
         disk_bytes: size of the shards.
         independent_teammates: number of teammates that were not trained together: several checkpoints of one member of
-            a population count once. None where it was not counted.
+            a population count once. None where the tasks are unknown.
     """
 
     original_transitions: int | None
@@ -109,7 +108,7 @@ class LayoutStatistics:
     actions: int
     mean_final_return: float
     disk_bytes: int
-    independent_teammates: int | None = None
+    independent_teammates: int | None
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,7 @@ class ReleaseInfo:
     histories: int
     transitions: int
     layouts: dict[str, LayoutSummary]
-    shards: dict[str, _Bytes] = field(default_factory=dict)
+    shards: dict[str, _Bytes]
     statistics: dict[str, LayoutStatistics] = field(default_factory=dict)
     left_out: list[LeftOutTask] = field(default_factory=list)
 
@@ -179,7 +178,7 @@ class ReleaseInfo:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """The object to write, without `shards`, `statistics` and `left_out` where they are empty."""
+        """Return the object to write, without `shards`, `statistics` and `left_out` where they are empty."""
         content = json.loads(msgspec.json.encode(self))
         return {name: value for name, value in content.items() if value not in ({}, [])}
 
@@ -190,8 +189,6 @@ class ReleaseInfo:
         Raises:
             IndexFormatError: without the file, which the caller adds.
         """
-        if isinstance(content, dict) and "shards" not in content:
-            raise IndexFormatError("Object missing required field `shards`")
         try:
             info = msgspec.convert(content, cls)
         except msgspec.ValidationError as error:
@@ -204,8 +201,6 @@ class ReleaseInfo:
                     check_name(text)
         except Icrl4ahtError as error:
             raise IndexFormatError(str(error)) from error
-        if len(content["environment"]) != 2:
-            raise IndexFormatError("environment: expected max_steps and kept_steps only")
         return info
 
 
@@ -238,7 +233,7 @@ def read_info(root: Path) -> ReleaseInfo:
 
 
 def _instead(root: Path) -> str:
-    """Advice for a folder that is not a release."""
+    """Return advice for a folder that is not a release."""
     if not root.is_dir():
         hint = "there is no such folder: check the path"
     elif below := sorted(str(path.parent.parent) for path in root.glob(f"*/{INFO}")):
@@ -249,20 +244,20 @@ def _instead(root: Path) -> str:
 
 
 def check_version(version: str) -> str:
-    """A data version, checked.
+    """Return a data version after checking it.
 
     Raises:
         OptionError: if it does not have the form of SemVer.
     """
-    if len(version) > _VERSION_LENGTH or not _SEMVER.fullmatch(version):
-        raise OptionError(f"data version {version[:100]!r}: expected one such as 1.0.0 or 1.0.0-rc.1 (SemVer)")
+    if not isinstance(version, str) or len(version) > _VERSION_LENGTH or not _SEMVER.fullmatch(version):
+        raise OptionError(f"data version {version!r:.100}: expected one such as 1.0.0 or 1.0.0-rc.1 (SemVer)")
     return version
 
 
 def describe(
     kind: Kind, data_version: str, kept_steps: int, entries: list[Entry], format_version: int = FORMAT_VERSION
 ) -> ReleaseInfo:
-    """The info of a release with these histories, without sizes of shards and statistics."""
+    """Return the info of a release with these histories, without sizes of shards and statistics."""
     layouts = {}
     for name in dict.fromkeys(entry.layout for entry in entries):
         members = [entry for entry in entries if entry.layout == name]
@@ -286,9 +281,10 @@ def describe(
         histories=len(entries),
         transitions=sum(entry.T for entry in entries),
         layouts=layouts,
+        shards={},
     )
 
 
 def shard_sizes(root: Path, entries: Iterable[Entry]) -> dict[str, int]:
-    """Bytes of every shard, in the order of the index."""
+    """Return the bytes of every shard, in the order of the index."""
     return {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in entries)}

@@ -57,12 +57,12 @@ files of their own (.git/config, sitecustomize.py, x.pth), so everything else is
 
 
 def is_known_file(name: str) -> bool:
-    """Whether a path in a release is that of a file which releases have, except the manifest itself."""
+    """Return whether a path in a release is that of a file which releases have, except the manifest itself."""
     return _KNOWN.fullmatch(name) is not None
 
 
 def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
-    """File, a path in the release -> SHA-256.
+    """Return the files of a manifest: path in the release -> SHA-256.
 
     Args:
         text: content of the manifest.
@@ -104,13 +104,13 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
 
 
 def read_manifest(folder: Path) -> dict[str, str]:
-    """The manifest of a release folder, see `parse_manifest`."""
+    """Return the manifest of a release folder, see `parse_manifest`."""
     path = resolve_inside(folder, MANIFEST)
     return parse_manifest(read_text(path), path)
 
 
 def _listed(root: Path) -> Mapping[str, str]:
-    """The manifest of a release folder, parsed again only if its text has changed."""
+    """Return the manifest of a release folder, parsed again only if its text has changed."""
     path = resolve_inside(root, MANIFEST)
     return _parsed_once(read_text(path), path)
 

@@ -82,8 +82,7 @@ class TeammateSuite:
     """The populations that a learned teammate was selected from.
 
     Args:
-        algorithms: layout -> algorithms; older releases have one list for all `layouts`.
-        layouts: the layouts of such a list; None means every layout of the release.
+        algorithms: layout -> algorithms.
         members: policies in each population.
         train: training teammates wanted per population.
         total_steps: environment steps of each member's training.
@@ -92,8 +91,7 @@ class TeammateSuite:
             recorded.
     """
 
-    algorithms: dict[str, list[str]] | list[str]
-    layouts: list[str] | None = None
+    algorithms: dict[str, list[str]]
     members: int
     train: int
     total_steps: int
@@ -203,7 +201,7 @@ class Provenance:
     other: dict[str, Any] = field(default_factory=dict)
 
     def entry_fields(self) -> dict[str, Any]:
-        """The fields of the task's index entries that describe the policy behind the expert actions."""
+        """Return the fields of the task's index entries that describe the policy behind the expert actions."""
         expert = self.expert
         return {
             "expert_return": None if expert is None else expert.return_greedy,
@@ -212,7 +210,7 @@ class Provenance:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """The object to write, without what was not recorded."""
+        """Return the object to write, without what was not recorded."""
         content = _recorded(asdict(self))
         for name in {"expert", "filter", "nearest_test", "references", "suite"} & content.keys():
             content[name] = _recorded(content[name])

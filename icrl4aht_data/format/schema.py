@@ -102,13 +102,13 @@ class Field:
     absent: tuple[Kind, ...] = ()
 
     def element(self, layout: Layout, kind: Kind) -> np.dtype:
-        """The stored element's dtype: a scalar, the S bytes of a state record, or 5 x 5 x C bytes."""
+        """Return the stored element's dtype: a scalar, the S bytes of a state record, or 5 x 5 x C bytes."""
         if self.row == "scalar":
             return np.dtype(self.compact if kind == "lite" else self.dtype)
         return np.dtype(("u1", (record_size(layout),) if self.row == "state" else layout.obs_shape))
 
     def held(self, layout: Layout) -> np.dtype:
-        """The element's dtype in the memory of samplers: the compact one for every kind of release."""
+        """Return the dtype of an element in the memory of samplers: the compact one for every kind of release."""
         return self.element(layout, "lite")
 
 
@@ -132,7 +132,7 @@ ACTION_FIELDS = ("actions", "teammate_actions", "expert_actions", "oracle_action
 
 
 def held_fields(kind: Kind) -> tuple[Field, ...]:
-    """The fields that batches and converted releases are made of.
+    """Return the fields that batches and converted releases are made of.
 
     All stored ones, except `obs` where it can be rendered from the state records.
     """
@@ -141,7 +141,7 @@ def held_fields(kind: Kind) -> tuple[Field, ...]:
 
 
 def record_field(kind: Kind) -> Field:
-    """The field that determines what the ego saw: the state record, or the observation itself."""
+    """Return the field that determines what the ego saw: the state record, or the observation itself."""
     return FIELDS["state" if kind in KINDS else "obs"]
 
 
@@ -223,15 +223,15 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     has_oracle_actions: bool = False
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
-        """The fields that this history's shard stores."""
+        """Return the fields that this history's shard stores."""
         return tuple(field for field in FIELDS.values() if kind not in field.absent and self._stores(field))
 
     def has(self, field: Field) -> bool:
-        """Whether the history has a field that its kind of release may have, see `Field.optional`."""
+        """Return whether the history has a field that its kind of release may have, see `Field.optional`."""
         return self._stores(self.stored_field(field))
 
     def stored_field(self, field: Field) -> Field:
-        """The field that stores a field's values: itself, or `expert_actions` for `oracle_actions`.
+        """Return the field that stores a field's values: itself, or `expert_actions` for `oracle_actions`.
 
         The expert of a noise history is the oracle, so its release may leave out the second copy of its actions.
         """
@@ -242,15 +242,15 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return getattr(self, f"has_{field.name}", True)
 
     def rows(self, field: Field) -> int:
-        """Number of the field's rows: T or E."""
+        """Return the number of rows of a field: T or E."""
         return self.T if field.axis == "T" else self.episodes
 
     def chunks(self, field: Field) -> int:
-        """Number of the field's chunks."""
+        """Return the number of chunks of a field."""
         return -(-self.rows(field) // field.chunk)
 
     def to_json(self) -> dict[str, Any]:
-        """The object of the index line."""
+        """Return the object of the index line."""
         return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)}
 
 
@@ -299,18 +299,18 @@ def check_name(text: str) -> None:
 
 
 def episode_ends(steps: int, kept_steps: int) -> np.ndarray:
-    """bool (steps,): the last step of every episode of `kept_steps` steps."""
+    """Return bool (steps,): True on the last step of every episode of `kept_steps` steps."""
     return np.arange(steps) % kept_steps == kept_steps - 1
 
 
 def episode_returns(rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
-    """float64 (E,): the sum of rewards (T,) of each episode; `dones` (T,) marks last steps."""
+    """Return float64 (E,), the sum of rewards (T,) of each episode; `dones` (T,) marks last steps."""
     ends = np.flatnonzero(dones) + 1
     return np.diff(np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)[ends - 1]]))
 
 
 def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean return over the first and over the last w = max(5, floor(0.1 N)) of N episodes (paper, App. F.1).
+    """Return the mean of the first and of the last w = max(5, floor(0.1 N)) of N episodes (paper, App. F.1).
 
     Args:
         returns: (B, N), episode returns.
@@ -323,7 +323,7 @@ def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
-    """Whether expert actions come from a policy that earns less than half of what the ego earned at a history's end.
+    """Return whether the policy behind expert actions earns less than half of what the ego earned at the end.
 
     Where the end is negative, labels are weak if they earn less than one and a half times it.
 
@@ -339,6 +339,6 @@ def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
 
 
 def stream_score(returns: np.ndarray) -> np.ndarray:
-    """float64 (B,): end + (end - start) of learning curves (B, N) (paper, App. F.1)."""
+    """Return end + (end - start) of learning curves (B, N), float64 (B,) (paper, App. F.1)."""
     start, end = curve_ends(returns)
     return end + (end - start)

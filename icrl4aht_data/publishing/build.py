@@ -43,7 +43,7 @@ from icrl4aht_data.writing.card import (
     write_card,
 )
 from icrl4aht_data.writing.parquet import to_parquet, write_episodes
-from icrl4aht_data.writing.release_folder import atomic_folder, check_target
+from icrl4aht_data.writing.release_folder import as_path, atomic_folder, check_target
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
 _POLICY = "policy.json"
@@ -52,8 +52,8 @@ _LIBRARIES = {"matplotlib": "plot", "PIL": "plot", "pyarrow": "hf", "mlcroissant
 
 
 def build_release(
-    source: Path | None,
-    target: Path,
+    source: str | Path | None,
+    target: str | Path,
     *,
     link: bool = False,
     overwrite: bool = False,
@@ -75,7 +75,7 @@ def build_release(
         OptionError: if `target` may not be written, see `release_folder.check_target`, or a library is not installed.
         ReleaseError: if `source` is not valid; names the first problems.
     """
-    source = (MINI if source is None else source).resolve()
+    source, target = as_path(MINI if source is None else source).resolve(), as_path(target)
     check_target(target, overwrite, [source])
     missing = [name for name in _LIBRARIES if find_spec(name) is None]
     if missing:

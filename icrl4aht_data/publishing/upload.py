@@ -67,7 +67,7 @@ class Upload:
 
 
 def upload_release(
-    folder: Path,
+    folder: str | Path,
     address: str,
     *,
     private: bool = False,
@@ -95,7 +95,7 @@ def upload_release(
     """
     from huggingface_hub import HfApi
 
-    found = re.fullmatch(r"hf://datasets/([\w.-]+/[\w.-]+)/?", address)
+    found, folder = re.fullmatch(r"hf://datasets/([\w.-]+/[\w.-]+)/?", str(address)), Path(folder)
     if found is None:
         raise OptionError(f"{address!r}: expected hf://datasets/ORG/REPO; the revision is the data version's tag")
     check_valid(folder, advance)

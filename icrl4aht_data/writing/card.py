@@ -103,7 +103,7 @@ def render_card(content: Mapping[str, Any]) -> str:
 
 
 def teammate_name(task: Task) -> str:
-    """Family of a task's heuristic, or its algorithm, and number of the parameters, such as "H3/t12"."""
+    """Return a heuristic's family, or an algorithm, with the number of the parameters, such as "H3/t12"."""
     family = task.teammate_kind if task.teammate_family == "rl" else task.teammate_family
     return f"{family}/t{task.teammate.get('theta_id', 0)}"
 

@@ -16,12 +16,12 @@ from icrl4aht_data.format.schema import MANIFEST, PROVENANCE, RELEASE_CARD, SOUR
 from icrl4aht_data.utils.files import read_text
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.release import NewTask, write_release
-from icrl4aht_data.writing.release_folder import check_target
+from icrl4aht_data.writing.release_folder import as_path, check_target
 from icrl4aht_data.writing.stored import release_tasks, stored_task
 
 
 def combine_releases(
-    target: Path,
+    target: str | Path,
     roots: Sequence[str | Path],
     data_version: str | None = None,
     *,
@@ -44,8 +44,9 @@ def combine_releases(
     """
     if data_version is not None:
         check_version(data_version)
-    if not roots:
-        raise OptionError("expected at least one release to combine")
+    target = as_path(target)
+    if not roots or isinstance(roots, (str, Path)):
+        raise OptionError(f"expected a list of at least one release to combine, found {roots!r}")
     check_target(target, overwrite, roots)
     datasets = [load_icrl4aht(root) for root in roots]
     _check_compatible(datasets)

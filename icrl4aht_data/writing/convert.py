@@ -11,13 +11,13 @@ from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, PROVENANCE, SOURCE_CARD, Kind
 from icrl4aht_data.utils.files import read_text
 from icrl4aht_data.writing.release import write_release
-from icrl4aht_data.writing.release_folder import check_target
+from icrl4aht_data.writing.release_folder import as_path, check_target
 from icrl4aht_data.writing.stored import HistoryProgress, release_tasks, stored_task
 
 
 def to_release(
     dataset: Dataset,
-    target: Path,
+    target: str | Path,
     kind: Kind,
     *,
     overwrite: bool = False,
@@ -36,6 +36,7 @@ def to_release(
         OptionError: if `target` may not be written, see `release_folder.check_target`, or if a kind with states is
             wanted of a dataset without.
     """
+    target = as_path(target)
     if kind in KINDS and not dataset.has_states:
         raise OptionError(
             f"{dataset.root}: has observations only, and a {kind} release is made of state records, which observations "

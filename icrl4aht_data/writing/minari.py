@@ -33,7 +33,7 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.installation import install_command
-from icrl4aht_data.writing.release_folder import atomic_folder
+from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 from icrl4aht_data.writing.stored import HistoryProgress, with_source
 
 _NAME = re.compile(r"[\w.-]+-v\d+")
@@ -42,7 +42,7 @@ _LABELS = {"expert_actions": "expert_action", "oracle_actions": "oracle_action"}
 
 def to_minari(
     dataset: Dataset,
-    target: Path,
+    target: str | Path,
     *,
     overwrite: bool = False,
     advance: HistoryProgress = lambda done, total: None,
@@ -69,6 +69,7 @@ def to_minari(
         from minari.dataset.minari_storage import MinariStorage
     except ImportError as error:
         raise OptionError(f"Minari is needed: {install_command('minari')}") from error
+    target = as_path(target)
     if not dataset.has_states:
         raise NotStoredError(
             f"{dataset.root}: has observations only, without those after the last steps of episodes, which a Minari "

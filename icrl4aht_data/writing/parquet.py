@@ -12,6 +12,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.reading.arrow_tables import episode_schema, episode_table, import_pyarrow, index_schema
 from icrl4aht_data.utils.files import atomic_write, check_output, explain_full_disk
+from icrl4aht_data.writing.release_folder import as_path
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -23,7 +24,7 @@ FILE_EPISODES = 500_000
 """Episodes after which a history starts the next file: about 100 MB."""
 
 
-def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path:
+def to_parquet(dataset: Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write the selection's index as a Parquet file, one row per history. Needs pyarrow, of the extra `hf`.
 
     Args:
@@ -35,7 +36,7 @@ def to_parquet(dataset: Dataset, path: Path, *, overwrite: bool = False) -> Path
         OptionError: if pyarrow is not installed, or `path` may not be written, see `utils.files.check_output`, or
             is inside the release.
     """
-    arrow = import_pyarrow()
+    arrow, path = import_pyarrow(), as_path(path)
     import pyarrow.parquet as pq
 
     check_output(path, overwrite)

@@ -47,7 +47,7 @@ from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
 from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, atomic_folder, check_target
+from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, as_path, atomic_folder, check_target
 from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays, with_source
 
 PUBLISHED_CHUNK = 4096
@@ -61,7 +61,7 @@ FROM_PUBLISHED = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], n
 
 def to_published(
     dataset: Dataset,
-    target: Path,
+    target: str | Path,
     *,
     chunk: int = PUBLISHED_CHUNK,
     states: bool = True,
@@ -82,6 +82,7 @@ def to_published(
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`.
     """
+    target = as_path(target)
     kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
     sources = {entry.task_id: entry.source for entry in dataset.entries}
     recorded = read_provenance(dataset.origin.file(PROVENANCE))
@@ -119,8 +120,8 @@ def _write_published(group: h5py.Group, name: str, array: np.ndarray, chunk: int
 
 
 def from_published(
-    source: Path,
-    target: Path,
+    source: str | Path,
+    target: str | Path,
     kind: Kind | None = None,
     *,
     tasks: Path | None = None,
@@ -153,7 +154,7 @@ def from_published(
         PublishedFormatError: if a file is missing or malformed, if a group has no array that a release of that kind
             needs, or if a group, a stream or a content appears twice; names file and group.
     """
-    kept_steps = check_int("kept_steps", kept_steps, 1)
+    kept_steps, source, target = check_int("kept_steps", kept_steps, 1), as_path(source), as_path(target)
     check_target(target, overwrite, [source])
     lines = read_published_index(resolve_inside(source, HISTORIES_INDEX), family_map)
     provenance_path = resolve_inside(source, "provenance.json")

@@ -24,7 +24,7 @@ PADDING = (
 
 
 def is_short(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
-    """Whether views of this shape have as many rows as the map of a layout, which are fewer than a view has."""
+    """Return whether views of this shape have as many rows as a map that is lower than a view."""
     return layout.height < WINDOW and tuple(obs_shape) == (layout.height, *layout.obs_shape[1:])
 
 

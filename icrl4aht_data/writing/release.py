@@ -17,11 +17,12 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.format.info import LeftOutTask, check_version, describe, shard_sizes
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import (
+    ALL_KINDS,
     HISTORIES,
     INFO,
     KINDS,
@@ -43,7 +44,7 @@ from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.writing.card import write_card
-from icrl4aht_data.writing.release_folder import atomic_folder
+from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 from icrl4aht_data.writing.shard_writer import EncodedChunk, encode_history, write_shard
 from icrl4aht_data.writing.statistics import layout_statistics
 
@@ -93,7 +94,7 @@ class NewTask:
 
 
 def write_release(
-    target: Path,
+    target: str | Path,
     kind: Kind,
     tasks: Iterable[NewTask],
     *,
@@ -129,11 +130,15 @@ def write_release(
         done: called after the histories of a task, for progress.
 
     Raises:
+        UnknownNameError: if there is no such kind.
         OptionError: if `target` may not be written, see `release_folder.check_target`, if there is no task or one
             twice, if only some tasks are known by name only, or if a history's arrays are missing, of unequal length or
             lossy.
     """
+    target = as_path(target)
     check_version(data_version)
+    if kind not in ALL_KINDS:
+        raise unknown("kind", kind, ALL_KINDS)
     new = list(tasks)
     ids = [task.task.task_id for task in new]
     if not new or len(set(ids)) < len(ids):

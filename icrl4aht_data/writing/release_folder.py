@@ -26,6 +26,17 @@ _CONVERTED = (
 """Files of the folders that are no releases: published files, and a Minari dataset."""
 
 
+def as_path(target: object) -> Path:
+    """Return the path of a folder or file to write.
+
+    Raises:
+        OptionError: if it is neither a path nor a text.
+    """
+    if not isinstance(target, (str, Path)):
+        raise OptionError(f"{target!r:.100}: expected the path of a folder or file to write")
+    return Path(target)
+
+
 @contextmanager
 def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[str | Path] = ()) -> Iterator[Path]:
     """Yield a new folder to fill, which becomes `target` if the block ends without an error.

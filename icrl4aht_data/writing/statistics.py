@@ -75,7 +75,7 @@ def layout_statistics(
 
 
 def _policy(task: Task) -> str:
-    """A text that is equal for checkpoints of one policy's training, and for nothing else."""
+    """Return a text that is equal for checkpoints of one training, and for nothing else."""
     checkpoint = task.teammate.get("theta", {}).get("checkpoint")
     if task.teammate_family != "rl" or checkpoint is None:
         return json.dumps(task.teammate, sort_keys=True)

@@ -75,7 +75,7 @@ def test_a_malformed_provenance_is_named(tmp_path, note, message):
         ({"kind": "heavy"}, "Invalid enum value 'heavy'"),
         ({"histories": True}, r"Expected `int`, got `bool` - at `\$\.histories`"),
         ({"environment": {"max_steps": 400, "kept_steps": 0}}, "Expected `int` >= 1"),
-        ({"environment": {"max_steps": 400, "kept_steps": 100, "speed": 2}}, "max_steps and kept_steps only"),
+        ({"environment": {"max_steps": 400, "kept_steps": 100, "speed": 2}}, "unknown field `speed`"),
         ({"shards": {"a": -1}}, "Expected `int` >= 0"),
         ({"data_version": "\x1b[2J"}, r"data version '\\x1b\[2J': expected one such as 1.0.0"),
     ],

@@ -12,9 +12,13 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.errors import OptionError, PublishedFormatError
+from icrl4aht_data.errors import OptionError, PublishedFormatError, UnknownNameError
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
+from icrl4aht_data.publishing.build import build_release
+from icrl4aht_data.publishing.upload import upload_release
+from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.minari import to_minari
 from icrl4aht_data.writing.parquet import to_parquet
 from icrl4aht_data.writing.published import PUBLISHED_FIELDS, from_published, to_published
 from tests.helpers.batches import digest
@@ -120,3 +124,32 @@ def test_parquet_index(lite, tmp_path):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     rows = pq.read_table(to_parquet(dataset, tmp_path / "index.parquet")).to_pylist()
     assert rows == [entry.to_json() for entry in dataset.entries]
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda ds: to_release(ds, 3, "lite"),
+        lambda ds: to_release(ds, "out", "heavy"),
+        lambda ds: to_published(ds, None),
+        lambda ds: to_minari(ds, b"out-v0"),
+        lambda ds: to_parquet(ds, 3.5),
+        lambda ds: from_published(None, "out"),
+        lambda ds: from_published("files", "out", kept_steps="many"),
+        lambda ds: combine_releases("out", str(ds.root)),
+        lambda ds: combine_releases("out", [ds.root], 5),
+        lambda ds: combine_releases(["out"], [ds.root]),
+        lambda ds: build_release(ds.root, 5),
+        lambda ds: upload_release(ds.root, None),
+        lambda ds: verify_release(ds.root, level=3),
+    ],
+)
+def test_wrong_arguments_are_errors_of_the_package(lite, tmp_path, monkeypatch, call):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((OptionError, UnknownNameError)):
+        call(load_icrl4aht(lite[0]))
+    assert not list(tmp_path.iterdir())
+
+
+def test_paths_may_be_texts(lite, tmp_path):
+    assert to_release(load_icrl4aht(lite[0])[:1], str(tmp_path / "out"), "lite") == tmp_path / "out"
