@@ -126,22 +126,26 @@ def test_parquet_index(lite, tmp_path):
     assert rows == [entry.to_json() for entry in dataset.entries]
 
 
+def wrong(value: Any) -> Any:
+    return value
+
+
 @pytest.mark.parametrize(
     "call",
     [
-        lambda ds: to_release(ds, 3, "lite"),
-        lambda ds: to_release(ds, "out", "heavy"),
-        lambda ds: to_published(ds, None),
-        lambda ds: to_minari(ds, b"out-v0"),
-        lambda ds: to_parquet(ds, 3.5),
-        lambda ds: from_published(None, "out"),
-        lambda ds: from_published("files", "out", kept_steps="many"),
+        lambda ds: to_release(ds, wrong(3), "lite"),
+        lambda ds: to_release(ds, "out", wrong("heavy")),
+        lambda ds: to_published(ds, wrong(None)),
+        lambda ds: to_minari(ds, wrong(b"out-v0")),
+        lambda ds: to_parquet(ds, wrong(3.5)),
+        lambda ds: from_published(wrong(None), "out"),
+        lambda ds: from_published("files", "out", kept_steps=wrong("many")),
         lambda ds: combine_releases("out", str(ds.root)),
-        lambda ds: combine_releases("out", [ds.root], 5),
-        lambda ds: combine_releases(["out"], [ds.root]),
-        lambda ds: build_release(ds.root, 5),
-        lambda ds: upload_release(ds.root, None),
-        lambda ds: verify_release(ds.root, level=3),
+        lambda ds: combine_releases("out", [ds.root], wrong(5)),
+        lambda ds: combine_releases(wrong(["out"]), [ds.root]),
+        lambda ds: build_release(ds.root, wrong(5)),
+        lambda ds: upload_release(ds.root, wrong(None)),
+        lambda ds: verify_release(ds.root, level=wrong(3)),
     ],
 )
 def test_wrong_arguments_are_errors_of_the_package(lite, tmp_path, monkeypatch, call):
