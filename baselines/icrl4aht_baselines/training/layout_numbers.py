@@ -11,16 +11,17 @@ from icrl4aht_baselines.methods.view_change import mirrored_action
 from icrl4aht_data.overcooked.layouts import Layout
 
 
-class LayoutNumbers:
-    """A sampler's batches of state records, with other numbers of the layouts.
+class NumberedBatches:
+    """A sampler's batches of state records, with other numbers of the layouts, perhaps mirrored at random.
 
     Args:
         sampler: of histories on some of the layouts.
         numbers: int32, new number of each layout of `sampler.layouts`.
+        layouts: number of all layouts, to mirror each row at random, see `view_change.changed_view`; 0 mirrors none.
     """
 
-    def __init__(self, sampler: Any, numbers: np.ndarray) -> None:
-        self._sampler, self._numbers = sampler, numbers
+    def __init__(self, sampler: Any, numbers: np.ndarray, layouts: int = 0) -> None:
+        self._sampler, self._numbers, self._layouts = sampler, numbers, layouts
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._sampler, name)
@@ -31,28 +32,14 @@ class LayoutNumbers:
     def batch(self, i: int, out: Any = None) -> Any:
         """Return batch i, written into `out` if it is given."""
         batch = self._sampler.batch(i, out)
-        rows = np.zeros(len(batch.obs if hasattr(batch, "obs") else batch.query_obs), np.int32)
-        return batch._replace(layouts=self._numbers[rows if batch.layouts is None else batch.layouts])
-
-
-class MirroredBatches(LayoutNumbers):
-    """A sampler's batches of state records, of which each row is mirrored at random; see `view_change.changed_view`.
-
-    Args:
-        sampler: of histories on some of the layouts.
-        numbers: int32, new number of each layout of `sampler.layouts`.
-        layouts: number of all layouts.
-    """
-
-    def __init__(self, sampler: Any, numbers: np.ndarray, layouts: int) -> None:
-        super().__init__(sampler, numbers)
-        self._layouts = layouts
-
-    def batch(self, i: int, out: Any = None) -> Any:
-        """Return batch i, written into `out` if it is given."""
-        batch = super().batch(i, out)
+        rows = len(batch.obs if hasattr(batch, "obs") else batch.query_obs)
+        # A sampler of one layout does not number it.
+        numbers = self._numbers[np.zeros(rows, np.int32) if batch.layouts is None else batch.layouts]
+        if not self._layouts:
+            return batch._replace(layouts=numbers)
+        # The mirroring is a function of the batch's number and process, as the batch itself is.
         drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
-        mirroring = drawn.integers(4, size=len(batch.layouts), dtype=np.int32)
+        mirroring = drawn.integers(4, size=rows, dtype=np.int32)
         actions = {
             name: mirrored_action(values, mirroring)
             for name, values in batch._asdict().items()
@@ -61,13 +48,13 @@ class MirroredBatches(LayoutNumbers):
         if hasattr(batch, "is_first"):  # no step precedes: the fillers stay 0, as they are when a model acts
             filler = batch.is_first | ~batch.attention_mask
             actions |= {name: np.where(filler, 0, actions[name]) for name in actions if name.startswith("prev_")}
-        return batch._replace(**actions, layouts=batch.layouts + self._layouts * mirroring)
+        return batch._replace(**actions, layouts=numbers + self._layouts * mirroring)
 
 
 def number_layouts(sampler: Any, layouts: Sequence[Layout], mirror: bool = False) -> Any:
-    """Return the sampler with layouts numbered as in `layouts`, of which its histories may be on a part only."""
+    """Return the sampler with its layouts numbered as in `layouts`; its histories may be on some of these only."""
     numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
     if mirror:
-        return MirroredBatches(sampler, numbers, len(layouts))
+        return NumberedBatches(sampler, numbers, len(layouts))
     agree = sampler.dataset.obs != "state" or numbers.tolist() == list(range(len(layouts)))
-    return sampler if agree else LayoutNumbers(sampler, numbers)
+    return sampler if agree else NumberedBatches(sampler, numbers)

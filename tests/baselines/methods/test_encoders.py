@@ -14,8 +14,6 @@ import pytest
 from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.methods.tokens import batch_steps, plain_view
-from icrl4aht_baselines.training.histories import prepare
-from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_generation.learners import encoder
 from icrl4aht_generation.learners.encoder import CompactView, GroupedWords
 
@@ -65,11 +63,7 @@ def assert_equal_results(one: Any, two: Any, params: Any) -> None:
     jax.tree.map(compare, gradient, other_gradient)
 
 
-SLOW_METHODS = (pytest.param(name, marks=pytest.mark.slow) for name in ("dpt", "hybrid_ad", "amago_offline"))
-METHODS = ("ad", *SLOW_METHODS)
-
-
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", ["ad", pytest.param("dpt", marks=pytest.mark.slow)])
 def test_words_give_the_loss_and_gradient_of_the_paper(lite, name):
     """The batch of the paper's encoder holds observations, the other one state records."""
     paper, words = made(name, "paper", plain_view), made(name, "words")
@@ -128,21 +122,3 @@ def test_inputs_of_several_layouts_are_their_observations(two_layouts, kind, can
     steps = batch_steps(jax.tree.map(jnp.asarray, states), view)
     assert isinstance(steps.obs, GroupedWords) == (kind == "words")
     np.testing.assert_array_equal(view.observations(steps.obs), shown.obs)
-
-
-def test_every_part_numbers_the_layouts_as_the_model_does(two_layouts):
-    """The held-out histories of a task, or all of a held-out one, may be on one of the layouts only."""
-    options = TrainOptions(steps=1, batch_size=6, context=5)
-    jobs = [
-        prepare("ad", OPTIONS, options, HistoryOptions(("asymm_both", "cramped_up"), str(two_layouts), obs=obs))
-        for obs in (None, "uint8")
-    ]
-    view = CompactView("paper", tuple(map(get_layout, jobs[0].about["histories"]["layouts"])))
-    parts = [{"train": job.data.train, **job.data.validation} for job in jobs]
-    numbered = set()
-    for part, sampler in parts[0].items():
-        batch = sampler.batch(0, sampler.empty())
-        numbered.add(tuple(sorted(set(batch.layouts.tolist()))))
-        found = view(jnp.asarray(batch.obs), jnp.asarray(batch.layouts))
-        np.testing.assert_array_equal(found, parts[1][part][0].obs)
-    assert len(numbered) > 1, "of parts with one layout and with both"

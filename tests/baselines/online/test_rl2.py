@@ -38,6 +38,7 @@ from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import read_trained_on
 from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task
 from icrl4aht_generation.teammates.registry import build_teammate, sample_teammate
 
@@ -111,22 +112,11 @@ def test_episodes_for_learning(trainer):
         memory = np.asarray(after.ego.state)
         assert not memory[ended].any() and np.abs(memory[~ended]).sum() > 0
         np.testing.assert_array_equal(played.hidden[0], tasks.ego.state)
+        for before in (after.before.prev_action, after.before.prev_reward, after.before.prev_teammate_action):
+            assert ended.any() and not np.asarray(before)[ended].any()  # a new task knows nothing of the one before
         tasks = after
     changes = np.asarray(tasks.ego.change.upside_down), np.asarray(tasks.ego.change.sideways)
     assert all(0 < flags.sum() < 8 for flags in changes)
-
-
-def test_the_first_step_of_a_task_knows_nothing_of_the_one_before(trainer):
-    player, state = trainer.players[0], trainer.init()
-    tasks = state.tasks[0]
-    for number in range(4):
-        tasks, played, _ = player.episode(state.params, trainer._mates[0], tasks, jax.random.key(number))
-        ended = np.asarray(played.done[-1])
-        for before in (tasks.before.prev_action, tasks.before.prev_reward, tasks.before.prev_teammate_action):
-            assert not np.asarray(before)[ended].any()
-        if ended.any():
-            return
-    raise AssertionError("no task ended")
 
 
 def test_the_log(through):
@@ -248,31 +238,30 @@ class TestGroups:
         assert (chances[:, 0] == 1).sum() == 100 * MIXTURE[0][0]
         assert mixed_chances(1)[0].tolist() == [1.0, 0.0, 0.0, 0.0]
 
-    @pytest.mark.parametrize("behaviour", BEHAVIOURS)
-    def test_behaviours(self, behaviour):
+    def test_behaviours(self):
         """With the behaviour `stay` the teammate never moves, with `script` it plays as without behaviours."""
-        base = teammates(1)[0]
-        chances = np.eye(len(BEHAVIOURS), dtype=np.float32)[[BEHAVIOURS.index(behaviour)]]
-        (mate,) = with_behaviours([base], chances)
-        taken, plain = played_actions(mate), played_actions(base)
-        if behaviour == "stay":
-            assert (taken == STAY).all()
-        elif behaviour == "script":
-            np.testing.assert_array_equal(taken, plain)
-        else:
-            assert 0.05 < (taken != plain).mean() < 1.0
+        (base,) = teammates(1)
+        mates = with_behaviours([base] * len(BEHAVIOURS), np.eye(len(BEHAVIOURS), dtype=np.float32))
+        (plain,), taken = played_actions([base]), dict(zip(BEHAVIOURS, played_actions(mates), strict=True))
+        assert (taken["stay"] == STAY).all()
+        np.testing.assert_array_equal(taken["script"], plain)
+        for behaviour in ("random", "noisy"):
+            assert 0.05 < (taken[behaviour] != plain).mean() < 1.0
 
 
-def played_actions(mate: Any) -> np.ndarray:
-    """40 actions of a teammate in one state, the start of an episode."""
+def played_actions(mates: list[Policy]) -> list[np.ndarray]:
+    """Return 40 actions of each of teammates that share their functions, in the state at the start of an episode."""
     cells, facings = np.array(LAYOUT.agent_cells, np.uint8), np.zeros(2, np.uint8)
     record = jnp.asarray(start(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
-    memory, found = mate.init(mate.params, jax.random.key(0)), []
-    act = jax.jit(mate.act)
-    for t in range(40):
-        action, memory = act(mate.params, memory, record, jax.random.fold_in(jax.random.key(1), t))
-        found.append(int(action))
-    return np.array(found)
+    act = jax.jit(mates[0].act)
+    found = []
+    for mate in mates:
+        memory, actions = mate.init(mate.params, jax.random.key(0)), []
+        for t in range(40):
+            action, memory = act(mate.params, memory, record, jax.random.fold_in(jax.random.key(1), t))
+            actions.append(int(action))
+        found.append(np.array(actions))
+    return found
 
 
 class TestPreparing:
@@ -344,21 +333,30 @@ class TestPreparing:
         assert _shares(load_icrl4aht(split="train", layout="coord_simple"), ()) == {"coord_simple": FLAT_SHARE}
         assert _shares(None, read_tasks(manifest_path("layout", "test"))) == {"asymm_right": 1.0, "cramped_down": 1.0}
 
-    def test_layouts_without_any_teammate(self):
-        choice = HistoryOptions(("cramped_up", "asymm_right"), source=("noise",))
-        tasks = read_tasks(manifest_path("layout", "train", "diverse"))
-        with pytest.raises(OptionError, match="asymm_right: neither a chosen history nor a task of a manifest"):
-            self.prepare(PlayOptions(), tasks, choice)
-
-    def test_learned_teammates_play_on_their_own_layout_only(self):
-        choice = HistoryOptions(("cramped_up",), teammate_family=("rl",))
-        with pytest.raises(OptionError, match="cramped_up: rearranged layouts and four recipes need heuristic"):
-            self.prepare(PlayOptions(rearranged=1), (), choice)
-
-    def test_tasks_elsewhere(self):
-        tasks = read_tasks(manifest_path("layout", "test"))
-        with pytest.raises(OptionError, match="none of the 40 tasks is on cramped_up, but on asymm_right, "):
-            self.prepare(PlayOptions(), tasks)
+    @pytest.mark.parametrize(
+        ("play", "choice", "manifest", "message"),
+        [
+            (
+                PlayOptions(),
+                HistoryOptions(("cramped_up", "asymm_right"), source=("noise",)),
+                ("layout", "train", "diverse"),
+                "asymm_right: neither a chosen history nor a task of a manifest",
+            ),
+            (
+                PlayOptions(rearranged=1),
+                HistoryOptions(("cramped_up",), teammate_family=("rl",)),
+                None,
+                "cramped_up: rearranged layouts and four recipes need heuristic",
+            ),
+            (PlayOptions(), CHOICE, ("layout", "test"), "none of the 40 tasks is on cramped_up, but on asymm_right, "),
+            (PlayOptions(), HistoryOptions(("cramped_up",), queries=7), None, "queries = 7: rl2 learns by playing"),
+            (PlayOptions(), HistoryOptions(("cramped_up",), channels="own"), None, "rl2 takes canonical channels"),
+        ],
+    )
+    def test_impossible_choices(self, play, choice, manifest, message):
+        tasks = read_tasks(manifest_path(*manifest)) if manifest else ()
+        with pytest.raises(OptionError, match=message):
+            self.prepare(play, tasks, choice)
 
 
 class TestCommand:
@@ -390,22 +388,8 @@ class TestCommand:
         prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # compiles: it fits what the evaluator passes
 
     @pytest.mark.parametrize(
-        ("options", "message"),
-        [
-            (["--queries", "7"], "queries = 7: rl2 learns by playing, not from histories; leave it out"),
-            (["--every", "2"], "every = 2: rl2 learns by playing, not from histories; leave it out"),
-            (["--channels", "own"], "channels = own: rl2 takes canonical channels; leave it out"),
-        ],
-    )
-    def test_options_of_histories(self, lite, tmp_path, options, message):
-        arguments = ["train", "rl2", "--layout", "coord_simple", "--root", str(lite[0]), "--out", str(tmp_path / "run")]
-        result = CliRunner().invoke(cli, [*arguments, *options])
-        assert isinstance(result.exception, OptionError) and str(result.exception) == message
-
-    @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (["rl2", "--context", "5"], "--context: not with rl2, which learns by playing"),
             (["rl2", "--size", "tiny"], "--size: not with rl2, which learns by playing"),
             (["rl2", "--next-obs", "--layers", "2"], "--layers, --next-obs: not with rl2, which learns by playing"),
             (["ad", "--epochs", "2"], "--epochs: not with ad, only with rl2, which learns by playing"),

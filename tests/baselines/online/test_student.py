@@ -113,12 +113,9 @@ def test_teammates_of_other_tasks_are_played_as_well(dataset):
     assert len(again.tasks) == len(plain.tasks) + 1  # each teammate once
 
 
-def test_tasks_on_other_layouts_alone_are_an_error(dataset):
+def test_impossible_tasks(dataset):
     with pytest.raises(OptionError, match="none of the 120 tasks of the manifests is on cramped_up; leave them out"):
         release_teammates(dataset, tasks=read_tasks(manifest_path("teammate", "test")))
-
-
-def test_learned_teammates_of_other_tasks_are_refused(dataset):
     learned = replace(TEST_TASKS[0], teammate={"kind": "rl", "family": "fcp", "theta": {}})
     with pytest.raises(OptionError, match="its teammate is learned; expected heuristics, which need no checkpoints"):
         release_teammates(dataset, tasks=[learned])
