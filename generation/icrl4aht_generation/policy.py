@@ -24,15 +24,15 @@ class Policy(NamedTuple):
             parameters share one compilation.
         init: (params, key) -> memory, any pytree, at the start of an episode; for egos in evaluation, of a task.
         act: (params, memory, view, key) -> action, int32 () in 0..5, and the memory after the step.
-        sees: content of `view`: "state" for the state record, uint8 (S,); "observation" for uint8 (5, 5, C); "percept",
-            for egos in evaluation only, for the observation with the outcome of the previous step
-            (`icrl4aht_baselines.agents.Percept`).
+        sees: content of `view`: "state" for the state record, uint8 (S,); "observation" for uint8 (5, 5, C);
+            "ego_input", for egos in evaluation only, for the observation with the outcome of the previous step
+            (`icrl4aht_baselines.agents.EgoInput`).
     """
 
     params: Any
     init: Callable[[Any, Key[Array, ""]], Any]
     act: Callable[[Any, Any, Array, Key[Array, ""]], tuple[Int[Array, ""], Any]]
-    sees: Literal["state", "observation", "percept"]
+    sees: Literal["state", "observation", "ego_input"]
 
 
 def sometimes_random(key: Key[Array, ""], chance: Any, action: Int[Array, ""]) -> Int[Array, ""]:

@@ -79,8 +79,8 @@ class MyAgent:
     def reset(self, batch):
         self.rng = np.random.default_rng(0)
 
-    def act(self, percept):
-        return self.rng.integers(0, 6, len(percept.obs))
+    def act(self, ego_input):
+        return self.rng.integers(0, 6, len(ego_input.obs))
 
 
 tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"]

@@ -13,7 +13,7 @@ from icrl4aht_generation.policy import Policy
 
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.methods.method import Method
-from icrl4aht_baselines.methods.tokens import percept_step
+from icrl4aht_baselines.methods.tokens import input_step
 from icrl4aht_baselines.methods.view_change import no_change
 from icrl4aht_baselines.training.histories import TrainedModel, read_trained
 from icrl4aht_baselines.training.run_folder import CONFIG
@@ -195,8 +195,8 @@ def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLI
     def start() -> Any:
         return method.start(context, mode.acting == "cached")
 
-    def act(params: Any, memory: Any, percept: Any, key: Any) -> tuple[Any, Any]:
-        step, done = percept_step(percept), percept.prev_done
+    def act(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
+        step, done = input_step(ego_input), ego_input.prev_done
         if mode.forget:
             # An episode is played as a task's first one: an empty memory, and zeros for the step before.
             memory = jax.tree.map(lambda new, old: jnp.where(done, new, old), start(), memory)
@@ -206,15 +206,15 @@ def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLI
         action = logits.argmax() if mode.greedy else jax.random.categorical(key, logits)
         return action.astype(jnp.int32), memory
 
-    return Policy(params, lambda params, key: start(), act, "percept")
+    return Policy(params, lambda params, key: start(), act, "ego_input")
 
 
 def with_view(policy: Policy, layout: Layout, channels: Channels, hide_recipe: bool = False) -> Policy:
-    """Return a policy for the percepts of a layout.
+    """Return a policy that takes the inputs of an ego on a layout.
 
     Args:
-        policy: takes percepts whose observations have these channels.
-        layout: the layout, whose percepts have its own channels.
+        policy: takes inputs with observations of these channels.
+        layout: the layout, whose own channels the inputs have.
         channels: "own" for those of the layout, or "canonical".
         hide_recipe: whether recipe indicators look like counters; with canonical channels only.
     """
@@ -222,9 +222,9 @@ def with_view(policy: Policy, layout: Layout, channels: Channels, hide_recipe: b
         return policy
     change = no_change()._replace(hidden=jnp.bool_(True))
 
-    def act(params: Any, memory: Any, percept: Any, key: Any) -> tuple[Any, Any]:
-        obs = to_canonical(layout, percept.obs)
+    def act(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
+        obs = to_canonical(layout, ego_input.obs)
         obs = change.observations(obs) if hide_recipe else obs
-        return policy.act(params, memory, percept._replace(obs=obs), key)
+        return policy.act(params, memory, ego_input._replace(obs=obs), key)
 
     return policy._replace(act=act)

@@ -15,7 +15,7 @@ from icrl4aht_data.overcooked.channels import CHANNELS, Channels, to_canonical
 from icrl4aht_data.overcooked.layouts import Layout
 
 
-class Percept(NamedTuple):
+class EgoInput(NamedTuple):
     """Input of an ego with memory: its observation and the outcome of the previous step.
 
     As in training, the step before the first step of an episode is the last step of the previous episode. Before the
@@ -50,7 +50,7 @@ class HostPolicy(NamedTuple):
     params: Any
     init: Callable[[Any, Any], Any]
     act: Callable[[Any, Any, Any, Any], tuple[Any, Any]]
-    sees: Literal["state", "observation", "percept"]
+    sees: Literal["state", "observation", "ego_input"]
 
 
 class HostAgent(Protocol):
@@ -60,8 +60,8 @@ class HostAgent(Protocol):
         """Clear the memory: a new set of `batch` tasks begins."""
         ...
 
-    def act(self, percept: Percept) -> np.ndarray:
-        """Return actions, integers (B,) in 0..5, for a `Percept` of arrays (B, ...): obs is uint8 (B, 5, 5, C)."""
+    def act(self, ego_input: EgoInput) -> np.ndarray:
+        """Return actions, integers (B,) in 0..5, for an `EgoInput` of arrays (B, ...): obs is uint8 (B, 5, 5, C)."""
         ...
 
 
@@ -77,9 +77,11 @@ def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout]
 
     Raises:
         UnknownNameError: if there are no such channels.
-        OptionError: during evaluation, if `act` does not return B integers.
+        OptionError: if the agent has no `reset` or `act`; during evaluation, if `act` does not return B integers.
     """
-
+    for name in ("reset", "act"):
+        if not callable(getattr(agent, name, None)):
+            raise OptionError(f"agent = {agent!r:.100}: expected an object with the methods reset and act")
     if channels not in CHANNELS:
         raise unknown("channels", channels, CHANNELS)
 
@@ -88,21 +90,21 @@ def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout]
             agent.reset(keys.shape[0])
             return ()
 
-        def call(*percept) -> np.ndarray:
-            batch = len(percept[1])
-            actions = np.asarray(agent.act(Percept(*(np.asarray(part) for part in percept))))
+        def call(*ego_input) -> np.ndarray:
+            batch = len(ego_input[1])
+            actions = np.asarray(agent.act(EgoInput(*(np.asarray(part) for part in ego_input))))
             if actions.shape != (batch,) or not np.issubdtype(actions.dtype, np.integer):
                 raise OptionError(
                     f"the agent's act returned {actions.dtype} of shape {actions.shape}, expected integers ({batch},)"
                 )
             return actions.astype(np.int32)
 
-        def act(params, carry, percept: Percept, keys):
+        def act(params, carry, ego_input: EgoInput, keys):
             if channels == "canonical":
-                percept = percept._replace(obs=to_canonical(layout, percept.obs))
+                ego_input = ego_input._replace(obs=to_canonical(layout, ego_input.obs))
             shape = jax.ShapeDtypeStruct(keys.shape, jnp.int32)
-            return io_callback(call, shape, *percept, ordered=True), carry
+            return io_callback(call, shape, *ego_input, ordered=True), carry
 
-        return HostPolicy((), init, act, "percept")
+        return HostPolicy((), init, act, "ego_input")
 
     return make

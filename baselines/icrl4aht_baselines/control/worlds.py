@@ -17,7 +17,7 @@ import numpy as np
 from icrl4aht_generation.policy import Policy
 from jaxtyping import Array, Float, Int
 
-from icrl4aht_baselines.agents.host import Percept
+from icrl4aht_baselines.agents.host import EgoInput
 from icrl4aht_baselines.methods.encoder import FlatEncoder
 from icrl4aht_baselines.methods.method import World
 from icrl4aht_baselines.methods.tokens import plain_view
@@ -107,11 +107,11 @@ def play_world(
             state, reward = small.step(task, state, action, world_key)
             done = (t + 1) % small.episode == 0 if small.episode else jnp.bool_(False)
             state = jnp.where(done, small.start, state)
-            after = Percept(before.obs, action, jnp.float32(reward), jnp.int32(0), done)
+            after = EgoInput(before.obs, action, jnp.float32(reward), jnp.int32(0), done)
             return (state, memory, after), (action, reward)
 
         obs = jnp.zeros_like(small.observe(small.start))
-        nothing = Percept(obs, jnp.int32(0), jnp.float32(0), jnp.int32(0), jnp.bool_(False))
+        nothing = EgoInput(obs, jnp.int32(0), jnp.float32(0), jnp.int32(0), jnp.bool_(False))
         return jax.lax.scan(step, (small.start, policy.init(policy.params, key), nothing), jnp.arange(steps))[1]
 
     return jax.jit(jax.vmap(play_task))(tasks, jax.random.split(jax.random.key(seed), len(tasks)))

@@ -15,7 +15,7 @@ from icrl4aht_baselines.agents.egos import with_view
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import Protocol
 from icrl4aht_baselines.methods.method import Method
-from icrl4aht_baselines.methods.tokens import percept_step
+from icrl4aht_baselines.methods.tokens import input_step
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.overcooked.channels import Channels
 
@@ -67,16 +67,17 @@ def measure_drift(
         cached, exact = (method.start(context, way) for way in (True, False))
         return _BothMemories(cached, exact, jnp.int32(0), jnp.zeros(length), jnp.zeros(length, bool))
 
-    def act(params: Any, both: _BothMemories, percept: Any, key: Any) -> tuple[Any, _BothMemories]:
+    def act(params: Any, both: _BothMemories, ego_input: Any, key: Any) -> tuple[Any, _BothMemories]:
         (one, cached), (two, exact) = (
-            method.act(params, percept_step(percept), percept.prev_done, memory) for memory in (both.cached, both.exact)
+            method.act(params, input_step(ego_input), ego_input.prev_done, memory)
+            for memory in (both.cached, both.exact)
         )
         distance, same = jnp.abs(jax.nn.softmax(one) - jax.nn.softmax(two)).sum() / 2, one.argmax() == two.argmax()
         t = both.steps % length
         compared = both.distance.at[t].set(distance), both.same.at[t].set(same)
         return one.argmax().astype(jnp.int32), _BothMemories(cached, exact, both.steps + 1, *compared)
 
-    ego = Policy(params, init, act, "percept")
+    ego = Policy(params, init, act, "ego_input")
     rollout, state, episode = prepare_rollout(lambda layout: with_view(ego, layout, channels), tasks, protocol)
     for _ in range(protocol.episodes):
         state, _ = episode(params, rollout.teammate_params, state)

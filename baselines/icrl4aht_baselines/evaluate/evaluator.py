@@ -76,9 +76,12 @@ def evaluate(
         UnknownNameError: if there is no such protocol.
         TaskFormatError: if a teammate's parameters are impossible; names the task.
     """
+    rules = protocol if isinstance(protocol, Protocol) else get_protocol(protocol)
+    seeds = _checked_seeds(seeds)
+    if not callable(make_ego):
+        raise OptionError(f"make_ego = {make_ego!r}: expected a function layout -> ego, such as from_host(my_agent)")
     for task in tasks:
         _check_teammate(task, suite)
-    rules, seeds = get_protocol(protocol) if isinstance(protocol, str) else protocol, _checked_seeds(seeds)
     settings = {
         "agent": agent,
         "seeds": seeds,
@@ -146,6 +149,8 @@ def _evaluate_groups(
 
 
 def _check_teammate(task: Task, suite: Path | None) -> None:
+    if not isinstance(task, Task):
+        raise OptionError(f'tasks: {task!r:.100}: expected tasks, such as those of test_tasks("teammate")')
     try:
         if task.teammate["kind"] == "heuristic":
             check_theta(task.teammate)

@@ -18,7 +18,7 @@ from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.policy import Policy, stacked
 from jaxtyping import Array, Float, Int, UInt8
 
-from icrl4aht_baselines.agents.host import HostPolicy, Percept
+from icrl4aht_baselines.agents.host import EgoInput, HostPolicy
 from icrl4aht_baselines.evaluate.protocols import FOUR_RECIPES, Protocol
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -38,7 +38,7 @@ class RolloutState(NamedTuple):
 
     env: EnvState
     ego: Any
-    before: Percept
+    before: EgoInput
 
 
 class EpisodeBatch(NamedTuple):
@@ -127,8 +127,8 @@ class EvaluationRollout:
         return state, EpisodeBatch(record, actions, reward, end)
 
     def ego_view(self, state: RolloutState) -> Any:
-        """Return the input of the egos, with a leading axis (B,): state records, observations or percepts."""
-        if self.ego.sees == "percept":
+        """Return the input of the egos, with a leading axis (B,): state records, observations, or an `EgoInput`."""
+        if self.ego.sees == "ego_input":
             return state.before._replace(obs=self._view("observation", state.env, EGO))
         return self._view(self.ego.sees, state.env, EGO)
 
@@ -136,10 +136,10 @@ class EvaluationRollout:
         return state.record if sees == "state" else self.env.observe_one(state, slot)
 
 
-def no_outcome(batch: int) -> Percept:
+def no_outcome(batch: int) -> EgoInput:
     """Return the outcome of the previous step before the first step of B tasks."""
     zero = jnp.zeros(batch, jnp.int32)
-    return Percept(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
+    return EgoInput(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
 
 
 def _fold_all(keys: jax.Array, data: Any) -> jax.Array:

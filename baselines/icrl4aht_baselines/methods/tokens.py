@@ -67,9 +67,9 @@ def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
     return StepInput(obs, batch.prev_actions, batch.prev_rewards, batch.prev_teammate_actions)  # type: ignore[arg-type]
 
 
-def percept_step(percept: Any) -> StepInput:
-    """Return the input of an acting ego, converted from an `agents.Percept`."""
-    return StepInput(percept.obs, percept.prev_action, percept.prev_reward, percept.prev_teammate_action)
+def input_step(ego_input: Any) -> StepInput:
+    """Return the input of an acting ego, converted from an `agents.EgoInput`."""
+    return StepInput(ego_input.obs, ego_input.prev_action, ego_input.prev_reward, ego_input.prev_teammate_action)
 
 
 def batch_transitions(batch: DPTBatch, view: BatchView) -> tuple[Transition, Any]:

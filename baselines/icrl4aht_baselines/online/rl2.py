@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutState, no_outcome
 from icrl4aht_baselines.methods.method import Method
-from icrl4aht_baselines.methods.tokens import StepInput, percept_step
+from icrl4aht_baselines.methods.tokens import StepInput, input_step
 from icrl4aht_baselines.methods.view_change import ViewChange, no_change
 from icrl4aht_baselines.online.programs import SharedProgram, run_all, shared_programs
 from icrl4aht_baselines.online.teammates import mixed_chances, with_behaviours
@@ -337,14 +337,14 @@ def _model_policy(method: Method, layout: Layout, changes: bool) -> Policy:
     def init(params: Any, key: Array) -> PlayerMemory:
         return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))
 
-    def act(params: Any, memory: PlayerMemory, percept: Any, key: Array) -> tuple[Array, PlayerMemory]:
-        step = percept_step(percept._replace(obs=to_canonical(layout, percept.obs)))
+    def act(params: Any, memory: PlayerMemory, ego_input: Any, key: Array) -> tuple[Array, PlayerMemory]:
+        step = input_step(ego_input._replace(obs=to_canonical(layout, ego_input.obs)))
         step = seen_steps(memory.change, step, memory.started) if changes else step
-        logits, state = method.act(params, step, percept.prev_done, memory.state)
+        logits, state = method.act(params, step, ego_input.prev_done, memory.state)
         action = jax.random.categorical(key, logits).astype(jnp.int32)
         return memory.change.actions(action), memory._replace(state=state, started=jnp.bool_(True))
 
-    return Policy({}, init, act, "percept")
+    return Policy({}, init, act, "ego_input")
 
 
 class StepNumbers:

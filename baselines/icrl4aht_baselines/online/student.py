@@ -87,7 +87,7 @@ def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> P
     """
     if labeller is not None and labeller.sees != policy.sees:
         raise OptionError(
-            f"the labeller sees a {labeller.sees}, expected a {policy.sees}, as the agent does: choose a trained model"
+            f"the labeller takes {labeller.sees}, expected {policy.sees}, as the agent does: choose a trained model"
         )
     params = policy.params, None if labeller is None else labeller.params
 
@@ -139,7 +139,7 @@ def record_histories(
     """Play histories of tasks that share a layout and a teammate family; `config.histories` of each, in their order.
 
     Args:
-        make_ego: layout -> agent, which sees percepts, observations or state records.
+        make_ego: layout -> agent, of any kind that `evaluate` takes.
         tasks: the tasks; their seeds determine schedules and episodes.
         config: number and length of the histories, and their noise.
         suite: folder of learned teammates, if tasks have any.

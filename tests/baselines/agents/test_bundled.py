@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.agents import Percept, bundled
+from icrl4aht_baselines.agents import EgoInput, bundled
 from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
 from icrl4aht_baselines.agents.egos import PlayMode, find_agent
 from icrl4aht_baselines.commands.options import find_ego
@@ -145,7 +145,7 @@ def test_the_package_bundles_models_that_play_and_have_cards():
             trained = read_trained(folder)
             for layout in {"teammate": ("demo_wide", "coord_ring"), "layout": ("asymm_right", "cramped_down")}[track]:
                 policy = find_agent(model.name).make(get_layout(layout))
-                assert policy.sees == "percept" and trained.channels == "canonical"
+                assert policy.sees == "ego_input" and trained.channels == "canonical"
 
 
 def test_parameters_of_another_model_are_refused(run, tmp_path):
@@ -182,24 +182,24 @@ class TestPlayMode:
         agent = find_agent(run, greedy=False, forget=True)
         policy = agent.make(get_layout("demo_wide"))
         rng = np.random.default_rng(0)
-        percepts = [_percept(rng, done=False) for _ in range(3)]
-        begin = _percept(rng, done=True)
+        ego_inputs = [_ego_input(rng, done=False) for _ in range(3)]
+        begin = _ego_input(rng, done=True)
 
         def after(history: list) -> np.ndarray:
             memory, found = policy.init(policy.params, jax.random.key(0)), []
-            for percept in [*history, begin, *percepts]:
+            for ego_input in [*history, begin, *ego_inputs]:
                 logits_key = jax.random.key(len(found))
-                action, memory = policy.act(policy.params, memory, percept, logits_key)
+                action, memory = policy.act(policy.params, memory, ego_input, logits_key)
                 found.append(int(action))
             return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(memory)])
 
-        np.testing.assert_array_equal(after([]), after([_percept(rng, done=False) for _ in range(2)]))
+        np.testing.assert_array_equal(after([]), after([_ego_input(rng, done=False) for _ in range(2)]))
         keeps = find_agent(run, greedy=False).make(get_layout("demo_wide"))
         policy = keeps
-        assert not np.array_equal(after([]), after([_percept(rng, done=False) for _ in range(2)]))
+        assert not np.array_equal(after([]), after([_ego_input(rng, done=False) for _ in range(2)]))
 
 
-def _percept(rng: np.random.Generator, done: bool) -> Percept:
+def _ego_input(rng: np.random.Generator, done: bool) -> EgoInput:
     obs = rng.integers(0, 2, (5, 5, 45), dtype=np.uint8)
     numbers = np.int32(rng.integers(6)), np.float32(rng.choice([0, 20])), np.int32(rng.integers(6))
-    return Percept(obs, *numbers, np.bool_(done))
+    return EgoInput(obs, *numbers, np.bool_(done))

@@ -15,7 +15,7 @@ TINY = control.ControlSize(bandit_steps=4, room_episodes=2, rows=64, tasks=4, up
 
 
 def fixed(action: int) -> Policy:
-    return Policy((), lambda params, key: (), lambda params, carry, view, key: (jnp.int32(action), carry), "percept")
+    return Policy((), lambda params, key: (), lambda params, carry, view, key: (jnp.int32(action), carry), "ego_input")
 
 
 def test_what_the_worlds_reward():

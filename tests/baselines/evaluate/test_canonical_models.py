@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines import experiments
 from icrl4aht_baselines.agents.egos import find_agent, with_view
-from icrl4aht_baselines.agents.host import Percept, from_host
+from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.experiments import EXPERIMENTS, ExperimentPlan, run_experiment
@@ -79,13 +79,13 @@ def test_it_plays_on_a_third_layout(trained, tmp_path):
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_an_ego_of_canonical_channels_sees_them_on_every_layout(layout):
     """A policy that returns what it sees, in place of an action."""
-    shown = Policy((), lambda params, key: (), lambda params, memory, percept, key: (percept, memory), "percept")
+    shown = Policy((), lambda params, key: (), lambda params, memory, ego_input, key: (ego_input, memory), "ego_input")
     (record,) = random_records(layout, 1, np.random.default_rng(4))
     own = jnp.asarray(observe(layout, record, 0))
-    percept = Percept(own, 1, 2.0, 3, False)
-    seen, _ = jax.jit(with_view(shown, layout, "canonical").act, static_argnums=(0, 1))((), (), percept, 0)
+    ego_input = EgoInput(own, 1, 2.0, 3, False)
+    seen, _ = jax.jit(with_view(shown, layout, "canonical").act, static_argnums=(0, 1))((), (), ego_input, 0)
     np.testing.assert_array_equal(seen.obs, observe(layout, record, 0, canonical=True))
-    assert seen._replace(obs=0) == percept._replace(obs=0)
+    assert seen._replace(obs=0) == ego_input._replace(obs=0)
     assert with_view(shown, layout, "own") is shown
 
 
@@ -94,17 +94,17 @@ def test_an_ego_outside_jax_may_take_canonical_channels():
         def reset(self, batch: int) -> None:
             self.batch = batch
 
-        def act(self, percept: Percept) -> np.ndarray:
-            self.seen = percept.obs
-            return np.zeros(len(percept.obs), np.int32)
+        def act(self, ego_input: EgoInput) -> np.ndarray:
+            self.seen = ego_input.obs
+            return np.zeros(len(ego_input.obs), np.int32)
 
     agent = Agent()
     records = random_records(THIRD, 3, np.random.default_rng(5))
     zero = jnp.zeros(3, jnp.int32)
-    percept = Percept(jnp.asarray(observe(THIRD, records, 0)), zero, zero, zero, zero)
+    ego_input = EgoInput(jnp.asarray(observe(THIRD, records, 0)), zero, zero, zero, zero)
     for channels in ("own", "canonical"):
         policy = from_host(agent, channels)(THIRD)
-        jax.block_until_ready(policy.act((), (), percept, jax.random.split(jax.random.key(0), 3))[0])
+        jax.block_until_ready(policy.act((), (), ego_input, jax.random.split(jax.random.key(0), 3))[0])
         expected = observe(THIRD, records, 0, canonical=channels == "canonical")
         np.testing.assert_array_equal(agent.seen, expected, strict=True)
     with pytest.raises(UnknownNameError, match="unknown channels 'union'; valid: own, canonical"):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, find_agent, random, stay
-from icrl4aht_baselines.agents.host import Percept, from_host
+from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
 from icrl4aht_baselines.evaluate.results import Result, read_result, write_result
@@ -99,12 +99,23 @@ def test_folders_with_other_files_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("seeds", "message"),
-    [(3, "seeds = 3: expected a sequence"), ((), "seeds"), ((True,), "seeds = True"), ((1, 1), "expected different")],
+    ("arguments", "message"),
+    [
+        ({"seeds": 3}, r"seeds = 3: expected a sequence of integers"),
+        ({"seeds": ()}, r"seeds = \(\): expected a sequence of integers"),
+        ({"seeds": (True,)}, "seeds = True: expected an integer"),
+        ({"seeds": (1, 1)}, r"seeds = \[1, 1\]: expected different ones"),
+        ({"protocol": "sedeed"}, "unknown protocol 'sedeed'.*Did you mean 'seeded'"),
+        ({"protocol": 5}, "unknown protocol 5"),
+        ({"make_ego": 5}, "make_ego = 5: expected a function layout -> ego"),
+        ({"tasks": ["demo_wide"]}, "tasks: 'demo_wide': expected tasks, such as those of test_tasks"),
+    ],
 )
-def test_impossible_seeds(seeds, message):
-    with pytest.raises(OptionError, match=message):
-        evaluate("stay", stay, SIMPLE, "published", seeds=seeds)
+def test_impossible_arguments(arguments, message):
+    with pytest.raises((OptionError, UnknownNameError), match=message):
+        evaluate(**{"agent": "stay", "make_ego": stay, "tasks": SIMPLE, "protocol": "published"} | arguments)
+    with pytest.raises(OptionError, match="agent = 5: expected an object with the methods reset and act"):
+        from_host(5)  # type: ignore[arg-type]
 
 
 def test_damaged_results_are_named(tmp_path):
@@ -126,17 +137,17 @@ def test_a_motionless_ego_earns_exactly_the_published_40_with_h4():
 
 
 class Watcher:
-    """A host agent that plays fixed actions and records its percepts."""
+    """A host agent that plays fixed actions and records its ego_inputs."""
 
     def __init__(self, actions=None):
         self.actions = actions
-        self.seen: list[Percept] = []
+        self.seen: list[EgoInput] = []
 
     def reset(self, batch):
         self.batch, self.rng, self.played = batch, np.random.default_rng(0), []
 
-    def act(self, percept):
-        self.seen.append(percept)
+    def act(self, ego_input):
+        self.seen.append(ego_input)
         chosen = self.rng.integers(0, 6, self.batch) if self.actions is None else self.actions(self.batch)
         self.played.append(chosen)
         return chosen
@@ -149,14 +160,14 @@ def test_host_agents_see_what_happened():
     record, actions, reward = (np.concatenate([np.asarray(p[k]) for p in played], axis=1) for k in range(3))
     assert len(watcher.seen) == 200
     layout = LAYOUTS["coord_simple"]
-    for t, percept in enumerate(watcher.seen):
-        np.testing.assert_array_equal(percept.obs, observe(layout, record[:, t], 0))
+    for t, ego_input in enumerate(watcher.seen):
+        np.testing.assert_array_equal(ego_input.obs, observe(layout, record[:, t], 0))
         np.testing.assert_array_equal(watcher.played[t], actions[:, t, 0])
         if t:
-            np.testing.assert_array_equal(percept.prev_action, actions[:, t - 1, 0])
-            np.testing.assert_array_equal(percept.prev_teammate_action, actions[:, t - 1, 1])
-            np.testing.assert_array_equal(percept.prev_reward, reward[:, t - 1])
-        assert percept.prev_done.tolist() == [t == 100] * 5
+            np.testing.assert_array_equal(ego_input.prev_action, actions[:, t - 1, 0])
+            np.testing.assert_array_equal(ego_input.prev_teammate_action, actions[:, t - 1, 1])
+            np.testing.assert_array_equal(ego_input.prev_reward, reward[:, t - 1])
+        assert ego_input.prev_done.tolist() == [t == 100] * 5
     assert not watcher.seen[0].prev_action.any()
     assert not watcher.seen[0].prev_reward.any()
 
@@ -198,10 +209,10 @@ def test_invalid_actions_of_host_agents(actions, message):
 def test_host_agents_return_one_integer_per_task(actions, message):
     """The ego acts without the environment, whose compilation takes seconds."""
     policy, keys = from_host(Watcher(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
-    percept = Percept(jnp.zeros((1, 5, 5, 40)), *[jnp.zeros(1)] * 4)
+    ego_input = EgoInput(jnp.zeros((1, 5, 5, 40)), *[jnp.zeros(1)] * 4)
     memory = policy.init((), keys)
     with pytest.raises(jax.errors.JaxRuntimeError, match=message):
-        jax.block_until_ready(jax.jit(policy.act)((), memory, percept, keys))
+        jax.block_until_ready(jax.jit(policy.act)((), memory, ego_input, keys))
 
 
 @pytest.mark.parametrize("action", [jnp.zeros(3, jnp.int32), jnp.float32(1)])

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from icrl4aht_baselines.agents.host import Percept
+from icrl4aht_baselines.agents.host import EgoInput
 from icrl4aht_baselines.methods import attention
 from icrl4aht_baselines.methods.conditional import change_if
 from icrl4aht_baselines.methods.method import Method
@@ -22,7 +22,7 @@ from icrl4aht_baselines.methods.tokens import (
     Transition,
     batch_steps,
     batch_transitions,
-    percept_step,
+    input_step,
     plain_view,
 )
 
@@ -294,12 +294,12 @@ def test_the_teammates_action_is_predicted_from_the_steps_before_it():
         ModelOptions(teammate_loss=True)
 
 
-def percepts(steps: int, episode: int, seed=0) -> Percept:
+def ego_inputs(steps: int, episode: int, seed=0) -> EgoInput:
     """Input of an ego over some steps."""
     rng = np.random.default_rng(seed)
     t = np.arange(steps)
     zero_first = t > 0
-    return Percept(
+    return EgoInput(
         obs=jnp.asarray(rng.normal(size=(steps, 3)), jnp.float32),
         prev_action=jnp.asarray(rng.integers(0, 4, steps) * zero_first),
         prev_reward=jnp.asarray(rng.normal(size=steps) * zero_first, jnp.float32),
@@ -313,9 +313,9 @@ def player(name: str, context: int, cached: bool, **changes: Any):
     method, params = tiny(name, **changes)
 
     @jax.jit
-    def play(seen: Percept):
-        def step(memory, percept):
-            logits, memory = method.act(params, percept_step(percept), percept.prev_done, memory)
+    def play(seen: EgoInput):
+        def step(memory, ego_input):
+            logits, memory = method.act(params, input_step(ego_input), ego_input.prev_done, memory)
             return memory, logits
 
         return jax.lax.scan(step, method.start(context, cached), seen)[1]
@@ -327,7 +327,7 @@ def player(name: str, context: int, cached: bool, **changes: Any):
     ("name", "positions"), [*KINDS, ("dpt", "none"), pytest.param("dpt", "rope", marks=pytest.mark.slow)]
 )
 def test_cached_equals_exact_while_the_window_is_not_full(name, positions):
-    seen = percepts(12, episode=4)
+    seen = ego_inputs(12, episode=4)
     exact, cached = (player(name, 12, way, positions=positions)(seen) for way in (False, True))
     np.testing.assert_allclose(exact, cached, rtol=1e-4, atol=1e-5)
     assert np.abs(np.diff(exact, axis=0)).min() > 0
@@ -336,8 +336,8 @@ def test_cached_equals_exact_while_the_window_is_not_full(name, positions):
 @pytest.mark.parametrize("name", STEPS)
 def test_acting_computes_what_training_computes(name):
     method, params = tiny(name)
-    seen = percepts(9, episode=4)
-    steps = jax.tree.map(lambda x: x[None], percept_step(seen))
+    seen = ego_inputs(9, episode=4)
+    steps = jax.tree.map(lambda x: x[None], input_step(seen))
     policy = jax.jit(lambda steps: method.logits(run(method, params, steps).head)[0])
     expected = policy(steps)
     np.testing.assert_allclose(player(name, 12, False)(seen), expected, rtol=1e-4, atol=1e-5)
@@ -349,7 +349,7 @@ def test_acting_computes_what_training_computes(name):
 @pytest.mark.parametrize(("context", "first"), [(12, 0), (4, 2)])
 def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first):
     method, params = tiny("dpt")
-    seen = percepts(11, episode=4)  # two finished episodes, and three steps of the third
+    seen = ego_inputs(11, episode=4)  # two finished episodes, and three steps of the third
     known = np.array([0, 1, 2, 4, 5, 6])[first:]  # an episode's last step has no successor in it
     after = jax.tree.map(lambda x: x[known + 1][None], seen)
     both = jnp.stack([seen.obs[known][None], after.obs], axis=2)
@@ -363,7 +363,7 @@ def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first):
 @pytest.mark.parametrize(("name", "context", "first_without"), [("ad", 5, 5), ("hybrid_ad", 5, 5), ("dpt", 5, 8)])
 def test_steps_outside_the_context_have_no_part(name, context, first_without, cached):
     """The first step changes: AD's window of 5 steps loses it after 5, DPT's 5 transitions after two episodes of 3."""
-    seen = percepts(12, episode=4)
+    seen = ego_inputs(12, episode=4)
     play = player(name, context, cached)
     changed = seen._replace(obs=seen.obs.at[0].add(3.0))
     difference = np.abs(play(seen) - play(changed)).max(axis=-1)
@@ -373,7 +373,7 @@ def test_steps_outside_the_context_have_no_part(name, context, first_without, ca
 
 def test_a_full_cached_window_drops_a_fifth():
     """With K = 10 it drops 2 steps, and so has the last 9 and 10 steps in turn; DPT's context is exact."""
-    seen = percepts(16, episode=4)
+    seen = ego_inputs(16, episode=4)
     cached, ten, nine = (player("ad", context, way)(seen) for context, way in ((10, True), (10, False), (9, False)))
     np.testing.assert_allclose(cached[:10], ten[:10], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(cached[11::2], ten[11::2], rtol=1e-4, atol=1e-5)

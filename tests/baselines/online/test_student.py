@@ -31,12 +31,12 @@ CONFIG = NoiseConfig(2, 10, start=(1.0, 1.0), end=(0.0, 0.0))
 
 
 def cook(layout: Any) -> Policy:
-    """An agent that always interacts, and sees percepts."""
-    return Policy((), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(5), memory), "percept")
+    """An agent that always interacts, and sees ego_inputs."""
+    return Policy((), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(5), memory), "ego_input")
 
 
 def idle(layout: Any) -> Policy:
-    return stay(layout)._replace(sees="percept")
+    return stay(layout)._replace(sees="ego_input")
 
 
 COOK, IDLE = NamedEgo("cook", cook, {"version": 1}), NamedEgo("idle", idle)
@@ -86,10 +86,10 @@ def test_another_agent_labels(dataset):
     """The labeller sees the history that the agent makes, its actions included."""
 
     def counts(layout: Any) -> Policy:
-        def act(params: Any, memory: Any, percept: Any, key: Any) -> tuple[Any, Any]:
-            return jnp.int32((memory + 1) % 6), memory + (percept.prev_action == STAY)
+        def act(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
+            return jnp.int32((memory + 1) % 6), memory + (ego_input.prev_action == STAY)
 
-        return Policy((), lambda params, key: jnp.int32(0), act, "percept")
+        return Policy((), lambda params, key: jnp.int32(0), act, "ego_input")
 
     tasks = release_teammates(dataset).tasks[:1]
     config = NoiseConfig(1, 10, start=(0.0, 0.0))
@@ -97,7 +97,7 @@ def test_another_agent_labels(dataset):
     assert (found.actions == STAY).all()
     # Nothing was done before the first step; then every step was a "stay".
     np.testing.assert_array_equal(found.expert_actions[0], (1 + np.maximum(np.arange(1000) - 1, 0)) % 6)
-    with pytest.raises(OptionError, match="the labeller sees a state, expected a percept, as the agent does"):
+    with pytest.raises(OptionError, match="the labeller takes state, expected ego_input, as the agent does"):
         with_noise(idle(None), 10, AGENTS["oracle"](tasks[0].layout))
 
 
