@@ -1,8 +1,8 @@
 """Attention in training, for sequences of a context and of queries about it.
 
 Shapes: `B` batch size, `N` tokens, `K` tokens of a context, `H` heads, `Dh` width of a head, `R` rows of a block.
-Queries are computed a block of rows at a time. In short sequences a block has `SHORT_ROWS` rows, and keys that no row
-of it sees are left out. Longer ones are computed `LONG_ROWS` rows at a time, and again in the backward pass, so that
+Queries are computed a block of rows at a time. In short sequences a block has `SHORT_ROWS` rows and leaves out the keys
+that none of its rows sees. In longer ones a block has `LONG_ROWS` rows and is computed again in the backward pass:
 memory grows with LONG_ROWS x N instead of N x N.
 """
 
@@ -38,7 +38,7 @@ def query_attention(
 
 
 def _attention(q: Array, k: Array, v: Array, seen_by_first: int, *own: Array) -> Array:
-    """Return attention of rows of queries, of which row i sees `seen_by_first` + i keys, and its own if there are any.
+    """Return attention of queries: row i sees the first `seen_by_first` + i keys, and its own key if it has one.
 
     Args:
         q: queries (B, N, H, Dh).
@@ -77,7 +77,7 @@ def _attend(
     q_BxHxRxDh: Float[Array, "B H R Dh"],
     *own_BxHxRxDh: Float[Array, "B H R Dh"],
 ) -> Float[Array, "B H R Dh"]:
-    """Return the attention of a block of rows, of which row i sees `seen` + i keys.
+    """Return the attention of a block of rows: row i sees the first `seen` + i keys.
 
     Weights are divided by their sum after they were applied, to (R, Dh) instead of (R, N) numbers.
     """

@@ -1,9 +1,9 @@
 """Decision-Pretrained Transformer (paper, App. E.3): the expert's action at a query, from a context of transitions.
 
-The query follows its context, [c_1 .. c_K, q], so that the answer, read at the last position, has seen all of it, and
-so that an ego's context need not be recomputed for every query. The loss with prior poses the query after every part of
-the context, c_1 .. c_j for j = 0..K: K + 1 copies of the query, each of which sees its part and itself. With Q queries
-a context, they are posed in turn: query j mod Q after the first j transitions.
+The query follows its context, [c_1 .. c_K, q]. Its answer, read at the last position, has seen all of the context, and
+an acting ego computes the context once for many queries. The loss with prior poses the query after every part of the
+context, c_1 .. c_j for j = 0..K, as K + 1 copies of the query that each see their part and themselves. Several queries
+of one context are posed in turn: query j mod Q after the first j transitions.
 
 Shapes: `B` batch size, `Q` queries of a context, `K` transitions of a context, `D` width, `A` actions, `N` entries of
 an observation.

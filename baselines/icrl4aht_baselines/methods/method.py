@@ -81,7 +81,7 @@ class Method:
         """Return the memory of an ego before its first step.
 
         Args:
-            context: K, the steps or transitions that it remembers; older ones have no part in its actions.
+            context: K, the steps or transitions that it remembers; older ones do not influence its actions.
             cached: whether the memory keeps what was computed for each step; otherwise it keeps tokens, and each step
                 computes the complete context. See `agents.egos.ACTING`.
         """

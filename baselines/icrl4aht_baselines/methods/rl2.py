@@ -61,7 +61,7 @@ class RL2Model(nn.Module):
         return self.head(features), jnp.concatenate(layers, axis=-1)
 
     def start(self, context: int, cached: bool) -> Float[Array, " S"]:
-        """Return the state before a task, whatever the context: it forgets nothing at once."""
+        """Return the state before a task; both arguments have no effect, since a recurrent state has no window."""
         return jnp.zeros(self.trunk.layers * self.trunk.width)
 
     def act(

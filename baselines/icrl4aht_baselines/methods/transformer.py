@@ -201,7 +201,7 @@ class Transformer(nn.Module):
         return (AttentionCache(zeros, zeros),) * self.layers
 
     def caches_of(self, x_NxD: Float[Array, "N D"], slots: int) -> tuple[AttentionCache, ...]:
-        """Return caches of `slots` slots, one per layer, of which the first N hold a sequence; N is not 0."""
+        """Return caches of `slots` slots, one per layer, whose first N hold a sequence; N is not 0."""
         behind = ((0, 0), (0, slots - len(x_NxD)), (0, 0))
         caches = []
         for block in self.blocks:

@@ -2,7 +2,7 @@
 
 The game has no preferred direction, so a mirrored task is another task of the same kind, played on the mirrored layout.
 Models that are tested on other layouts than they are trained on learn from mirrored tasks, too. A hidden recipe
-indicator looks like a counter, as it is one on layouts whose ego cannot see the recipe.
+indicator looks like a counter, as on layouts without an indicator.
 
 `B` denotes any leading axes. Observations have the canonical channels.
 """

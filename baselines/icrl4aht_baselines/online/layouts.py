@@ -1,4 +1,4 @@
-"""Layouts to play on that are no layouts of the benchmark, so that a model learns the game rather than one map."""
+"""Layouts outside the benchmark to play on, from which a model learns the game and not one map."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def with_four_recipes(layout: Layout) -> Layout:
 def unseen_layouts(layout: Layout, count: int) -> list[Layout]:
     """Return rearranged versions of a layout that no model is trained on, with the layout's own recipes.
 
-    They have the layout's name: what a model was told of the layout, such as hidden recipe indicators, holds for them.
+    They have the layout's name: settings by layout, such as hidden recipe indicators, apply to them as well.
 
     Raises:
         OptionError: as `rearranged_layouts`.
@@ -39,11 +39,11 @@ def unseen_layouts(layout: Layout, count: int) -> list[Layout]:
 
 
 def rearranged_layouts(layout: Layout, count: int) -> list[Layout]:
-    """Return layouts with the same rooms, and with counters, piles, pots and other fixtures in other places.
+    """Return layouts with the same rooms, and with counters, piles, pots and other fixtures in other cells.
 
-    A fixture moves only to cells that the same agents reach, so that the same work is possible. None of the layouts is
-    one of the benchmark, mirrored ones included. Every second one has the four recipes of `with_four_recipes`. Fewer
-    are the first ones of more.
+    A fixture moves only to cells that the same agents reach, since otherwise no soup might be possible. None of the
+    layouts is one of the benchmark, mirrored or not. Every second one has the four recipes of `with_four_recipes`. With
+    a smaller count the result is the beginning of a longer one.
 
     Args:
         layout: the layout.

@@ -82,7 +82,7 @@ def _check_hoisted(jaxpr: core.Jaxpr) -> None:
 
 
 def run_all(program: SharedProgram, shared: int, *arguments: Any) -> Any:
-    """Run the functions of a program side by side.
+    """Run the functions of a program at once.
 
     Args:
         program: the program.

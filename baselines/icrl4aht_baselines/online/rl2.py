@@ -80,7 +80,7 @@ class PlayState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TaskGroup:
-    """Tasks of one family of teammates, on one layout or on as many as there are tasks, which are played side by side.
+    """Tasks of one family of teammates, on one layout or on one for each task, which are played at once.
 
     Attributes:
         layouts: the layout of all tasks alone, or one for each task.
@@ -303,7 +303,7 @@ def _group_players(
 
 
 def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
-    """Return steps as an ego sees them whose view is changed.
+    """Return steps as an ego with a changed view sees them.
 
     Args:
         change: the changes (*B,).

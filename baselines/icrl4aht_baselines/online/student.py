@@ -5,7 +5,7 @@ episodes, as in noise distillation (Zisman et al. 2024); with a chance of 0 the 
 visits. `expert_actions` are the agent's own choices, before the noise, or those of another trained agent, which sees
 the same history. Labels on what a student visits are those of on-policy imitation (DAgger, Ross et al. 2011).
 
-Shapes: `B` histories that are played side by side, `E` episodes, `T` steps of an episode, `S` bytes of a state record.
+Shapes: `B` histories that are played at once, `E` episodes, `T` steps of an episode, `S` bytes of a state record.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Training teammates that do not always follow their script, so that a student learns to do without their help.
+"""Training teammates that do not always follow their script, with which a model learns to act without their help.
 
 A teammate has four behaviours: it follows its script, does nothing, acts at random, or follows its script except for
 some random actions. Each episode draws one by the teammate's own chances: a teammate with one behaviour keeps it for a

@@ -154,7 +154,7 @@ def _labels_of(method: Method, wanted: Labels | None) -> Labels | None:
 def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
     """Opens the release, with state records if there are any and nothing else is required.
 
-    Channels are canonical if all layouts are chosen, or some whose own channels differ, and nothing else is required.
+    Channels are canonical if all layouts or layouts with different own channels are chosen, unless an option says else.
 
     Returns:
         The chosen histories, and those of split validation that agree with the choice, if there are any.
@@ -312,7 +312,7 @@ def _check_thinned(dataset: Dataset, context: int, every: int) -> None:
 
 
 def _longer_source(dataset: Dataset, context: int) -> str:
-    """Return the advice to choose a source whose histories all have so many steps, if there is one."""
+    """Return the advice to choose a source with histories of enough steps, or "" if there is none."""
     lengths, sources = dataset.column("T"), dataset.column("source")
     longer = [name for name in dataset.counts("source") if lengths[sources == name].min() >= context]
     return f", or choose --source {longer[0]}, whose histories are longer" if longer else ""

@@ -1,4 +1,4 @@
-"""Stopping a training by a signal, so that it loses nothing."""
+"""Stop a training by a signal without losing what it computed."""
 
 from __future__ import annotations
 

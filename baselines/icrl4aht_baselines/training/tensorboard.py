@@ -15,7 +15,7 @@ _FLUSH_SECONDS = 10
 
 
 class TensorBoardLog:
-    """Event files with the numbers of metrics.jsonl, one folder per part, so that a chart shows the parts together.
+    """Event files with the numbers of metrics.jsonl, one folder per part: a chart then shows the parts together.
 
     They are rewritten from the log whenever a run resumes, so they hold the log's lines, and no step twice.
 
