@@ -12,6 +12,7 @@ that knows its tasks by name.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -42,7 +43,7 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import resolve_inside, write_json
+from icrl4aht_data.utils.files import add_filename, resolve_inside, write_json
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
 from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
@@ -88,7 +89,7 @@ def to_published(
     recorded = read_provenance(dataset.origin.file(PROVENANCE))
     provenance = {name: with_source(of_task, sources[name]) for name, of_task in recorded.items() if name in sources}
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
-        with h5py.File(folder / HISTORIES_H5, "w") as new, (folder / HISTORIES_INDEX).open("w") as index:
+        with _new_hdf5(folder / HISTORIES_H5) as new, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
                 group = new.create_group(f"/{number}")
                 for field in (one for one in history.entry.stored_fields(kind) if one.name != "oracle_actions"):
@@ -102,6 +103,42 @@ def to_published(
             write_tasks(folder / "tasks.jsonl", tasks)
         write_json(folder / "provenance.json", {name: of_task.to_json() for name, of_task in provenance.items()})
     return target
+
+
+class _SafeFile(io.FileIO):
+    """A new file whose writes do not fail: libhdf5 may crash when it closes a file on a full disk.
+
+    Attributes:
+        error: the first error of the disk, after which nothing is written.
+    """
+
+    error: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        view, done = memoryview(data).cast("B"), 0
+        try:
+            while self.error is None and done < len(view):  # a full disk may cut a write short
+                done += super().write(view[done:]) or 0
+        except OSError as error:
+            self.error = error
+        return len(view)
+
+    def truncate(self, size: int | None = None, /) -> int:
+        try:
+            return super().truncate(size) if self.error is None else 0
+        except OSError as error:
+            self.error = error
+            return 0
+
+
+@contextmanager
+def _new_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Yield a new HDF5 file to write to; raise OSError, which names it, if the disk has no room for it."""
+    with add_filename(path), _SafeFile(path, "w+") as stream:
+        with h5py.File(stream, "w") as file:
+            yield file
+        if stream.error is not None:
+            raise stream.error
 
 
 def _streams_each(provenance: Provenance | None) -> int:
