@@ -35,10 +35,11 @@ from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
-from benchmarks.harness import COUNT, elapsed, folder_size, peak_memory, print_line
+from benchmarks.harness import elapsed, folder_size, peak_memory, print_line
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, track_of
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks
+from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.schema import HISTORIES, KINDS, TASKS
 from icrl4aht_data.writing.published import PUBLISHED_CHUNK
@@ -175,11 +176,11 @@ def write_paper_format(root: Path, parts: list[Dataset]) -> None:
                 index.write(json.dumps(history.entry.to_json()) + "\n")
 
 
-PARTS = ("speed", "noise", "memory", "bytes")
+PARTS_OF_COLLECTION = ("speed", "noise", "memory", "bytes")
 
 
 @click.command()
-@click.argument("parts", nargs=-1, type=click.Choice(PARTS))
+@click.argument("parts", nargs=-1, type=click.Choice(PARTS_OF_COLLECTION))
 @click.option("--profile", default="smoke", show_default=True, help="Profile of the speed part.")
 @click.option("--updates", type=COUNT, default=30, show_default=True, help="Updates of the speed part.")
 @click.option("--layout", default="demo_wide", show_default=True, help="Layout of the noise part.")
@@ -193,7 +194,7 @@ def main(parts: tuple[str, ...], profile: str, updates: int, layout: str, wide_u
         "memory": lambda: collection_memory(wide_updates),
         "bytes": lambda: transition_bytes(streams),
     }
-    for part in parts or PARTS:
+    for part in parts or PARTS_OF_COLLECTION:
         print_line("collect", part=part, **measures[part]())
 
 

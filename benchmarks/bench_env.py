@@ -29,8 +29,9 @@ from icrl4aht_generation.adapters.jaxmarl_env import JaxMARLEnv
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.config import PPOConfig
 
-from benchmarks.harness import COUNT, compared, print_line, rates_in_turn
+from benchmarks.harness import compared, print_line, rates_in_turn
 from benchmarks.peers import jaxmarl_environment, jaxmarl_training
+from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _LAYOUTS = ("coord_simple", "coord_ring", "demo_wide")

@@ -53,7 +53,7 @@ from icrl4aht_generation.teammates.instances import published_tasks
 from jax.extend.backend import get_backend
 from jaxlib import version as jaxlib_version
 
-from benchmarks.bench_learn import heuristic_learner
+from benchmarks.bench_learn import heuristic_learner, size_options
 from benchmarks.harness import compile_measured, print_line
 from benchmarks.isolated import run_isolated
 from icrl4aht_data import load_icrl4aht
@@ -357,7 +357,7 @@ def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
 def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
     """Return the architecture of a size of AD."""
     changes = {**sizes.shrunk.get(size, {}), "encoder": encoder, "bfloat16": dtype == "bfloat16"}
-    return ModelOptions(**SIZES[size].model | changes)
+    return size_options(size, **changes)
 
 
 def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:

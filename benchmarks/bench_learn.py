@@ -44,11 +44,12 @@ from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.teammates.instances import published_tasks
 from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
-from benchmarks.harness import COUNT, compared, compiled_call, elapsed, print_line, rates_in_turn
+from benchmarks.harness import compared, compiled_call, elapsed, print_line, rates_in_turn
 from benchmarks.published import published_reader
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.sampling.ad import ADBatch, ADSampler
@@ -134,7 +135,7 @@ def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
         i += 1
 
 
-def architecture(size: str, **changes: Any) -> ModelOptions:
+def size_options(size: str, **changes: Any) -> ModelOptions:
     """Return the architecture of a size of AD."""
     return ModelOptions(**SIZES[size].model | changes)
 
@@ -164,7 +165,7 @@ def compare_training(
         for way in ("published", *encoders):
             encoder: EncoderKind = "paper" if way == "published" else way
             world = overcooked_world(dataset.layouts, encoder, plain_view if way == "published" else None)
-            trainer = Trainer(get_method("ad")(architecture(size, encoder=encoder), world), options)
+            trainer = Trainer(get_method("ad")(size_options(size, encoder=encoder), world), options)
             if way == "published":
                 found = published_batches(Path(folder) / "published", sampler)
                 batches = (jax.device_put(batch, trainer.rows) for batch in found)
@@ -179,7 +180,7 @@ def compare_training(
 
 def untrained_ad(layout: Layout, size: str, acting: Acting) -> Policy:
     """Return an ego of untrained AD of a size."""
-    model = architecture(size)
+    model = size_options(size)
     method = get_method("ad")(model, overcooked_world([layout], model.encoder))
     return learned(method, method.init(jax.random.key(0)), SIZES[size].context, PlayMode(acting))
 
@@ -212,12 +213,14 @@ def evaluate_all_tasks(size: str, protocol: Protocol) -> None:
     _print(part="tasks", size=size, tasks=len(tasks), episodes=protocol.episodes, minutes=round(seconds / 60, 2))
 
 
-PARTS = ("ego", "jaxmarl", "ad", "act", "tasks")
+PARTS_OF_LEARNING = ("ego", "jaxmarl", "ad", "act", "tasks")
 _ENCODERS: tuple[EncoderKind, ...] = get_args(EncoderKind)
 
 
 @click.command()
-@click.option("--part", "parts", multiple=True, type=click.Choice(PARTS), help="[default: all; jaxmarl needs --peer]")
+@click.option(
+    "--part", "parts", multiple=True, type=click.Choice(PARTS_OF_LEARNING), help="[default: all; jaxmarl needs --peer]"
+)
 @click.option("--layout", default="demo_wide", show_default=True)
 @click.option("--rounds", type=COUNT, default=5, show_default=True)
 @click.option("--profile", "profiles", multiple=True, default=("mini", "cpu"), show_default=True, help="For `ego`.")
@@ -244,7 +247,7 @@ def main(
     """Measure the speed of learning egos and of training and playing sequence models; one JSON line each."""
     if "jaxmarl" in parts and not peer:
         raise click.UsageError("--part jaxmarl: expected --peer FILE, a copy of JaxMARL's ippo_rnn_overcooked_v2.py")
-    parts, here = parts or tuple(part for part in PARTS if peer or part != "jaxmarl"), get_layout(layout)
+    parts, here = parts or tuple(part for part in PARTS_OF_LEARNING if peer or part != "jaxmarl"), get_layout(layout)
     loaded = {profile.name: profile for profile in map(load_profile, profiles)}
     threads = [profile.xla_threads for profile in loaded.values() if profile.xla_threads]
     if threads and set(parts) == {"ego"}:  # sequence models use all cores

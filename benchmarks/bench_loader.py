@@ -26,10 +26,11 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.harness import COUNT, compared, elapsed, print_line
+from benchmarks.harness import compared, elapsed, print_line
 from benchmarks.histories import write_many
 from benchmarks.published import fair_reader, published_reader
 from icrl4aht_data import ADBatch, ADSampler, load_icrl4aht
+from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.writing.published import to_published
 
 _AIMS = {("ram", "state"): 8000, ("ram", "uint8"): 400, ("ram", "float32"): 200}

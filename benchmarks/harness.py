@@ -17,9 +17,6 @@ from typing import Any, NamedTuple
 
 import click
 
-COUNT = click.IntRange(min=1)
-"""Type of options that are numbers of something, at least 1."""
-
 
 def print_line(benchmark: str, **facts: Any) -> None:
     """Print one JSON line of a benchmark."""

@@ -119,7 +119,7 @@ class _Renderer:
         seen = np.flatnonzero(where != NOWHERE)
         row, cell, where = row[seen], cell[seen], where[seen]
         flat, start = np.ascontiguousarray(record).reshape(-1), row * record.shape[1]
-        # A pot with item byte 8, two pieces of ingredient 0, and timer 0 shows patch 512 + 8; a full pot that cooks, with
+        # A pot with item byte 8, two pieces of ingredient 0, and timer 0 shows patch 512 + 8; one that cooks, with
         # item byte 12 and timer 19, patch 512 + 19 * 256 + 12. It is copied onto the pot's cell in the window.
         patch = self._first_patch.take(cell) + flat.take(start + self._patch_column.take(cell))
         pots = np.flatnonzero(cell < self._pots)
