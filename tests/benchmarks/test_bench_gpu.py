@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -15,7 +14,6 @@ from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import learned
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout
-from icrl4aht_baselines.methods.options import SIZES
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_baselines.training.trainer import Trainer
 from icrl4aht_generation.learners.ego import compiled_update
@@ -108,24 +106,6 @@ def test_a_batch_that_does_not_fit_is_computed_in_parts(monkeypatch):
     assert tried == [1, 2, 4]
     with pytest.raises(MemoryError, match="no number of parts fits: RESOURCE_EXHAUSTED"):
         measure(Bench(SMALL_SIZES, {}))  # of 2 rows
-
-
-def test_other_errors_of_training_are_errors(monkeypatch):
-    def steps(*arguments):
-        raise jax.errors.JaxRuntimeError("INTERNAL: ..")
-
-    monkeypatch.setattr(bench_gpu, "_training_steps", steps)
-    with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
-        measure_training(Bench(FULL_SIZES, {}), "small", "paper", "float32")
-
-
-def test_models_are_those_of_the_sizes():
-    """A case has the values of `train --size`, except for its own encoder and dtype."""
-    for name in ("tiny", "small"):
-        size = SIZES[name]
-        model = architecture(FULL_SIZES, name, "words", "bfloat16")
-        assert asdict(model).items() >= (size.model | {"encoder": "words", "bfloat16": True}).items()
-        assert context_length(FULL_SIZES, name) == size.context
 
 
 @pytest.mark.slow

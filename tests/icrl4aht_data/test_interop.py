@@ -21,7 +21,6 @@ from icrl4aht_data.utils.installation import install_command
 from icrl4aht_data.writing.parquet import to_parquet
 from tests.helpers.batches import assert_equal
 from tests.helpers.paths import ROOT
-from tests.helpers.random_releases import random_release
 
 
 @pytest.fixture
@@ -86,23 +85,6 @@ class TestGrain:
             assert len(found) == len(sampler)
             for i, batch in enumerate(found):
                 assert_equal(batch, sampler[i])
-
-    def test_a_checkpointed_iterator_resumes_exactly(self, sampler):
-        import grain
-
-        def make():
-            return iter(grain.MapDataset.source(sampler).repeat(2).to_iter_dataset())
-
-        iterator = make()
-        for _ in range(3):
-            next(iterator)
-        state = iterator.get_state()
-        rest = list(iterator)
-        again = make()
-        again.set_state(state)
-        for one, two in zip(again, rest, strict=True):
-            assert_equal(one, two)
-        assert_equal(rest[0], sampler[3])
 
 
 ONE_CORE = "ignore:This DataLoader will create:UserWarning"
@@ -182,15 +164,6 @@ class TestHuggingFace:
         np.testing.assert_array_equal(row["episode_end_state"], written[7]["episode_end_state"][2])
         assert row["return"] == written[7]["rewards"][40:60].sum()
         assert row["oracle_actions"] is None
-
-    def test_episodes_with_oracle_actions(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
-        written = random_release(
-            tmp_path / "r", layouts=("demo_wide",), streams=2, episodes=5, oracle=True, labels=False
-        )
-        row = hf_episodes(load_icrl4aht(tmp_path / "r"))[6]
-        assert (row["history_id"], row["episode"], row["expert_actions"]) == (1, 1, None)
-        np.testing.assert_array_equal(row["oracle_actions"], written[1]["oracle_actions"][20:40])
 
     def test_windows_and_resuming(self, sampler):
         windows = hf_windows(sampler, stop=3)

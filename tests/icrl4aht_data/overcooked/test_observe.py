@@ -190,35 +190,6 @@ def test_a_complete_scene_seen_by_the_ego():
     }
 
 
-def test_the_same_scene_seen_by_the_teammate():
-    """From (3, 2) the window reaches x = 1..5, y = 0..4: now pile 1 and the indicator (4, 2) are in it."""
-    record = state_record(
-        CRAMPED,
-        (1, 1, "left"),
-        (3, 2, "down"),
-        hands=[PLATE, 0],
-        recipe=RECIPE_111,
-        pot_items=[COOKED + 3 * ZERO],
-        counters={(0, 2): PLATE},
-    )
-    assert seen(CRAMPED, record, 1) == {
-        "self position": at(1, (3, 2)),
-        "self down": at(1, (3, 2)),
-        "other position": at(1, (1, 1)),
-        "other left": at(1, (1, 1)),
-        "other plate": at(1, (1, 1)),
-        "wall": at(1, (1, 0), (3, 0), (4, 0), (2, 3), (4, 3)),
-        "goal": at(1, (3, 3)),
-        "pot": at(1, (2, 0)),
-        "R": at(1, (4, 2)),
-        "plates": at(1, (1, 3)),
-        "pile 1": at(1, (4, 1)),
-        "item cooked": at(1, (2, 0)),
-        "item 0": at(3, (2, 0)),
-        "recipe 1": at(3, (4, 2)),
-    }
-
-
 @each_layout
 def test_cells_outside_the_map_are_all_zero_and_all_others_are_not_cut(layout):
     records = random_records(layout, 256, np.random.default_rng(2))

@@ -97,19 +97,6 @@ def test_the_recipe_shows_on_the_indicator_in_the_footer_and_on_a_lit_button():
         assert np.any(first[footer:] != second[footer:])
 
 
-def test_items_show_on_counters_and_each_kind_looks_different():
-    cell = COORD.counters[0]
-    position = (cell % COORD.width, cell // COORD.width)
-    frames = [frame_of(counters={position: item}) for item in (0, PLATE, ONION, TOMATO, DISH)]
-    assert len({frame.tobytes() for frame in frames}) == len(frames)
-    assert all(changed_cells(frames[0], frame) == {cell} for frame in frames[1:])
-
-
-def test_a_delivery_lights_the_hatch():
-    goals = {cell for cell, letter in enumerate("".join(COORD.rows)) if letter == "X"}
-    assert changed_cells(frame_of(delivered=0), frame_of(delivered=1)) == goals
-
-
 def test_the_view_is_outlined_only_on_request():
     layout = LAYOUTS["coord_ring"]
     record = state_record(layout, (4, 3, "up"), (1, 1, "up"))[0]

@@ -219,22 +219,6 @@ def test_a_wrong_delivery_costs_20_and_the_recipe_stays(slot, recipe, dish):
     assert (after.recipe, after.delivered) == (recipe, 0)
 
 
-@pytest.mark.parametrize(
-    ("dishes", "reward"),
-    [
-        ([DISH_000, DISH_000], 40),
-        ([DISH_000, DISH_111], 0),  # judged by the recipe before the step, which changes only after both
-        ([DISH_111, DISH_000], 0),
-        ([DISH_111, DISH_111], -40),
-    ],
-)
-def test_two_deliveries_in_one_step_both_count(dishes, reward):
-    record = state_record(ASYMM, (3, 2, "up"), (7, 1, "right"), hands=dishes, recipe=RECIPE_000)
-    after = act(ASYMM, record, INTERACT, INTERACT, next_recipe=RECIPE_111)
-    assert (after.reward, after.hands) == (reward, [0, 0])
-    assert (after.recipe, after.delivered) == ((RECIPE_111, 1) if DISH_000 in dishes else (RECIPE_000, 0))
-
-
 # Button. In coord_ring the first button is at (4, 2), between the ego's ring and the teammate's room
 
 AT_BUTTON = ((4, 1, "down"), (4, 3, "up"))
@@ -261,29 +245,7 @@ def test_a_press_costs_5_and_lights_one_button_for_9_observations(slot):
     assert visible == [3] * 9 + [0, 0]
 
 
-def test_a_press_while_lit_costs_again_and_lights_for_the_full_time(slot):
-    after = interact(slot, ring(slot, buttons=[4, 7]), RING)
-    assert (after.reward, after.buttons) == (-5, [9, 6])
-
-
 # Agent 0 first: the counter (3, 2) of coord_ring, and the pot (4, 2) of asymm_both, are faced from both sides
-
-
-@pytest.mark.parametrize(
-    ("hands", "item", "hands_after", "counter_after"),
-    [
-        ([ZERO, 0], 0, [0, ZERO], 0),  # the ego puts down what the teammate takes
-        ([0, ZERO], 0, [0, 0], ZERO),  # the ego comes too early
-        ([ZERO, ONE], 0, [0, ONE], ZERO),  # the ego's item is put down, the teammate keeps its own
-        ([0, 0], ONE, [ONE, 0], 0),  # the ego takes it
-        ([0, ZERO], ONE, [ONE, 0], ZERO),  # the ego makes room for the teammate's
-        ([ZERO, 0], ONE, [ZERO, ONE], 0),  # the ego cannot, the teammate takes it
-    ],
-)
-def test_agent_0_interacts_first_on_a_shared_counter(hands, item, hands_after, counter_after):
-    record = state_record(RING, (3, 1, "down"), (3, 3, "up"), hands=hands, counters={(3, 2): item})
-    after = act(RING, record, INTERACT, INTERACT)
-    assert (after.hands, after.counters) == (hands_after, {(3, 2): counter_after} if counter_after else {})
 
 
 @pytest.mark.parametrize(
@@ -365,25 +327,3 @@ def test_taking_a_plate_pays_3_if_it_is_needed(slot, pots, other_hand, counters,
     after = interact(slot, record, ASYMM)
     assert (after.hands[slot], after.reward) == (PLATE, 0)
     assert after.shaped == own(slot, reward)
-
-
-def test_plates_in_hands_count_as_before_the_steps_interactions():
-    both = state_record(ASYMM, *AT_PLATES_ASYMM, pot_items=[ZERO, 0])
-    assert act(ASYMM, both, INTERACT, INTERACT).shaped == [3, 3]  # the ego's new plate does not count yet
-
-    served = state_record(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[SOUP_001, ONE])
-    after = act(ASYMM, served, INTERACT, INTERACT)
-    # The plate that the ego used still counts, against the one pot left.
-    assert (after.hands, after.shaped) == ([DISH_001, PLATE], [0, 0])
-
-
-def test_pots_and_counters_are_as_agent_0_left_them():
-    filled = state_record(ASYMM, (3, 2, "right"), AT_PLATES_ASYMM[1], hands=[ONE, 0], recipe=RECIPE_000)
-    assert act(ASYMM, filled, INTERACT, INTERACT).shaped == [0, 3]  # the ego's ingredient makes the plate useful
-
-    cleared = state_record(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], pot_items=[ZERO, ONE], counters={(2, 4): PLATE})
-    assert act(ASYMM, cleared, INTERACT, INTERACT).shaped == [0, 3]  # the ego took the plate from the counter
-
-    dropped = state_record(ASYMM, AWAY[0], AT_PLATES_ASYMM[1], hands=[PLATE, 0], pot_items=[ZERO, ONE])
-    assert act(ASYMM, dropped, STAY, INTERACT).shaped == [0, 3]
-    assert act(ASYMM, dropped, INTERACT, INTERACT).shaped == [0, 0]  # now the ego's plate is on a counter

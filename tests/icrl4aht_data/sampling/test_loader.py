@@ -78,15 +78,6 @@ class TestCaches:
         with pytest.raises(UnknownNameError, match="unknown cache 'disk'; valid: auto, ram, mmap, stream"):
             load_icrl4aht(lite[0], cache="disk")  # type: ignore[arg-type]
 
-    def test_mapped_arrays_are_shared_and_made_once(self, lite, tmp_path, monkeypatch):
-        monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path))
-        first = load_icrl4aht(lite[0], layout="demo_wide", cache="mmap").ad(batch_size=2, length=9)[0]
-        (made,) = (path for path in tmp_path.iterdir() if path.name.startswith("histories-"))
-        stamps = {path.name: path.stat().st_mtime_ns for path in made.iterdir()}
-        assert set(stamps) == {"contents.json", *(f"{name}.npy" for name in lite[1][0])}
-        assert_equal(load_icrl4aht(lite[0], layout="demo_wide", cache="mmap").ad(batch_size=2, length=9)[0], first)
-        assert {path.name: path.stat().st_mtime_ns for path in made.iterdir()} == stamps
-
     @pytest.mark.parametrize("cache", CACHES)
     def test_damage_is_named_not_sampled(self, damaged, cache, tmp_path, monkeypatch):
         monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))  # without arrays of the undamaged release

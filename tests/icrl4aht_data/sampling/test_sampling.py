@@ -7,9 +7,10 @@ import warnings
 import numpy as np
 import pytest
 
-from icrl4aht_data import load_icrl4aht
+from icrl4aht_data import get_layout, load_icrl4aht
 from icrl4aht_data.benchmark.facts import all_families
 from icrl4aht_data.errors import MixedSplitsWarning, OptionError
+from icrl4aht_data.overcooked.state import record_size
 from tests.helpers.random_releases import random_release
 
 LENGTH = 32
@@ -155,41 +156,27 @@ def test_what_follows_an_episodes_last_step_is_its_own_end(lite, order):
         assert set(_rows(found)) <= set(_rows({"state": states, "next": following}))
 
 
-@pytest.mark.parametrize(
-    ("make", "expected"),
-    [
-        (
-            lambda dataset: dataset.ad(batch_size=4, length=50, seed=0),
-            {
-                "obs": ("float32", (4, 50, 5, 5, 45)),
-                "prev_actions": ("int32", (4, 50)),
-                "prev_rewards": ("float32", (4, 50)),
-                "target_actions": ("int32", (4, 50)),
-                "dones": ("bool", (4, 50)),
-                "attention_mask": ("bool", (4, 50)),
-                "is_first": ("bool", (4, 50)),
-            },
-        ),
-        (
-            lambda dataset: dataset.dpt(batch_size=4, context=30),
-            {
-                "query_obs": ("float32", (4, 5, 5, 45)),
-                "query_target": ("int32", (4,)),
-                "context_obs": ("float32", (4, 30, 5, 5, 45)),
-                "context_actions": ("int32", (4, 30)),
-                "context_next_obs": ("float32", (4, 30, 5, 5, 45)),
-                "context_rewards": ("float32", (4, 30)),
-            },
-        ),
-    ],
-    ids=["ad", "dpt"],
-)
-def test_fields_dtypes_and_shapes(lite, make, expected):
-    sampler = make(load_icrl4aht(lite[0], layout="demo_wide"))
-    batch = sampler[0]
-    assert {name: (str(a.dtype), a.shape) for name, a in batch._asdict().items() if a is not None} == expected
-    assert sampler.specs == expected
-    assert batch.describe().splitlines()[0].split() == [next(iter(expected)), "float32", *str(batch[0].shape).split()]
+@pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
+def test_fields_dtypes_and_shapes(lite, obs):
+    dataset = load_icrl4aht(lite[0], layout="demo_wide", obs=obs)
+    shape = (record_size(get_layout("demo_wide")),) if obs == "state" else (5, 5, 45)
+    dtypes = {
+        "rewards": "float32",
+        "dones": "bool",
+        "mask": "bool",
+        "first": "bool",
+        "obs": "uint8" if obs == "state" else obs,
+    }
+    for sampler in (dataset.ad(batch_size=4, length=30), dataset.dpt(batch_size=4, context=30)):
+        batch = sampler[0]
+        found = {name: (str(a.dtype), a.shape) for name, a in batch._asdict().items() if a is not None}
+        expected = {}
+        for name in found:
+            steps = (4,) if name.startswith("query") else (4, 30)
+            kind = name.split("_")[-1]
+            expected[name] = dtypes.get(kind, "int32"), (*steps, *shape) if kind == "obs" else steps
+        assert found == expected == sampler.specs
+        assert batch.describe().splitlines()[0].split()[:2] == [next(iter(found)), dtypes["obs"]]
 
 
 def test_the_draws_are_fixed_for_good(lite):
