@@ -74,6 +74,7 @@ def test_words_give_the_loss_and_gradient_of_the_paper(lite, name):
     assert_equal_results(found, loss_and_gradient(paper, params, batch_of(lite[0], name, "uint8")), params)
 
 
+@pytest.mark.slow
 def test_entries_give_the_loss_and_gradient_of_observations(lite):
     plain, entries = made("ad", "mlp", plain_view), made("ad", "mlp")
     params = random_parameters(plain)

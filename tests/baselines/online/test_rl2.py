@@ -313,6 +313,7 @@ class TestPreparing:
         assert {cell["layout"] for cell in job.about["trained_on"]} == {"cramped_down"}
         assert job.about["histories"]["layouts"] == ["cramped_down"]
 
+    @pytest.mark.slow
     def test_teammates_of_other_layouts_are_on_record(self):
         """With few tasks, some teammates are played with on rearranged layouts alone."""
         tasks = read_tasks(manifest_path("layout", "train", "diverse"))

@@ -145,6 +145,7 @@ def test_a_stopped_collection_resumes(release, dataset, tmp_path, monkeypatch):
     assert (target / "MANIFEST.sha256").read_bytes() == (release / "MANIFEST.sha256").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path):
     choice = ["--layout", "cramped_up", "--teammate-family", "H3", "--histories", "1", "--episodes", "10"]
     arguments = ["collect", "--agent", "random", *choice, "--out", str(tmp_path / "release")]
