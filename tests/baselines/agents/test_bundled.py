@@ -109,11 +109,6 @@ def test_layouts_of_other_tracks(models):
         find_agent("ad-tiny").make(get_layout("cramped_down"))
 
 
-def test_unknown_names(models):
-    with pytest.raises(UnknownNameError, match="unknown agent 'ad-tinny'; valid: stay, random, oracle, ad-tiny"):
-        find_agent("ad-tinny")
-
-
 def test_names_and_unfinished_runs(run, tmp_path):
     for name in ("../ad", "oracle", "AD-x", ""):
         with pytest.raises(OptionError, match="expected words of small letters and digits with hyphens: ad-reference"):

@@ -160,9 +160,3 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
     assert config["histories"]["root"] == server.url
     assert config["histories"]["manifest_sha256"] == file_hash(lite[0] / "MANIFEST.sha256")
     assert "model.teammate_actions: the run has False, expected True" in str(again.exception)
-    wrong = CliRunner().invoke(cli, [*arguments, "--size", "smal"])
-    assert wrong.exit_code == 2
-    assert "unknown size 'smal'" in wrong.output
-    alone = CliRunner().invoke(cli, [*arguments, *small, "--processes", "2"])
-    assert alone.exit_code == 2
-    assert "expected a --coordinator HOST:PORT as well" in alone.output.replace("\n", " ")

@@ -111,24 +111,6 @@ def test_an_ego_outside_jax_may_take_canonical_channels():
         from_host(agent, "union")  # type: ignore[arg-type]
 
 
-def test_batches_of_states_show_what_batches_of_observations_hold(lite, reconverted_release):
-    """A release without state records trains on the same batches."""
-    options = dataclasses.replace(OPTIONS, batch_size=8)
-    jobs = [
-        prepare("ad", MODEL, options, HistoryOptions(("all",), str(root))) for root in (lite[0], reconverted_release)
-    ]
-    assert [job.about["histories"]["obs"] for job in jobs] == ["state", "uint8"]
-    assert jobs[0].about["histories"]["selections"] == jobs[1].about["histories"]["selections"]
-    states, stored = (job.data.train[0] for job in jobs)
-    layouts = [get_layout(name) for name in ("coord_simple", "demo_wide")]
-    assert set(states.layouts.tolist()) == {0, 1}
-    view = CompactView("paper", tuple(layouts), canonical=True)
-    rendered: Any = view(jnp.asarray(states.obs), jnp.asarray(states.layouts))
-    np.testing.assert_array_equal(np.asarray(rendered), stored.obs, strict=True)
-    shapes = [jax.eval_shape(job.method.init, jax.random.key(0)) for job in jobs]
-    assert jax.tree.map(jnp.shape, shapes[0]) == jax.tree.map(jnp.shape, shapes[1])
-
-
 def test_every_part_is_rendered_by_its_own_layouts(lite):
     """A held-out part is on some of the layouts only, here the second one, and batches number those of the model."""
     job = prepare("ad", MODEL, dataclasses.replace(OPTIONS, batch_size=8), HistoryOptions(("all",), str(lite[0])))

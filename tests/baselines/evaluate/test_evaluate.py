@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 from pathlib import Path
 
 import jax
@@ -182,21 +181,10 @@ def test_recorded_play_follows_the_rules():
     np.testing.assert_array_equal(outcome.reward, played.reward[:, :-1])
 
 
-@pytest.mark.parametrize(
-    ("actions", "message"),
-    [
-        (lambda batch: np.full(batch, 6), r"returned actions 6\.\.6 on coord_simple, expected 0\.\.5"),
-        pytest.param(lambda batch: np.full(batch, -1), r"returned actions -1\.\.-1", marks=pytest.mark.slow),
-        pytest.param(
-            lambda batch: np.zeros((batch, 1), int),
-            r"failed on coord_simple.*returned int64 of shape \(5, 1\)",
-            marks=pytest.mark.slow,
-        ),
-    ],
-)
-def test_invalid_actions_of_host_agents(actions, message):
-    with pytest.raises(OptionError, match=re.compile(message, re.DOTALL)):
-        evaluate("mine", from_host(Watcher(actions)), SIMPLE, dataclasses.replace(PUBLISHED, episodes=1))
+def test_invalid_actions_of_host_agents():
+    watcher = Watcher(lambda batch: np.full(batch, 6))
+    with pytest.raises(OptionError, match=r"returned actions 6\.\.6 on coord_simple, expected 0\.\.5"):
+        evaluate("mine", from_host(watcher), SIMPLE, dataclasses.replace(PUBLISHED, episodes=1))
 
 
 @pytest.mark.parametrize(

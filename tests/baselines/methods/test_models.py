@@ -56,12 +56,6 @@ class TestSizes:
         world = overcooked_world([get_layout("coord_simple")])
         assert sizes(get_method(name)(ModelOptions(), world)) == parameters
 
-    def test_teammate_actions_add_an_embedding_or_a_one_hot(self):
-        world = overcooked_world([get_layout("coord_simple")])
-        option = ModelOptions(teammate_actions=True)
-        assert sizes(get_method("ad")(option, world)) == 3_283_870 + 6 * 64 + 64 * 256
-        assert sizes(get_method("dpt")(option, world)) == 3_285_022 + 6 * 256
-
     def test_impossible_options(self):
         with pytest.raises(OptionError, match="width = 30: expected a multiple of twice the heads"):
             ModelOptions(width=30)

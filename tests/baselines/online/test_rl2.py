@@ -29,7 +29,6 @@ from icrl4aht_baselines.online.rl2 import (
     _group_players,
     _Player,
     chosen_teammates,
-    imitation_weight,
     make_groups,
     seen_steps,
 )
@@ -141,12 +140,6 @@ def test_imitation_teaches_what_the_oracle_does(trainer):
         fallen[weight] = losses[0] - losses[-1]
     assert fallen[5.0] > 0.1
     assert fallen[0.0] < fallen[5.0] / 4
-
-
-def test_the_weight_of_imitation_falls_to_nothing():
-    play = PlayOptions(imitation=2.0, imitation_end=0.5)
-    found = [float(imitation_weight(play, jnp.int32(step), 100)) for step in (0, 25, 50, 99)]
-    assert found == pytest.approx([2.0, 1.0, 0.0, 0.0])
 
 
 def test_a_stopped_training_resumes_to_the_same_bits(trainer, through, tmp_path):
