@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 
 if TYPE_CHECKING:
     import gymnasium

@@ -29,7 +29,7 @@ from icrl4aht_data.format.manifest import check_against_manifest, check_folder, 
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.utils import files as disk
 from icrl4aht_data.utils.hashes import file_hash, git_hash
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.system import data_folder
 

@@ -36,7 +36,7 @@ from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.sampling.ad import ADBatch, ADSampler
 from icrl4aht_data.sampling.base import Sampler
 from icrl4aht_data.sampling.dpt import DPTBatch, DPTSampler
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.system import new_array
 

@@ -12,8 +12,6 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from icrl4aht_data.utils.without_jax import explain_missing_jax
-
 if TYPE_CHECKING:
     from icrl4aht_baselines.agents.egos import find_agent
     from icrl4aht_baselines.agents.host import from_host
@@ -23,8 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["evaluate", "find_agent", "from_host", "test_tasks"]
 
 _MODULES = {"find_agent": "agents.egos", "from_host": "agents.host", "test_tasks": "evaluate.protocols"}
-
-explain_missing_jax(__name__)
 
 
 class CallablePackage(ModuleType):

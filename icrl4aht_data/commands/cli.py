@@ -19,8 +19,8 @@ import click
 from icrl4aht_data.commands.verbs import SECTIONS, VERB_GROUP, VERBS, Verb
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
 from icrl4aht_data.utils.files import FULL, describe_disk
+from icrl4aht_data.utils.install_hints import missing_library
 from icrl4aht_data.utils.plugins import Plugins
-from icrl4aht_data.utils.requirements import missing_library
 
 _REMEDIES = {
     errno.ENOENT: "check the path; a new file's folder has to exist",
@@ -154,7 +154,7 @@ def run(command: click.Command) -> None:
     except OSError as error:
         _stop(_in_words(error), 1)
     except ModuleNotFoundError as error:
-        if (message := missing_library(error.name or "", "baselines")) is None:
+        if (message := missing_library(error.name or "")) is None:
             raise
         _stop(message, 1)
     except SystemExit as stop:

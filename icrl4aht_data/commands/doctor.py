@@ -12,12 +12,13 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, metadata
+from importlib.metadata import PackageNotFoundError, metadata, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
 from huggingface_hub import constants
+from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
@@ -29,9 +30,8 @@ from icrl4aht_data.fetch import check_credentials, is_address, offline_switches,
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.safe_hdf5 import OLDEST_HDF5
 from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, get_layout
-from icrl4aht_data.utils.installation import PACKAGE, install_command, installation_source, restore_command
+from icrl4aht_data.utils.install_hints import EXTRAS, PACKAGE, RESTORE, install_command
 from icrl4aht_data.utils.plugins import METHOD_GROUP, Plugins
-from icrl4aht_data.utils.requirements import Dependency, dependencies, installed_version
 from icrl4aht_data.utils.system import (
     CACHE_VARIABLES,
     DATA_VARIABLES,
@@ -108,18 +108,24 @@ def _text(value: Any) -> str:
 
 
 def _packages(problems: list[Problem]) -> dict[str, Any]:
+    facts: dict[str, Any] = {PACKAGE: {"found": _installed(PACKAGE), "folder": str(MINI.parent)}}
     oldest = SpecifierSet(f">={'.'.join(map(str, OLDEST_HDF5))}")
-    wanted = [Dependency("HDF5", oldest, None, h5py.version.hdf5_version)]
+    wanted = [("HDF5", oldest, h5py.version.hdf5_version)]
     steps = {"HDF5": "pip install -U --force-reinstall h5py", "Python": "create an environment with such a Python"}
     try:
-        supported = SpecifierSet(metadata(PACKAGE)["Requires-Python"])
-        wanted += [Dependency("Python", supported, None, platform.python_version()), *dependencies()]
+        about = metadata(PACKAGE)
     except PackageNotFoundError:
-        problems.append(Problem(f"{PACKAGE}: not installed", install_command()))
-    found = installed_version(PACKAGE)
-    about = {"found": found, "folder": str(MINI.parent), "source": str(installation_source()) if found else None}
-    facts: dict[str, Any] = {PACKAGE: about}
-    for name, versions, extra, found in wanted:
+        problems.append(Problem(f"{PACKAGE}: not installed", f"pip install {PACKAGE}, or -e . in a checkout"))
+    else:
+        wanted.append(("Python", SpecifierSet(about["Requires-Python"]), platform.python_version()))
+        needed = {one.name: one for one in map(Requirement, reversed(about.get_all("Requires-Dist") or []))}
+        wanted += [
+            (name, one.specifier, _installed(name))
+            for name, one in reversed(needed.items())
+            if name in EXTRAS or one.marker is None
+        ]
+    for name, versions, found in wanted:
+        extra = EXTRAS.get(name)
         facts[name] = {"found": found, "expected": str(versions), "extra": extra}
         if found is None and extra is not None:
             facts[name]["install"] = install_command(extra)
@@ -127,6 +133,13 @@ def _packages(problems: list[Problem]) -> dict[str, Any]:
             problem = f"{name} {found or 'is not installed'}: expected {versions}"
             problems.append(Problem(problem, steps.get(name, f"pip install -U '{name}{versions}'")))
     return facts
+
+
+def _installed(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
 
 def _plugins(problems: list[Problem]) -> dict[str, Any]:
@@ -227,8 +240,7 @@ def _network(problems: list[Problem]) -> dict[str, Any]:
 
 def _bundled(problems: list[Problem]) -> dict[str, Any]:
     report = verify_release(MINI, level="quick")
-    step = restore_command()
-    problems += [Problem(f"the bundled release, {f.file}: {f.problem}", step) for f in report.findings]
+    problems += [Problem(f"the bundled release, {f.file}: {f.problem}", RESTORE) for f in report.findings]
     facts: dict[str, Any] = {"ok": report.ok}
     with suppress(Icrl4ahtError):  # what cannot be read is among the findings
         info = read_info(MINI)

@@ -26,7 +26,7 @@ from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, READABLE_VERSIONS,
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
-from icrl4aht_data.utils.installation import upgrade_advice
+from icrl4aht_data.utils.install_hints import PACKAGE
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 _NUMBER = r"(0|[1-9]\d*)"
@@ -226,7 +226,7 @@ def read_info(root: Path) -> ReleaseInfo:
         raise IndexFormatError(f"{path}: malformed: {error}") from error
     found = f"{path}: format version {version}, this package reads {', '.join(map(str, READABLE_VERSIONS))}"
     if version > FORMAT_VERSION:
-        raise FormatTooNewError(f"{found}: {upgrade_advice()}")
+        raise FormatTooNewError(f"{found}: `pip install -U {PACKAGE}`")
     raise FormatTooOldError(
         f"{found}: fetch the release again, or convert it to version 4 with `icrl4aht-data convert` of {_CONVERTER}"
     )

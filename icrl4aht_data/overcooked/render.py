@@ -20,7 +20,7 @@ from icrl4aht_data.overcooked.drawing import FOOTER, INK, PAPER, VIEW, Canvas, C
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import faults, record_size
 from icrl4aht_data.utils.files import atomic_write
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int
 
 if TYPE_CHECKING:

@@ -32,7 +32,7 @@ from icrl4aht_data.plotting import plot_headroom, plot_layout_curves, plot_layou
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
 from icrl4aht_data.utils.files import files_below, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.templates import card_file, fill_template
 from icrl4aht_data.writing.card import (
     CURVES_FIGURE,

@@ -18,7 +18,7 @@ from icrl4aht_data.format.info import ReleaseInfo, read_info
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES, PARQUET_INDEX
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, record_width
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.card import card_texts, episode_texts
 

@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import Selection
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -30,7 +30,7 @@ from icrl4aht_data.reading.sources import (
     decoded_size,
     open_source,
 )
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int, check_position
 from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.utils.text import counted_histories, counted_noun

@@ -15,7 +15,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from icrl4aht_data.errors import PluginError
-from icrl4aht_data.utils.installation import PACKAGE
+from icrl4aht_data.utils.install_hints import PACKAGE
 
 METHOD_GROUP = "icrl4aht.methods"
 """Group of methods, which `baselines` knows and `doctor` lists."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from string import Template
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.installation import restore_command
+from icrl4aht_data.utils.install_hints import RESTORE
 
 _PACKAGE = Path(__file__).parent.parent
 
@@ -28,7 +28,7 @@ def card_file(name: str, package: Path = _PACKAGE) -> Path:
     for folder in (package / "cards", package.parent / "cards", package.parent):
         if (folder / name).is_file():
             return folder / name
-    raise OptionError(f"{package / 'cards' / name}: missing; restore it: `{restore_command()}`")
+    raise OptionError(f"{package / 'cards' / name}: missing; restore it: `{RESTORE}`")
 
 
 def fill_template(template: str, **values: str) -> str:

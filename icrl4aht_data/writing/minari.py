@@ -32,7 +32,7 @@ from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 from icrl4aht_data.writing.stored import HistoryProgress, with_source
 

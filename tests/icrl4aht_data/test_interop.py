@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, torch_loader
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.writing.parquet import to_parquet
 from tests.helpers.batches import assert_equal
 from tests.helpers.paths import ROOT

@@ -84,13 +84,8 @@ train rl2 --layout demo_wide --context 5 | --context: not with rl2, which learns
 train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
 collect --agent none --out c | A trained model is named by its folder
 collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
-<<<<<<< HEAD
 collect --agent stay --out c --noise 2 0 | noise = '2': expected `float` <= 1
-research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, rl2-tests, ad-noise,
-=======
-collect --agent stay --out c --noise 2 0 | noise = '2': expected `float` <= 1
-research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2, 
->>>>>>> 92151cb (Options state bounds as annotations that msgspec checks, from TOML, JSON and the command line alike; options by topic)
+research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2,
 research reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states its results
 research reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 results empty | Missing option '--out'

@@ -1,55 +1,47 @@
-"""Without JAX or an adapter's library, modules that need it name the command that installs it when imported."""
+"""Without JAX or an adapter's library, commands and adapters that need it name the command that installs it."""
 
 from __future__ import annotations
 
 import importlib
-import json
+import re
 import subprocess
 import sys
 
 import pytest
 
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.paths import ROOT
 
-IMPORT_ALL = """
-import importlib, json, pkgutil, sys
+PROGRAM = """
+import sys
 
 sys.modules.update(dict.fromkeys(("jax", "flax", "optax", "jaxtyping", "gymnasium"), None))
-package, found = importlib.import_module(sys.argv[1]), {}
-for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.", onerror=lambda name: None):
-    if not module.name.endswith("__main__"):
-        try:
-            importlib.import_module(module.name)
-            found[module.name] = "imported"
-        except ModuleNotFoundError as error:
-            found[module.name] = error.msg
-print(json.dumps(found))
+sys.argv = ["icrl4aht-data", *sys.argv[1:]]
+from icrl4aht_data.commands.cli import main
+
+main()
 """
 
 
 @pytest.mark.parametrize(
-    ("extra", "free", "needing"),
+    ("words", "code"),
     [
-        ("baselines", "icrl4aht_baselines.commands.train_commands", "icrl4aht_baselines.evaluate"),
-        ("generation", "icrl4aht_generation.commands", "icrl4aht_generation.env"),
+        ("train --help", 0),
+        ("generate --help", 0),
+        ("list", 0),
+        ("evaluate --agent stay --out {out}", 1),
+        ("train ad --layout demo_wide --out {out}", 1),
+        ("plan", 1),
     ],
 )
-def test_every_module_imports_or_names_the_extra(extra, free, needing):
-    command = [sys.executable, "-W", "error", "-c", IMPORT_ALL, f"icrl4aht_{extra}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    found = json.loads(done.stdout)
-    assert found[free] == "imported"
-    assert found[needing] == f"this needs jax, which is not installed: {install_command(extra)}"
-    ends = tuple(f", which is not installed: {install_command(one)}" for one in (extra, "gym", "jaxmarl", "pettingzoo"))
-    wrong = {name: message for name, message in found.items() if message != "imported" and not message.endswith(ends)}
-    assert not wrong
-
-
-def test_with_jax_imports_are_left_alone():
-    code = "import sys; old = [*sys.meta_path]; import icrl4aht_baselines as b; print(old == sys.meta_path)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout == "True\n"
+def test_commands_explain_themselves_or_name_the_extra(words, code, tmp_path):
+    command = [sys.executable, "-c", PROGRAM, *words.format(out=tmp_path / "out").split()]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == code, done.stderr
+    if code:
+        needed = re.escape(f", which is not installed: {install_command('baselines')}")
+        assert re.fullmatch(rf"error: this needs \w+{needed}\n", done.stderr), done.stderr
+        assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import can_draw
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 
 CONSOLE = Console(quiet=True)
 SMOKE = load_profile("smoke")

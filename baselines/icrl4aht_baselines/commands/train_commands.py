@@ -57,7 +57,7 @@ from icrl4aht_data.commands.options import (
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.new_file import check_new_file, check_new_files
 from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from icrl4aht_baselines.report.overlap import overlap_marks
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.installation import install_command, restore_command
+from icrl4aht_data.utils.install_hints import RESTORE, install_command
 
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
@@ -50,7 +50,7 @@ def render(name: str, values: dict[str, Any]) -> str:
         where = [frame for frame in frames if Path(frame.filename).parent == _TEMPLATES][-1]
         raise OptionError(
             f"{where.filename}, line {where.lineno}: {error.message}, expected a value of the page; restore the "
-            f"templates: `{restore_command('baselines')}`"
+            f"templates: `{RESTORE}`"
         ) from error
 
 
@@ -60,11 +60,10 @@ def _load(environment: Environment, name: str) -> Template:
     try:
         return environment.get_template(name)
     except TemplateNotFound as error:
-        raise OptionError(f"{_TEMPLATES / name}: missing; restore it: `{restore_command('baselines')}`") from error
+        raise OptionError(f"{_TEMPLATES / name}: missing; restore it: `{RESTORE}`") from error
     except TemplateSyntaxError as error:
         raise OptionError(
-            f"{error.filename}, line {error.lineno}: {error.message}; restore the template: "
-            f"`{restore_command('baselines')}`"
+            f"{error.filename}, line {error.lineno}: {error.message}; restore the template: `{RESTORE}`"
         ) from error
 
 
@@ -77,7 +76,7 @@ def _environment() -> Environment:
     try:
         loader = PackageLoader("icrl4aht_baselines.report")
     except ValueError as error:
-        raise OptionError(f"{_TEMPLATES}: missing; restore it: `{restore_command('baselines')}`") from error
+        raise OptionError(f"{_TEMPLATES}: missing; restore it: `{RESTORE}`") from error
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 
 _FLUSH_SECONDS = 10
 

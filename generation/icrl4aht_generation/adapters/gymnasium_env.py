@@ -21,7 +21,7 @@ from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_sh
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.render import draw_frame
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_generation.adapters.arguments import check_action, check_integers, check_record
 from icrl4aht_generation.env import Environment, EnvState

@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_sh
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.state import unpack
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_generation.env import Environment, EnvState

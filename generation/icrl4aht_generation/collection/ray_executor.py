@@ -14,7 +14,7 @@ from typing import Any
 from rich.text import Text
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_generation.collection.board import TaskBoard
 from icrl4aht_generation.collection.job import CollectionJob, TaskOutcome
 from icrl4aht_generation.collection.options import CollectOptions, request_determinism

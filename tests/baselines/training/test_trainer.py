@@ -42,7 +42,7 @@ from tensorboardX.proto.event_pb2 import Event  # type: ignore[attr-defined]
 from icrl4aht_data import dataset as dataset_module
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.random_releases import random_release
 from tests.helpers.small_models import FLAT, TINY, ad_batch, random_parameters
 from tests.helpers.tiny import start

@@ -20,7 +20,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.environments import TASK_ENVIRONMENT, make_environment
 from icrl4aht_data.errors import NotStoredError, OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.paths import ROOT
 
 NAME = "icrl4aht/demo_wide-H4-t0-v0"

@@ -14,7 +14,7 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import COOKED, INDICATOR, LAYOUTS, PLATE
 from icrl4aht_data.overcooked.render import draw_frame, save_episode, save_frame
 from icrl4aht_data.overcooked.state import columns
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.states import random_records, state_record
 
 CELL = 32

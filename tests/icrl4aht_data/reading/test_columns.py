@@ -20,7 +20,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.provenance import ExpertLabels
 from icrl4aht_data.format.schema import ENTRY_HINTS
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.random_releases import random_release
 
 

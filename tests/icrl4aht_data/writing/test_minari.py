@@ -16,7 +16,7 @@ from icrl4aht_data.commands.cli import main
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.environments import TASK_ENVIRONMENT
 from icrl4aht_data.errors import NotStoredError, OptionError
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.writing.minari import to_minari
 
 EPISODES, STEPS = 6, 20

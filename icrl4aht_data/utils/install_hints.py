@@ -1,0 +1,33 @@
+"""How to install what is missing. pip adds an extra to the installed copy, wherever that came from."""
+
+from __future__ import annotations
+
+PACKAGE = "icrl4aht-data"
+"""Name of the distribution, which has the packages icrl4aht_data, icrl4aht_generation and icrl4aht_baselines."""
+
+EXTRAS = {
+    **dict.fromkeys(("jax", "flax", "optax", "jaxtyping", "safetensors", "jinja2"), "baselines"),
+    **dict.fromkeys(("matplotlib", "pillow"), "plot"),
+    **dict.fromkeys(("datasets", "pyarrow", "mlcroissant"), "hf"),
+    **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari")},
+    "tensorboardx": "tensorboard",
+    "s3fs": "s3",
+    "ray": "cluster",
+    "gymnasium": "gym",
+}
+"""Optional package -> the extra that installs it."""
+
+RESTORE = f"pip install --force-reinstall --no-deps {PACKAGE}, or in a checkout git checkout ."
+"""How to restore files of this package."""
+
+
+def install_command(*extras: str) -> str:
+    """Return the shell command that installs extras, such as "plot"."""
+    return f"pip install '{PACKAGE}[{','.join(extras)}]'"
+
+
+def missing_library(module: str) -> str | None:
+    """Return a message that says how to install a missing module of another library; None if no extra has it."""
+    top = module.partition(".")[0]
+    extra = EXTRAS.get({"PIL": "pillow"}.get(top, top.lower()))
+    return f"this needs {top}, which is not installed: {install_command(extra)}" if extra else None
