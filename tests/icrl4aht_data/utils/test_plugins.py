@@ -99,7 +99,7 @@ def test_processes_know_it(rooms, tmp_path):
     with installed(rooms):
         random_release(tmp_path / "release", layouts=("plain_room", "demo_wide"))
     code = "from icrl4aht_data.commands.cli import main; main()"
-    path = os.pathsep.join(map(str, (rooms, ROOT)))
+    path = os.pathsep.join(map(str, (rooms, ROOT, ROOT / "generation", ROOT / "baselines")))
     command = ["list", str(tmp_path / "release"), "--json", "--layout", "plain_room"]
     done = subprocess.run(
         [sys.executable, "-c", code, *command],
