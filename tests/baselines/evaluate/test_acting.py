@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -145,7 +144,6 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
         result = CliRunner().invoke(cli, [*arguments, *small], catch_exceptions=False)
         assert result.exit_code == 0, result.output
         assert "1 step in" in result.output
-        assert re.search(r"ad, loss \d\.\d+: 1 of 1 step after", result.output)  # no terminal: plain lines
         again = CliRunner().invoke(cli, [*arguments, *small, "--ta"])
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["model"].items() >= {"layers": 1, "width": 16, "heads": 2, "encoder": "words"}.items()
