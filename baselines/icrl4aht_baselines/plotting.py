@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from icrl4aht_data.benchmark.reference_returns import Cell
 from icrl4aht_data.plotting import MOST_PANELS, legend_below, new_figure, return_limits, running_mean, save_figure
 
 LogCurves = dict[str, dict[str, dict[int, list[float]]]]
@@ -55,7 +54,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
 
 
 def _log_curves(lines: Sequence[Mapping[str, Any]], by_layout: bool) -> LogCurves:
-    """Returns the curves of a log, with a panel of returns for each layout, or one for all."""
+    """Return the curves of a log, with a panel of returns for each layout, or one for all."""
     found: LogCurves = {}
     for line in lines:
         for name in (name for name in line if name not in ("step", "part")):
@@ -91,7 +90,7 @@ SMOOTHING = 10
 
 
 def smooth_returns(returns: Float[np.ndarray, " E"]) -> Float[np.ndarray, " E"]:
-    """Returns the running mean of a task's returns over up to `SMOOTHING` episodes."""
+    """Return the running mean of a task's returns over up to `SMOOTHING` episodes."""
     return running_mean(returns, min(SMOOTHING, len(returns) // 10))
 
 
@@ -100,10 +99,9 @@ _REFERENCE_LINES = {"oracle": ("#2c8a4b", "--"), "random": ("#b0653a", ":"), "st
 
 
 def plot_return_curves(
-    runs: Sequence[tuple[str, Mapping[Cell, np.ndarray]]],
-    cells: Sequence[Cell],
+    panels: Mapping[str, Mapping[str, np.ndarray]],
     path: Path,
-    references: Mapping[Cell, Mapping[str, float]] = MappingProxyType({}),
+    references: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
 ) -> None:
     """Plot the return per episode on shared axes: a panel per cell, a line per run.
 
@@ -111,39 +109,38 @@ def plot_return_curves(
     thin lines the mean of each single episode.
 
     Args:
-        runs: (label, cell -> returns (instances, episodes)).
-        cells: the cells to draw, at most `MOST_PANELS`.
+        panels: title of a cell -> label of a run -> returns (instances, episodes); at most `MOST_PANELS`.
         path: file to write, of a type in `icrl4aht_data.plotting.PICTURES`.
-        references: cell -> reference ego, stay, random or oracle -> its mean return, drawn as a level line.
+        references: title -> reference ego, stay, random or oracle -> its mean return, drawn as a level line.
     """
-    columns = min(4, len(cells))
-    rows = -(-len(cells) // columns)
+    columns = min(4, len(panels))
+    rows = -(-len(panels) // columns)
     figure = new_figure(2.7 * columns + 0.5, 1.9 * rows + 0.7)
-    panels: list[Any] = [*figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat]
+    grid: list[Any] = [*figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat]
+    labels = list(dict.fromkeys(label for runs in panels.values() for label in runs))
     limits = []
-    for axes, cell in zip(panels, cells, strict=False):
-        for number, (label, returns) in enumerate(runs):
-            if cell in returns:
-                limits += _plot_curve(axes, label, f"C{number}", returns[cell])
-        for name, level in references.get(cell, {}).items():
+    for axes, (title, runs) in zip(grid, panels.items(), strict=False):
+        for label, returns in runs.items():
+            limits += _plot_curve(axes, label, f"C{labels.index(label)}", returns)
+        for name, level in references.get(title, {}).items():
             colour, dashes = _REFERENCE_LINES[name]
             axes.axhline(level, color=colour, linestyle=dashes, linewidth=1.1, label=name)
             limits.append(level)
-        axes.set_title(f"{cell[0]}, {cell[1]}", fontsize=9)
+        axes.set_title(title, fontsize=9)
         axes.grid(alpha=0.3)
-    for axes in panels[len(cells) :]:
+    for axes in grid[len(panels) :]:
         axes.set_axis_off()
-    panels[0].set_ylim(*return_limits(limits))
-    for axes in panels[-columns:]:
+    grid[0].set_ylim(*return_limits(limits))
+    for axes in grid[-columns:]:
         axes.set_xlabel("episode", fontsize=9)
-    for axes in panels[::columns]:
+    for axes in grid[::columns]:
         axes.set_ylabel("return", fontsize=9)
     legend_below(figure)
     save_figure(figure, path)
 
 
 def _plot_curve(axes: Any, label: str, color: str, returns: np.ndarray) -> list[float]:
-    """Plots the curve of a run in a cell. Returns the lowest and the highest return drawn."""
+    """Plot the curve of a run in a cell. Return the lowest and the highest return drawn."""
     curves = np.stack([smooth_returns(row) for row in returns])
     low, high, raw = curves.min(axis=0), curves.max(axis=0), returns.mean(axis=0)
     episodes = np.arange(1, returns.shape[1] + 1)

@@ -1,355 +1,400 @@
-"""The page docs/results.md, which compares reference models with the reference egos and the paper's numbers.
-
-It is computed from the stored results, the returns of the reference egos and the paper's numbers.
+"""Stored results of reference models, `cards/results.json`, and docs/results.md, which compares them.
 
 Shapes: U tasks, S seeds with which each was played.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+import pandas as pd
 
 from icrl4aht_baselines.agents.egos import FORGETS
-from icrl4aht_baselines.report.intervals import MeanInterval, bootstrap_interval, mean_of_cells
-from icrl4aht_baselines.report.overlap import OVERLAPS
 from icrl4aht_baselines.report.results import (
-    cell_order,
-    family_of,
-    group_of,
-    normalise,
+    AGENT_COLUMNS,
+    BLOCKS,
+    CELL_COLUMNS,
+    ENDS,
+    ResultCell,
+    cell_rows,
+    episode_blocks,
     published_cells,
+    published_instances,
+    read_run,
+    results_table,
 )
-from icrl4aht_baselines.report.stored_results import UNSEEN, CellReturns, StoredResults
-from icrl4aht_baselines.training.ablations import ABLATIONS
-from icrl4aht_data.benchmark.facts import FAMILIES, TRACKS
-from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom, read_headroom
-from icrl4aht_data.errors import OptionError
+from icrl4aht_baselines.report.scores import AVERAGE, PAPER_METHODS, cell_headroom, normalise, open_cells
+from icrl4aht_baselines.report.statistics import mean_interval
+from icrl4aht_baselines.training.seen import (
+    OVERLAPS,
+    overlap_marks,
+)
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES
+from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.plotting import new_figure, save_figure
-from icrl4aht_data.utils.templates import fill_template, markdown_table
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
+from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.utils.text import counted_noun
 
 RESULTS_BEGINS: dict[str, bytes | None] = {"results.md": b"# Results: reference models\n", "results.png": None}
 """Files of the page -> their first bytes, by which they are recognised before they are replaced."""
 
-MOST_DRAWN = 5
-"""Most agents in the figure: more have bars that are too thin to tell apart."""
+AgentCells = dict[ResultCell, dict[str, Any]]
+"""Cell -> "overlaps", block or "gain" (last minus first) -> names of overlaps, or returns, float64 (U, S)."""
 
-_PAPER = ("AD", "DPT")
-
-
-def cells_with_headroom(protocol: str) -> list[Cell]:
-    """Returns the test cells with headroom under a protocol, in the paper's order."""
-    return sorted((cell for cell, egos in read_headroom(protocol).items() if has_headroom(egos)), key=cell_order)
+UNSEEN = "unseen"
+"""Protocol name of results on rearranged layouts, see `icrl4aht_baselines.online.unseen`; a task for each version."""
 
 
-def normalised_interval(cells: Mapping[Cell, CellReturns], protocol: str, chosen: Sequence[Cell]) -> MeanInterval:
-    """Returns the mean normalised return of some cells with headroom and its 95 % interval.
+@dataclass(frozen=True)
+class StoredResults:
+    """Results of several agents, `cards/results.json`.
 
-    The interval is a bootstrap over the tasks, and over the seeds of each, within each cell; cells are not resampled.
+    Attributes:
+        table: the results, see the module's docstring. Entries of ablations are stored like agents, with the
+            experiment's name instead of a protocol; results on unseen layouts with `UNSEEN`.
+        about: agent -> one sentence on how it was made; agents are shown in this order.
+        ablations: ablation -> entry -> what differs.
+        commits: agent or ablation -> commit of this repository whose code made it, if later code cannot.
     """
-    headroom = read_headroom(protocol)
-    return mean_of_cells([normalise(cells[cell].mean, headroom[cell]) for cell in chosen])
+
+    table: pd.DataFrame
+    about: dict[str, str] = field(default_factory=dict)
+    ablations: dict[str, dict[str, str]] = field(default_factory=dict)
+    commits: dict[str, str] = field(default_factory=dict)
+
+    def protocol(self, name: str) -> dict[str, AgentCells]:
+        """Return the results under a protocol by agent, in the order of `about`."""
+        of_protocol = self.table[self.table["protocol"] == name]
+        order = [*self.about, *(agent for agent in of_protocol["agent"].unique() if agent not in self.about)]
+        agents = dict(iter(of_protocol.groupby("agent", sort=False)))
+        return {agent: agent_cells(agents[agent]) for agent in order if agent in agents}
 
 
-def rising_cells(cells: Mapping[Cell, CellReturns], protocol: str) -> list[Cell]:
-    """Returns the cells with headroom whose gain is positive with its 95 % interval above 0."""
-    chosen = [cell for cell in cells_with_headroom(protocol) if cell in cells]
-    return [cell for cell in chosen if gain_interval(cells[cell])[0] > 0]
+def agent_cells(table: pd.DataFrame) -> AgentCells:
+    """Return one agent's results under one protocol, cells in order."""
+    found: AgentCells = defaultdict(dict)
+    for (*cell, block), rows in table.groupby([*CELL_COLUMNS, "block"], sort=False):
+        tasks = rows["task"].nunique()
+        found[ResultCell(*map(str, cell))][str(block)] = rows["return"].to_numpy().reshape(tasks, -1)
+        found[ResultCell(*map(str, cell))]["overlaps"] = tuple(rows["overlap"].iloc[0].split())
+    for blocks in found.values():
+        blocks["gain"] = blocks["last"] - blocks["first"]
+    return {cell: found[cell] for cell in sorted(found, key=lambda cell: cell.order)}
 
 
-def gain_interval(found: CellReturns) -> tuple[float, float]:
-    """Returns the 95 % bootstrap interval of the mean gain in a cell, over the tasks and the seeds of each."""
-    return bootstrap_interval(found.gain, np.random.default_rng(0))
+def results_file() -> Path:
+    """Return the path of the stored results."""
+    return card_file("published.json").with_name("results.json")
 
 
-def summary_table(stored: StoredResults, protocol: str) -> str:
-    """Returns a table with a row for each agent: normalised return by track, cells that rise, seeds of a task.
+def read_stored(path: Path) -> StoredResults:
+    """Return stored results; none if there is no file.
 
-    A normalised return is left out if the agent has not played all cells of the track that have headroom.
+    Raises:
+        OptionError: if the file is damaged.
     """
-    headroom = cells_with_headroom(protocol)
-    groups = {track: [cell for cell in headroom if cell[0] in facts["test"]] for track, facts in TRACKS.items()}
-    groups["both"] = headroom
+    if not path.is_file():
+        return StoredResults(results_table([]))
     rows = []
-    for agent in stored.agents(protocol):
-        cells = stored.cells[agent, protocol]
-        played = [cell for cell in headroom if cell in cells]
-        seeds = sorted({cells[cell].mean.shape[1] for cell in played})
-        rows.append(
-            [
-                _code(agent) + _marks(one for found in cells.values() for one in found.overlaps),
-                *(_score_text(cells, protocol, chosen) for chosen in groups.values()),
-                f"{len(rising_cells(cells, protocol))} of {len(played)}",
-                _opening_text(cells, protocol),
-                ", ".join(layouts_above_paper(cells)) or "none",
-                " or ".join(map(str, seeds)),
-            ]
-        )
-    scores = [f"{track} ({counted_noun(len(chosen), 'cell')})" for track, chosen in groups.items()]
-    header = ["agent", *scores, "rising", "first episode to last 20", "layouts above the paper's AD and DPT", "seeds"]
-    return markdown_table(header, rows)
+    try:
+        content = parse_json(read_text(path))
+        for agent, protocols in content["agents"].items():
+            for protocol, layouts in protocols.items():
+                for layout, groups in layouts.items():
+                    for group, stored in groups.items():
+                        family, _, kind = group.removesuffix(")").partition(" (")
+                        cell = ResultCell(layout, family, kind or "test")
+                        blocks = {name: np.array(stored[name], np.float64) for name in BLOCKS}
+                        if any(values.ndim != 2 for values in blocks.values()):
+                            raise ValueError(f"{agent}, {group} on {layout}: expected a list for each task")
+                        rows += cell_rows((agent, protocol), cell, blocks, stored["overlaps"])
+        texts = [dict(content.get(name, {})) for name in ("ablations", "commits")]
+        return StoredResults(results_table(rows), dict(content["about"]), *texts)
+    except (IndexFormatError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise OptionError(f"{path}: not stored results: {error!r}; restore the file") from error
 
 
-def _score_text(cells: Mapping[Cell, CellReturns], protocol: str, chosen: Sequence[Cell]) -> str:
-    """Returns the normalised return of some cells with its interval as text; empty if one was not played."""
-    if not all(cell in cells for cell in chosen):
-        return ""
-    mean, low, high = normalised_interval(cells, protocol, chosen)
-    return f"{mean:z.2f} ({low:z.2f} to {high:z.2f})"
+def write_stored(path: Path, stored: StoredResults) -> None:
+    """Write stored results, rounded to three digits."""
+    agents: dict[str, Any] = defaultdict(dict)
+    for (agent, protocol), table in stored.table.groupby(AGENT_COLUMNS, sort=False):
+        layouts: dict[str, Any] = defaultdict(dict)
+        for cell, blocks in agent_cells(table).items():
+            numbers = {name: np.round(blocks[name], 3).tolist() for name in BLOCKS}
+            layouts[cell.layout][cell.group] = numbers | {"overlaps": blocks["overlaps"]}
+        agents[str(agent)][protocol] = layouts
+    content = {"about": stored.about, "ablations": stored.ablations, "commits": stored.commits, "agents": agents}
+    with atomic_write(path) as partial:
+        text = json.dumps(content, separators=(",", ":"))
+        partial.write_text(text.replace('"mean"', '\n"mean"') + "\n", encoding="utf-8")
 
 
-def _opening_text(cells: Mapping[Cell, CellReturns], protocol: str) -> str:
-    """Returns the mean return of the first episode and of the last ones over the cells with headroom, and the 95 %
-    interval of their difference, as text."""
-    chosen = [cells[cell] for cell in cells_with_headroom(protocol) if cell in cells]
-    if not chosen:
-        return ""
-    opening, last = (np.mean([getattr(found, name).mean() for found in chosen]) for name in ("opening", "last"))
-    mean, low, high = mean_of_cells([found.last - found.opening for found in chosen])
-    return f"{opening:z.1f} to {last:z.1f}, {mean:+z.1f} ({low:+z.1f} to {high:+z.1f})"
-
-
-def layouts_above_paper(cells: Mapping[Cell, CellReturns]) -> list[str]:
-    """Returns the layouts with headroom where an agent's mean over the families exceeds both published methods."""
-    above = []
-    for layout in dict.fromkeys(layout for layout, _ in cells_with_headroom("published")):
-        own = [cells[layout, family].mean.mean() for family in FAMILIES[1:] if (layout, family) in cells]
-        paper = [published_cells(name)[layout]["Average"][0] for name in _PAPER]
-        if len(own) == len(FAMILIES) - 1 and np.mean(own) > max(paper):
-            above.append(layout)
-    return above
-
-
-def cells_table(stored: StoredResults, protocol: str, track: str, agents: Sequence[str]) -> str:
-    """Returns a table with a row for each cell of a track with headroom, and a column for each agent that played one.
-
-    The columns of the paper's methods have its numbers, which are of protocol `published`.
-    """
-    headroom = read_headroom(protocol)
-    chosen = [cell for cell in cells_with_headroom(protocol) if cell[0] in TRACKS[track]["test"]]
-    agents = [one for one in agents if any(cell in stored.cells.get((one, protocol), {}) for cell in chosen)]
-    rows = []
-    for cell in chosen:
-        egos = [f"{headroom[cell][name]:z.1f}" for name in ("stay", "random")]
-        published = [f"{published_cells(name)[cell[0]][cell[1]][0]:z.1f}" for name in _PAPER]
-        own = [_cell_text(stored.cells[agent, protocol].get(cell)) for agent in agents]
-        rows.append([*cell, *egos, *published, *own, f"{headroom[cell]['oracle']:z.1f}"])
-    paper = [f"{name} (paper)" for name in _PAPER]
-    header = ["layout", "family", "stay", "random", *paper, *map(_code, agents), "oracle"]
-    return markdown_table(header, rows, right=len(header) - 2)
-
-
-def validation_table(stored: StoredResults, agents: Sequence[str], group: str) -> str:
-    """Returns a table of mean returns with validation teammates, by which models are chosen.
+def add_results(stored: StoredResults, folder: Path, about: str) -> StoredResults:
+    """Return stored results with those of a folder that `evaluate` made; equal cells are replaced.
 
     Args:
-        stored: the results.
-        agents: the agents of the columns.
-        group: "validation" for teammates of the published training ranges, or "diverse".
+        stored: the results so far.
+        folder: the folder.
+        about: one sentence on how the agent was made; empty to keep the stored one.
+
+    Raises:
+        OptionError: if the folder has no results, or mixed ones, if a task was played for fewer than 2 x `ENDS`
+            episodes or a published one is missing, or if nothing says how a new agent was made.
     """
-    found = {agent: stored.cells.get((agent, "seeded"), {}) for agent in agents}
-    cells = {cell for of_agent in found.values() for cell in of_agent if group_of(cell) == group}
-    rows = [
-        [cell[0], family_of(cell), *(_cell_text(found[agent].get(cell)) for agent in agents)]
-        for cell in sorted(cells, key=cell_order)
-    ]
-    return markdown_table(["layout", "family", *map(_code, agents)], rows, right=len(agents))
+    run = read_run(folder)
+    for cell, returns in run.cells.items():
+        if returns.shape[1] < 2 * ENDS:
+            raise OptionError(f"{folder}: {returns.shape[1]} episodes, expected at least {2 * ENDS}; evaluate more")
+        if cell.kind == "test" and not run.is_complete(cell):
+            raise OptionError(
+                f"{folder}: {len(returns)} of the {published_instances(cell)} published tasks of {cell.layout} "
+                f"{cell.family}; evaluate all of them"
+            )
+    about = about or stored.about.get(run.agent, "")
+    if not about:
+        raise OptionError(f"{folder}: results of {run.agent}, a new agent: say how it was made by --about")
+    return _replace_rows(replace(stored, about=stored.about | {run.agent: about}), run.table)
 
 
-def gains_table(stored: StoredResults, protocol: str, agents: Sequence[str]) -> str:
-    """Returns a table of the first and the last episodes of each cell with headroom, and the interval of the gain."""
+def add_unseen(stored: StoredResults, returns: Mapping[str, Mapping[tuple[str, str], np.ndarray]]) -> StoredResults:
+    """Return stored results with those on unseen layouts, (versions, episodes); equal cells are replaced."""
     rows = []
-    for cell in cells_with_headroom(protocol):
-        row = [*cell]
-        for agent in agents:
-            found = stored.cells.get((agent, protocol), {}).get(cell)
-            if found is None:
-                row.append("")
-                continue
-            low, high = gain_interval(found)
-            ends = f"{found.first.mean():z.1f} to {found.last.mean():z.1f}"
-            text = f"{ends}, {found.gain.mean():+.1f} ({low:+.1f}, {high:+.1f}){_marks(found.overlaps)}"
-            row.append(f"**{text}**" if low > 0 else text)
-        rows.append(row)
-    return markdown_table(["layout", "family", *map(_code, agents)], rows)
+    for agent, cells in returns.items():
+        for cell, values in cells.items():
+            rows += cell_rows((agent, UNSEEN), ResultCell(*cell), episode_blocks(values[:, None]))
+    return _replace_rows(stored, results_table(rows))
 
 
-def ablation_table(stored: StoredResults, name: str) -> str:
-    """Returns a table with a row for each entry of an ablation.
-
-    Returns, their differences to the first entry, and gains are means over tasks and seeds, with 95 % bootstrap
-    intervals.
-    """
-    rows = []
-    first: Float[np.ndarray, "U S"] | None = None
-    for entry in ABLATIONS[name].entries:
-        cells = stored.cells.get((entry.name, name))
-        if cells is None:
-            continue
-        mean = np.concatenate([cells[cell].mean for cell in sorted(cells, key=cell_order)])
-        gain = np.concatenate([cells[cell].gain for cell in sorted(cells, key=cell_order)])
-        first = mean if first is None else first
-        comparable = entry is not ABLATIONS[name].entries[0] and mean.shape == first.shape
-        difference = _with_interval(mean - first, "+") if comparable else ""
-        rows.append([_code(entry.name), entry.about, _with_interval(mean), difference, _with_interval(gain, "+")])
-    if not rows:
-        return ""
-    return markdown_table(["entry", "difference", "mean return", "to the first", "last 20 - first 20"], rows)
-
-
-def unseen_table(stored: StoredResults) -> str:
-    """Returns a table with a row for each agent that played on unseen layouts, and a column for each layout's versions.
-
-    Returns are means over versions and families; normalised ones (return - `stay`) / (`oracle` - `stay`), mean over
-    layouts. Intervals are over the versions. Without `stay` and `oracle` there are no normalised ones.
-    """
-    found = {agent: stored.cells[agent, UNSEEN] for agent in stored.agents(UNSEEN)}
-    layouts = sorted({layout for cells in found.values() for layout, _ in cells})
-    versions = {  # agent -> layout -> (V,)
-        agent: {
-            layout: np.mean([cells[cell].mean.mean(axis=1) for cell in cells if cell[0] == layout], axis=0)
-            for layout in layouts
-            if layout in {name for name, _ in cells}
-        }
-        for agent, cells in found.items()
-    }
-    rows = []
-    for agent, own in versions.items():
-        texts = [_with_interval(own[layout][:, None]) if layout in own else "" for layout in layouts]
-        rows.append([_code(agent), *texts, _unseen_score(versions, agent, layouts)])
-    return markdown_table(["agent", *layouts, "normalised"], rows)
-
-
-def _unseen_score(versions: Mapping[str, Mapping[str, np.ndarray]], agent: str, layouts: Sequence[str]) -> str:
-    """Returns the normalised return of an agent on the versions of all layouts as text; empty if it has none."""
-    egos = [versions.get(name, {}) for name in ("stay", agent, "oracle")]
-    if agent in REFERENCES or not all(layout in ego for ego in egos for layout in layouts):
-        return ""
-    cells = []
-    for layout in layouts:
-        stay, own, oracle = (ego[layout] for ego in egos)
-        cells.append((own - stay) / (oracle.mean() - stay.mean()))
-    mean, low, high = mean_of_cells(cells)
-    return f"{mean:z.2f} ({low:z.2f} to {high:z.2f})"
-
-
-def _with_interval(values: Float[np.ndarray, "U S"], sign: str = "") -> str:
-    low, high = bootstrap_interval(values, np.random.default_rng(0))
-    return f"{values.mean():{sign}z.1f} ({low:{sign}z.1f} to {high:{sign}z.1f})"
-
-
-def _code(name: str) -> str:
-    return f"`{name}`"
-
-
-def _cell_text(found: CellReturns | None) -> str:
-    if found is None:
-        return ""
-    return f"{found.mean.mean():z.1f}{_marks(found.overlaps)}"
-
-
-def _marks(overlaps: Iterable[str]) -> str:
-    """Returns the marks of overlaps, each once, in the order of their legend."""
-    found = set(overlaps)
-    return "".join(kind.mark for name, kind in OVERLAPS.items() if name in found)
-
-
-def plot_comparison(stored: StoredResults, protocol: str, agents: Sequence[str], path: Path) -> None:
-    """Plot mean returns in the cells with headroom: of agents as bars, of reference egos and the paper as marks."""
-    headroom, chosen = read_headroom(protocol), cells_with_headroom(protocol)
-    figure = new_figure(11, 4.2)
-    axes, numbers = figure.subplots(), np.arange(len(chosen))
-    width = 0.8 / max(1, len(agents))
-    for number, agent in enumerate(agents):
-        cells = stored.cells.get((agent, protocol), {})
-        heights = [cells[cell].mean.mean() if cell in cells else np.nan for cell in chosen]
-        axes.bar(numbers - 0.4 + (number + 0.5) * width, heights, width, label=agent)
-    for name, style in (("oracle", "k_"), ("stay", "rx"), ("random", "g+")):
-        axes.plot(numbers, [headroom[cell][name] for cell in chosen], style, markersize=9, label=name)
-    for name, style in zip(_PAPER, ("ms", "cD"), strict=True):
-        returns = [published_cells(name)[layout][family][0] for layout, family in chosen]
-        axes.plot(numbers, returns, style, markersize=4, fillstyle="none", label=f"{name} (paper)")
-    axes.set_xticks(numbers, [f"{layout}\n{family}" for layout, family in chosen], rotation=60, fontsize=8)
-    axes.set_ylabel("mean return of an episode")
-    axes.axhline(0, color="gray", linewidth=0.6)
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, ncols=6, fontsize=8, loc="outside lower center", frameon=False)
-    axes.set_title(f"Test tasks with headroom, protocol {protocol}; the paper's numbers are of published", fontsize=10)
-    save_figure(figure, path)
-
-
-def render_page(stored: StoredResults, agents: Sequence[str]) -> str:
-    """Returns docs/results.md.
-
-    Args:
-        stored: the results.
-        agents: the agents of the tables of cells, in their order.
-    """
-    rising = [agent for agent in agents if not agent.endswith(FORGETS)]
-    cleared = {one: f"`{one.removesuffix(FORGETS)}`, its memory cleared at the start of each episode" for one in agents}
-    texts = stored.about | {one: text for one, text in cleared.items() if one.endswith(FORGETS)}
-    about = "\n".join(f"* `{agent}`: {text}" for agent, text in texts.items())
-    return fill_template(
-        "results.md",
-        about=about,
-        summary=summary_table(stored, "seeded"),
-        teammate=cells_table(stored, "seeded", "teammate", rising),
-        layout=cells_table(stored, "seeded", "layout", rising),
-        published_teammate=cells_table(stored, "published", "teammate", rising),
-        published_layout=cells_table(stored, "published", "layout", rising),
-        published_summary=summary_table(stored, "published"),
-        gains=gains_table(stored, "seeded", agents),
-        validation=validation_table(stored, rising, "validation"),
-        diverse=validation_table(stored, rising, "diverse"),
-        windows=ablation_table(stored, "ablate windows"),
-        contexts=ablation_table(stored, "ablate contexts"),
-        unseen=unseen_table(stored),
-        marks="\n".join(f"* {kind.mark}: {kind.meaning}" for kind in OVERLAPS.values()),
-        references=", ".join(map(_code, REFERENCES)),
-        forgets=f"`NAME{FORGETS}`",
-        drawn=str(MOST_DRAWN),
-        cells=str(len(cells_with_headroom("seeded"))),
-    )
+def _replace_rows(stored: StoredResults, table: pd.DataFrame) -> StoredResults:
+    keys = [*AGENT_COLUMNS, *CELL_COLUMNS]
+    known = pd.MultiIndex.from_frame(stored.table[keys]).isin(pd.MultiIndex.from_frame(table[keys]))
+    parts = [part for part in (stored.table[~known], table) if len(part)]
+    return replace(stored, table=pd.concat(parts, ignore_index=True))
 
 
 def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
-    """Write the page and its figure into a folder. Returns their paths.
+    """Write docs/results.md and its figure into a folder. Return their paths.
 
     Raises:
         OptionError: if there are no results.
     """
-    agents = shown_agents(stored)
-    if not agents:
+    if not len(stored.table):
         raise OptionError("no stored results: give folders that `icrl4aht-data evaluate` made")
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in RESULTS_BEGINS]
-    paths[0].write_text(render_page(stored, agents), encoding="utf-8")
-    plot_comparison(stored, "seeded", drawn_agents(stored), paths[1])
+    paths[0].write_text(render_comparison(stored), encoding="utf-8")
+    plot_comparison(stored, "seeded", paths[1])
     return paths
 
 
-def drawn_agents(stored: StoredResults) -> list[str]:
-    """Returns the agents of the figure, in the order in which they were stored.
-
-    They are the `MOST_DRAWN` with the highest normalised return of those with all cells, none of which they have met
-    the teammates of.
-    """
-    chosen = cells_with_headroom("seeded")
-    scores = {
-        agent: normalised_interval(stored.cells[agent, "seeded"], "seeded", chosen)[0]
-        for agent in stored.agents("seeded")
-        if not agent.endswith(FORGETS)
-        and all(cell in stored.cells[agent, "seeded"] for cell in chosen)
-        and all(one == "family" for cell in chosen for one in stored.cells[agent, "seeded"][cell].overlaps)
+def render_comparison(stored: StoredResults) -> str:
+    """Return docs/results.md. Tables of single cells leave out agents that the present code does not make."""
+    seeded, published = (stored.protocol(name) for name in ("seeded", "published"))
+    shown = [agent for agent in stored.about if agent not in stored.commits and not agent.endswith(FORGETS)]
+    texts = {
+        agent: f"{about} (made by commit {stored.commits[agent]})" if agent in stored.commits else about
+        for agent, about in stored.about.items()
     }
-    best = sorted(scores, key=scores.__getitem__, reverse=True)[:MOST_DRAWN]
-    return [agent for agent in scores if agent in best]
+    return fill_template(
+        "results.md",
+        about="\n".join(f"* `{agent}`: {text}" for agent, text in texts.items()),
+        summary=summary_table(seeded, "seeded"),
+        teammate=cells_table(seeded, "seeded", "teammate", shown),
+        layout=cells_table(seeded, "seeded", "layout", shown),
+        published_teammate=cells_table(published, "published", "teammate", shown),
+        published_layout=cells_table(published, "published", "layout", shown),
+        published_summary=summary_table(published, "published"),
+        gains=gains_table(seeded, "seeded", [agent for agent in stored.about if agent not in stored.commits]),
+        validation=validation_table(seeded, shown, "validation"),
+        diverse=validation_table(seeded, shown, "diverse"),
+        windows=ablation_table(stored, "ablate windows"),
+        contexts=ablation_table(stored, "ablate contexts"),
+        unseen=unseen_table(stored),
+        marks="\n".join(f"* {kind.mark}: {kind.meaning}" for kind in OVERLAPS.values()),
+        references=", ".join(f"`{name}`" for name in REFERENCES),
+        forgets=f"`NAME{FORGETS}`",
+        cells=str(len(open_cells("seeded"))),
+    )
 
 
-def shown_agents(stored: StoredResults) -> list[str]:
-    """Returns the agents that have results, in the order in which they were stored."""
-    return list(dict.fromkeys(agent for agent, protocol in stored.cells if protocol not in (*ABLATIONS, UNSEEN)))
+def summary_table(results: Mapping[str, AgentCells], protocol: str) -> str:
+    """Return a table with a row for each agent: normalised return by track, cells that rise, seeds of a task.
+
+    A normalised return is left out if the agent has not played all cells of the track that have headroom.
+    """
+    headroom, chosen = cell_headroom(protocol), open_cells(protocol)
+    groups = {track: [cell for cell in chosen if cell.layout in TRACKS[track]["test"]] for track in TRACKS}
+    groups["both"] = chosen
+    body = []
+    for agent, cells in results.items():
+        played = [cell for cell in chosen if cell in cells]
+        scores = {cell: normalise(cells[cell]["mean"], headroom[cell]) for cell in played}
+        rising = [cell for cell in played if mean_interval(cells[cell]["gain"]).low > 0]
+        opening, last = (np.mean([cells[cell][block].mean() for cell in played]) for block in ("opening", "last"))
+        rise = _with_interval(*(cells[cell]["last"] - cells[cell]["opening"] for cell in played), sign="+")
+        body.append(
+            [
+                f"`{agent}`" + _marks(*cells.values()),
+                *(
+                    _with_interval(*map(scores.__getitem__, of), digits=2) if set(of) <= scores.keys() else ""
+                    for of in groups.values()
+                ),
+                f"{len(rising)} of {len(played)}",
+                f"{opening:z.1f} to {last:z.1f}, {rise}" if played else "",
+                ", ".join(layouts_above_paper(cells)) or "none",
+                " or ".join(map(str, sorted({cells[cell]["mean"].shape[1] for cell in played}))),
+            ]
+        )
+    scored = [f"{track} ({counted_noun(len(of), 'cell')})" for track, of in groups.items()]
+    header = ["agent", *scored, "rising", "first episode to last 20", "layouts above the paper's AD and DPT", "seeds"]
+    return markdown_table(header, body)
+
+
+def layouts_above_paper(cells: AgentCells) -> list[str]:
+    """Return the layouts with headroom where an agent's mean over the families exceeds both published methods."""
+    above = []
+    for layout in dict.fromkeys(cell.layout for cell in open_cells("published")):
+        own = [cells[cell]["mean"].mean() for cell in cells if cell in [ResultCell(layout, one) for one in HEURISTICS]]
+        paper = [published_cells(name)[layout][AVERAGE][0] for name in PAPER_METHODS]
+        above += [layout] if len(own) == len(HEURISTICS) and np.mean(own) > max(paper) else []
+    return above
+
+
+def cells_table(results: Mapping[str, AgentCells], protocol: str, track: str, agents: Sequence[str]) -> str:
+    """Return a table with a row for each cell of a track with headroom, and a column for each agent that played one.
+
+    The columns of the paper's methods have its numbers, which are of protocol `published`.
+    """
+    chosen = [cell for cell in open_cells(protocol) if cell.layout in TRACKS[track]["test"]]
+    agents = [agent for agent in agents if any(cell in results.get(agent, {}) for cell in chosen)]
+    body = []
+    for cell in chosen:
+        egos = cell_headroom(protocol)[cell]
+        published = [f"{published_cells(name)[cell.layout][cell.family][0]:z.1f}" for name in PAPER_METHODS]
+        own = [_cell_text(results[agent], cell) for agent in agents]
+        body.append([*cell[:2], *(f"{egos[name]:z.1f}" for name in ("stay", "random")), *published, *own])
+        body[-1].append(f"{egos['oracle']:z.1f}")
+    paper = [f"{name} (paper)" for name in PAPER_METHODS]
+    header = ["layout", "family", "stay", "random", *paper, *(f"`{agent}`" for agent in agents), "oracle"]
+    return markdown_table(header, body, right=len(header) - 2)
+
+
+def validation_table(results: Mapping[str, AgentCells], agents: Sequence[str], kind: str) -> str:
+    """Return a table of mean returns with validation teammates, by which models are chosen.
+
+    Args:
+        results: agent -> its results.
+        agents: the agents of the columns.
+        kind: "validation" for teammates of the published training ranges, or "diverse".
+    """
+    found = {cell for agent in agents for cell in results.get(agent, {}) if cell.kind == kind}
+    body = [
+        [*cell[:2], *(_cell_text(results.get(agent, {}), cell) for agent in agents)]
+        for cell in sorted(found, key=lambda cell: cell.order)
+    ]
+    return markdown_table(["layout", "family", *(f"`{agent}`" for agent in agents)], body, right=len(agents))
+
+
+def gains_table(results: Mapping[str, AgentCells], protocol: str, agents: Sequence[str]) -> str:
+    """Return a table of the first and the last episodes of each cell with headroom, and the interval of the gain."""
+    body = []
+    for cell in open_cells(protocol):
+        texts = []
+        for found in (results.get(agent, {}).get(cell) for agent in agents):
+            if found is None:
+                texts.append("")
+                continue
+            gain, low, high = mean_interval(found["gain"])
+            ends = f"{found['first'].mean():z.1f} to {found['last'].mean():z.1f}"
+            text = f"{ends}, {gain:+.1f} ({low:+.1f}, {high:+.1f}){_marks(found)}"
+            texts.append(f"**{text}**" if low > 0 else text)
+        body.append([*cell[:2], *texts])
+    return markdown_table(["layout", "family", *(f"`{agent}`" for agent in agents)], body)
+
+
+def ablation_table(stored: StoredResults, name: str) -> str:
+    """Return a table with a row for each stored entry of an ablation.
+
+    Returns, their differences to the first entry, and gains are means over tasks and seeds, with 95 % bootstrap
+    intervals.
+    """
+    results, body = stored.protocol(name), []
+    first: np.ndarray | None = None
+    for entry, about in stored.ablations.get(name, {}).items():
+        cells = results[entry].values()
+        mean, gain = (np.concatenate([blocks[name] for blocks in cells]) for name in ("mean", "gain"))
+        difference = "" if first is None or mean.shape != first.shape else _with_interval(mean - first, sign="+")
+        first = mean if first is None else first
+        body.append([f"`{entry}`", about, _with_interval(mean), difference, _with_interval(gain, sign="+")])
+    return markdown_table(["entry", "difference", "mean return", "to the first", "last 20 - first 20"], body)
+
+
+def unseen_table(stored: StoredResults) -> str:
+    """Return a table with a row for each agent that played on unseen layouts, and a column for each layout's versions.
+
+    Returns are means over versions and families; normalised ones (return - `stay`) / (`oracle` - `stay`), mean over
+    layouts. Intervals are over the versions. Without `stay` and `oracle` there are no normalised ones.
+    """
+    versions: dict[str, dict[str, np.ndarray]] = {}  # agent -> layout -> mean over families (versions,)
+    for agent, cells in stored.protocol(UNSEEN).items():
+        for layout in dict.fromkeys(cell.layout for cell in cells):
+            of_layout = [blocks["mean"].mean(axis=1) for cell, blocks in cells.items() if cell.layout == layout]
+            versions.setdefault(agent, {})[layout] = np.mean(of_layout, axis=0)
+    layouts = sorted({layout for own in versions.values() for layout in own})
+    stay, oracle = (versions.get(name, {}) for name in ("stay", "oracle"))
+    body = []
+    for agent, own in versions.items():
+        score = ""
+        if agent not in REFERENCES and all(layout in ego for ego in (stay, own, oracle) for layout in layouts):
+            scaled = [(own[one] - stay[one]) / (oracle[one].mean() - stay[one].mean()) for one in layouts]
+            score = _with_interval(*scaled, digits=2)
+        texts = [_with_interval(own[one][:, None]) if one in own else "" for one in layouts]
+        body.append([f"`{agent}`", *texts, score])
+    return markdown_table(["agent", *layouts, "normalised"], body)
+
+
+def plot_comparison(stored: StoredResults, protocol: str, path: Path) -> None:
+    """Plot mean returns in the cells with headroom: of agents as bars, of reference egos and the paper as marks."""
+    headroom, chosen = cell_headroom(protocol), open_cells(protocol)
+    results = {
+        agent: cells
+        for agent, cells in stored.protocol(protocol).items()
+        if agent not in stored.commits and not agent.endswith(FORGETS)
+    }
+    figure = new_figure(11, 4.2)
+    axes, numbers, width = figure.subplots(), np.arange(len(chosen)), 0.8 / max(1, len(results))
+    for number, (agent, cells) in enumerate(results.items()):
+        heights = [cells[cell]["mean"].mean() if cell in cells else np.nan for cell in chosen]
+        axes.bar(numbers - 0.4 + (number + 0.5) * width, heights, width, label=agent)
+    for name, style in (("oracle", "k_"), ("stay", "rx"), ("random", "g+")):
+        axes.plot(numbers, [headroom[cell][name] for cell in chosen], style, markersize=9, label=name)
+    for name, style in zip(PAPER_METHODS, ("ms", "cD"), strict=True):
+        returns = [published_cells(name)[cell.layout][cell.family][0] for cell in chosen]
+        axes.plot(numbers, returns, style, markersize=4, fillstyle="none", label=f"{name} (paper)")
+    axes.set_xticks(numbers, [f"{cell.layout}\n{cell.family}" for cell in chosen], rotation=60, fontsize=8)
+    axes.set_ylabel("mean return of an episode")
+    axes.axhline(0, color="gray", linewidth=0.6)
+    figure.legend(ncols=5, fontsize=8, loc="outside lower center", frameon=False)
+    axes.set_title(f"Test tasks with headroom, protocol {protocol}; the paper's numbers are of published", fontsize=10)
+    save_figure(figure, path)
+
+
+def _with_interval(*cells: np.ndarray, digits: int = 1, sign: str = "") -> str:
+    mean, low, high = (f"{value:{sign}z.{digits}f}" for value in mean_interval(*cells))
+    return f"{mean} ({low} to {high})"
+
+
+def _cell_text(cells: AgentCells, cell: ResultCell) -> str:
+    return f"{cells[cell]['mean'].mean():z.1f}{_marks(cells[cell])}" if cell in cells else ""
+
+
+def _marks(*cells: Mapping[str, Any]) -> str:
+    return overlap_marks(name for blocks in cells for name in blocks["overlaps"]).strip()

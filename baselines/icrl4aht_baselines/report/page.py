@@ -1,69 +1,152 @@
-"""The report as one self-contained HTML page: inline CSS and SVG, GIFs as data URIs, no script, no external files."""
+"""Reports of results: Markdown, CSV and curves, and one self-contained HTML page.
+
+The page has inline CSS and SVG and GIFs as data URIs, no script and no external files.
+"""
 
 from __future__ import annotations
 
+import base64
 import json
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
+from functools import cache
+from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import pandas as pd
 from icrl4aht_generation.teammates.instances import INSTANCES
 
-from icrl4aht_baselines.plotting import SMOOTHING
-from icrl4aht_baselines.report.charts import (
+from icrl4aht_baselines.plotting import SMOOTHING, plot_return_curves
+from icrl4aht_baselines.report.figures import (
     BarChart,
+    NumberedRuns,
     PanelFigure,
     curve_figure,
     reported_series,
     return_bars,
     score_bars,
-    sweep_figure,
 )
-from icrl4aht_baselines.report.episode_gifs import EpisodePair, family_gifs
-from icrl4aht_baselines.report.headline import find_headlines
-from icrl4aht_baselines.report.overlap import describe_training, overlap_legend, overlap_marks
-from icrl4aht_baselines.report.rendering import render
+from icrl4aht_baselines.report.gifs import EpisodePair, family_gifs
 from icrl4aht_baselines.report.results import (
-    GROUP_TEXTS,
     PUBLISHED_PROTOCOL,
+    TASK_KINDS,
     EvaluationRun,
+    ResultCell,
     ResultSource,
-    cell_order,
-    group_of,
-    group_title,
-    instances_range,
+    family_title,
     read_published,
     split_cells,
 )
-from icrl4aht_baselines.report.tables import (
-    PAPER_TABLES,
-    TableRow,
-    TableScore,
-    fill_table,
-    returns_table,
-    sweep_points,
-    sweep_scores,
-    table_cells,
+from icrl4aht_baselines.report.scores import (
+    describe_conditions,
+    find_headlines,
+    returns_tables,
+    rows,
 )
-from icrl4aht_data.benchmark.facts import family_order
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES, Cell, read_headroom
+from icrl4aht_baselines.training.seen import describe_training, overlap_legend, overlap_marks
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import MOST_PANELS
+from icrl4aht_data.plotting import MOST_PANELS, check_can_draw
 from icrl4aht_data.utils.files import atomic_write, json_hash
-from icrl4aht_data.utils.text import counted_noun
+from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.templates import markdown_table
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
 _REFERENCE_RANK = {"oracle": 1, "random": 2, "stay": 3}
-_SHOWN_TRAINING = ("steps", "batch_size", "context", "learning_rate", "seed")
-_SHOWN_MODEL = ("layers", "width", "encoder", "positions")
+_SHOWN_SETTINGS = {
+    "train": ("steps", "batch_size", "context", "learning_rate", "seed"),
+    "model": ("layers", "width", "encoder", "positions"),
+    "histories": ("channels",),
+}
 _PAPER_CONDITIONS = f"Paper: protocol {PUBLISHED_PROTOCOL}, {INSTANCES} instances, 100 episodes of 100 steps."
-_SWEEPS = {"K": "Context length", "size": "Model scale and training budget"}
+
+
+def report_begins(runs: Sequence[EvaluationRun] = ()) -> dict[str, bytes | None]:
+    """Return the files of a report with their first bytes, by which they are recognised before they are replaced.
+
+    The bytes are None for a picture, which carries this package's mark. Without runs the only picture is curves.png.
+    """
+    pictures = list(_curve_pictures(runs)) or ["curves.png"]
+    return {
+        "report.md": b"# Returns per layout and teammate family\n",
+        "report.csv": b"agent,protocol,layout,family,instances,episodes,mean,std,",
+    } | dict.fromkeys(pictures)
+
+
+def _curve_pictures(runs: Sequence[EvaluationRun]) -> dict[str, list[ResultCell]]:
+    """Return the names of the pictures of curves and the cells in each: curves.png, curves-2.png and so on."""
+    parts = split_cells({cell for run in runs for cell in run.cells}, MOST_PANELS)
+    return {"curves.png" if n == 1 else f"curves-{n}.png": cells for n, cells in enumerate(parts, start=1)}
+
+
+def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
+    """Write report.md, report.csv and the curves of some runs into the folder `out`. Return their paths.
+
+    Raises:
+        OptionError: if matplotlib is not installed; nothing is written then.
+    """
+    check_can_draw()
+    out.mkdir(parents=True, exist_ok=True)
+    paths = [out / name for name in report_begins(runs)]
+    paths[0].write_text(markdown(runs), encoding="utf-8")
+    paths[1].write_text(csv_text(runs), encoding="utf-8")
+    for name, cells in _curve_pictures(runs).items():
+        panels = {cell.title: {run.name: run.cells[cell] for run in runs if cell in run.cells} for cell in cells}
+        plot_return_curves(panels, out / name)
+    return paths
+
+
+def markdown(runs: list[EvaluationRun]) -> str:
+    """Return a Markdown report: a summary, and a table of returns per protocol and kind of tasks."""
+    lines = [
+        "# Returns per layout and teammate family",
+        "",
+        *(f"* {escape(text, quote=False)}" for text in summary_lines(runs)),
+        "",
+        "Mean ± std over the instances' means, over the cells' means in averages. The paper's number of the same agent",
+        "is below it if the protocol is `published`: 5 instances, 100 episodes of 100 steps.",
+    ]
+    for protocol in dict.fromkeys(run.protocol for run in runs):
+        of_protocol = [run for run in runs if run.protocol == protocol]
+        lines += [f"\n{section}" for section in markdown_sections(of_protocol, protocol)]
+    return "\n".join(lines) + "\n"
+
+
+def markdown_sections(runs: list[EvaluationRun], protocol: str) -> list[str]:
+    """Return a section of Markdown for each kind of tasks that was played: a table, and the meaning of its marks."""
+    sections = []
+    for table in returns_tables(runs, protocol):
+        body = [
+            [label, escape(agent, quote=False), *("<br>".join([score.text, *score.notes]) for score in scores)]
+            for (label, agent), scores in table.rows.items()
+        ]
+        marks = {name for scores in table.rows.values() for score in scores for name in score.overlaps}
+        notes = [escape(table.caption, quote=False), TASK_KINDS[table.kind], *overlap_legend(marks)]
+        listed = "\n".join(f"* {note}" for note in notes if note)
+        text = markdown_table(["family", "agent", *table.columns], body)
+        sections.append(f"## {table.title}, {protocol}\n\n{text}\n\n{listed}")
+    return sections
+
+
+def summary_lines(runs: Sequence[EvaluationRun]) -> list[str]:
+    """Return the summary of some runs for the console and Markdown, and the legend of its marks."""
+    headlines = [headline for run in runs for headline in find_headlines(run)]
+    legend = overlap_legend({name for one in headlines for name in one.run.overlaps(one.cells)})
+    return [*(headline.text for headline in headlines), *legend]
+
+
+def csv_text(runs: list[EvaluationRun]) -> str:
+    """Return the rows of all runs as CSV with a header, see `scores.rows`."""
+    body = pd.DataFrame([row for run in runs for row in rows(run)], dtype=object)
+    return body.to_csv(index=False, lineterminator="\n")
 
 
 class _Chart(NamedTuple):
-    """A figure of the page. `series` has the number and name of each run in it."""
+    """A figure of the page; `series` has the number and name of each run in it."""
 
     title: str
     figure: BarChart | PanelFigure
@@ -71,57 +154,34 @@ class _Chart(NamedTuple):
     caption: str
 
 
-class _Row(NamedTuple):
-    """A row of a table of scores. `first` starts a group of rows; tooltips begin with `agent`."""
-
-    headers: list[str]
-    agent: str
-    scores: list[TableScore]
-    first: bool = False
-
-
-class _Table(NamedTuple):
-    """A table of scores, or of texts, whose rows then begin with a header."""
+class _TextTable(NamedTuple):
+    """A table of texts, whose rows begin with a header."""
 
     title: str
     caption: str
     columns: list[str]
-    rows: Sequence[_Row] | Sequence[Sequence[str]]
-
-
-_Part = TypeVar("_Part", "_Chart", "_Table", "_Sweep")
-
-
-class _Sweep(NamedTuple):
-    """Figure and table of one varied quantity."""
-
-    title: str
-    figure: PanelFigure
-    series: list[tuple[int, str]]
-    caption: str
-    table: _Table
+    rows: list[list[str]]
 
 
 def write_page(
     runs: Sequence[EvaluationRun], path: Path, episodes: Sequence[EpisodePair] = (), notes: Sequence[str] = ()
 ) -> Path:
-    """Write the page. Returns its path.
+    """Write the page. Return its path.
 
     Args:
         runs: merged, see `results.merge`; of any protocols, sweeps among them.
         path: ends in .html; replaced atomically.
-        episodes: see `episode_gifs.family_gifs`.
+        episodes: see `gifs.family_gifs`.
         notes: facts about these runs for the reader, such as layouts that were left out.
 
     Raises:
-        OptionError: if the path does not end in .html, there is no run, Jinja2 is not installed, or a template or a
-            picture is missing.
+        OptionError: if the path does not end in .html, there is no run, or Jinja2 is not installed.
     """
     if path.suffix not in (".html", ".htm"):
         raise OptionError(f"{path}: expected a name that ends in .html")
     if not runs:
         raise OptionError("no run to report; give at least one folder of results")
-    text = render("page.html", _page_values(runs, episodes, notes))
+    text = _environment().get_template("page.html").render(_page_values(runs, episodes, notes))
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
@@ -137,7 +197,7 @@ def write_page_with_episodes(
     suite: Path | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
-    """Write the page with episodes of a task per family of teammates, of at most three runs. Returns its path.
+    """Write the page with episodes of a task per family of teammates, of at most three runs. Return its path.
 
     Args:
         runs, path, notes: see `write_page`.
@@ -145,7 +205,10 @@ def write_page_with_episodes(
         suite: folder of learned teammates' checkpoints.
         progress: called with (description, tasks drawn, tasks).
     """
-    shown = _most_informative(runs)[:_RUNS_WITH_EPISODES] if episodes else []
+    # Trained agents come first, each of them once before any twice, and reference egos last.
+    repeats = [sum(earlier.agent == run.agent for earlier in runs[:number]) for number, run in enumerate(runs)]
+    order = sorted(range(len(runs)), key=lambda k: (_REFERENCE_RANK.get(runs[k].agent, 0), repeats[k], k))
+    shown = [runs[number] for number in order[:_RUNS_WITH_EPISODES]] if episodes else []
     left = [run.label for run in runs if run not in shown]
     if shown and left:
         notes = [*notes, f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}"]
@@ -153,286 +216,176 @@ def write_page_with_episodes(
         return write_page(runs, path, family_gifs(shown, Path(folder), suite, progress), notes)
 
 
-def _most_informative(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
-    """Returns the runs sorted: trained agents first, each agent once before any twice; reference egos last."""
-    repeats = [sum(earlier.agent == run.agent for earlier in runs[:number]) for number, run in enumerate(runs)]
-    order = sorted(range(len(runs)), key=lambda k: (_REFERENCE_RANK.get(runs[k].agent, 0), repeats[k], k))
-    return [runs[number] for number in order]
+def check_can_render() -> None:
+    """Check, before work that ends in a page, that pages can be made.
+
+    Raises:
+        OptionError: if Jinja2 is not installed.
+    """
+    _environment()
+
+
+@cache
+def _environment() -> Environment:
+    try:
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError as error:
+        raise OptionError(f"a page of results needs jinja2: {install_command('baselines')}") from error
+    loader = PackageLoader("icrl4aht_baselines.report")
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {
+        "number": lambda value, digits=1: f"{value:z.{digits}f}",
+        "signed": lambda value, digits=1: f"{value:+z.{digits}f}",
+        "picture": lambda path: f"data:image/gif;base64,{base64.b64encode(path.read_bytes()).decode()}",
+        "family": family_title,
+    }
+    return environment
 
 
 def _page_values(
     runs: Sequence[EvaluationRun], episodes: Sequence[EpisodePair], notes: Sequence[str]
 ) -> dict[str, Any]:
-    """Returns the values of the template page.html."""
+    """Return the values of the template page.html."""
     headlines = [headline for run in runs for headline in find_headlines(run)]
-    protocols = dict.fromkeys(run.protocol for run in runs)
+    protocols = list(dict.fromkeys(run.protocol for run in runs))
     labels = list(dict.fromkeys(run.label for run in runs))  # an agent has one colour under all protocols
-    numbered = [
-        (protocol, {labels.index(run.label): run for run in runs if run.protocol == protocol}) for protocol in protocols
-    ]
+    agents = list(dict.fromkeys(run.agent for run in runs))
+    names = ", ".join(agents) if len(agents) <= 4 else f"{', '.join(agents[:3])} and {len(agents) - 3} more"
 
-    def of_protocols(make: Callable[[str, dict[int, EvaluationRun]], Sequence[_Part]]) -> list[_Part]:
-        """Returns what is made of each protocol's runs; titles name the protocol if there are several."""
-        made = [(protocol, part) for protocol, of_protocol in numbered for part in make(protocol, of_protocol)]
-        if len(numbered) == 1:
-            return [part for _, part in made]
-        return [part._replace(title=f"{part.title} ({protocol})") for protocol, part in made]
+    def of_protocols(make: Callable[[str, NumberedRuns], Sequence[Any]]) -> list[Any]:
+        """Return what is made of each protocol's runs; titles name the protocol if there are several."""
+        made = []
+        for protocol in protocols:
+            numbered = {labels.index(run.label): run for run in runs if run.protocol == protocol}
+            suffix = f" ({protocol})" if len(protocols) > 1 else ""
+            made += [part._replace(title=f"{part.title}{suffix}") for part in make(protocol, numbered)]
+        return made
 
+    published = read_published()
+    sources = [published["source"], *(published[part]["source"] for part in ("tracks", "contexts", "auxiliary"))]
     return {
-        "title": _title(runs),
+        "title": f"{names}, protocol{'s' if len(protocols) > 1 else ''} {' and '.join(protocols)}",
         "version": version("icrl4aht-data"),
         "headlines": headlines,
         "reasons": list(dict.fromkeys(one.why_no_score for one in headlines if one.why_no_score)),
-        "several_protocols": len(numbered) > 1,
         "bar_charts": of_protocols(_bar_charts),
         "legend": overlap_legend({name for run in runs for name in run.overlaps(run.cells)}),
         "notes": notes,
         "curves": of_protocols(_curve_charts),
         "smoothing": SMOOTHING,
-        "sweeps": of_protocols(_sweeps),
         "episodes": _episodes_by_family(episodes),
-        "tables": of_protocols(_returns_tables),
-        "references": of_protocols(_reference_table),
+        "tables": of_protocols(lambda protocol, some: returns_tables(list(some.values()), protocol)),
         "settings": _settings_table(runs),
-        "paper_tables": _paper_tables(runs),
-        "paper_conditions": _PAPER_CONDITIONS,
+        "protocols": protocols,
         "published_protocol": PUBLISHED_PROTOCOL,
-        "sources": _paper_sources(),
+        "sources": [
+            *sources,
+            f"auxiliary losses: {json.dumps(published['auxiliary']['methods'])}",
+            published["not_stated"],
+        ],
     }
 
 
 def _episodes_by_family(episodes: Sequence[EpisodePair]) -> dict[str, list[EpisodePair]]:
-    """Returns heading -> episodes: of each family, or of all without a heading if there is one pair of each family."""
-    ordered = sorted(episodes, key=lambda pair: family_order(pair.family.partition(" ")[0]))
-    families = list(dict.fromkeys(pair.family for pair in ordered))
-    if len(families) == len(ordered) > 0:
-        return {"": ordered}
-    names = {family: "Learned teammates" if family == "rl" else family for family in families}
-    return {name: [pair for pair in ordered if pair.family == family] for family, name in names.items()}
+    """Return heading -> episodes: of each family, or of all without a heading if there is one pair of each family."""
+    by_family: dict[str, list[EpisodePair]] = {}
+    for pair in sorted(episodes, key=lambda pair: pair.cell.order[1:]):
+        name = "Learned teammates" if pair.cell.group == "rl" else pair.cell.group
+        by_family.setdefault(name, []).append(pair)
+    if all(len(pairs) == 1 for pairs in by_family.values()):
+        return {"": [pair for (pair,) in by_family.values()]} if by_family else {}
+    return by_family
 
 
-def _title(runs: Sequence[EvaluationRun]) -> str:
-    agents = list(dict.fromkeys(run.agent for run in runs))
-    names = ", ".join(agents) if len(agents) <= 4 else f"{', '.join(agents[:3])} and {len(agents) - 3} more"
-    protocols = dict.fromkeys(run.protocol for run in runs)
-    return f"{names}, {'protocol' if len(protocols) == 1 else 'protocols'} {' and '.join(protocols)}"
-
-
-def _bar_charts(protocol: str, runs: Mapping[int, EvaluationRun]) -> list[_Chart]:
-    """Returns charts of the normalised scores, and of the returns with tasks that have none."""
+def _bar_charts(protocol: str, runs: NumberedRuns) -> list[_Chart]:
+    """Return charts of the normalised scores, and of the returns with tasks that have none."""
     agents = reported_series(runs)
-    charts: list[_Chart] = []
     scores = score_bars(agents, protocol)
-    if scores:
-        about = (
-            "A bar runs from the return of an ego that stays to that of the agent, relative to the oracle, which knows "
-            "everything; next to a family are both egos' returns. *: beyond the chart."
-        )
-        charts.append(_bar_chart("Normalised score in each cell", scores, agents, "test", about))
-    plain = {number: run for number, run in runs.items() if run.variant is None}
-    for kind in ("test", *GROUP_TEXTS):
-        shown = agents if kind == "test" else plain
+    about = (
+        "A bar runs from the return of an ego that stays to that of the agent, relative to the oracle, which knows "
+        "everything; next to a family are both egos' returns. *: beyond the chart."
+    )
+    charts = [_bar_chart("Normalised score in each cell", scores, agents, "test", about)] if scores else []
+    for kind, text in TASK_KINDS.items():
+        shown = agents if kind == "test" else runs
         bars = None if kind == "test" and scores else return_bars(shown, kind)
-        if bars:
-            charts.append(
-                _bar_chart(f"Return in each cell, {kind} tasks", bars, shown, kind, GROUP_TEXTS.get(kind, ""))
-            )
+        charts += [_bar_chart(f"Return in each cell, {kind} tasks", bars, shown, kind, text)] if bars else []
     return charts
 
 
-def _bar_chart(title: str, bars: BarChart, runs: Mapping[int, EvaluationRun], kind: str, about: str) -> _Chart:
-    """Returns a chart with the legend and the conditions of the runs in it."""
-    drawn = [bar for rows in bars.layouts.values() for row in rows for bar in row.bars]
-    numbers = {bar.series for bar in drawn}
-    lines = " Lines: 95 % intervals over the instances." if any(bar.interval for bar in drawn) else ""
-    shown = {number: run for number, run in runs.items() if number in numbers}
-    cells = {cell for run in shown.values() for cell in run.cells if group_of(cell) == kind}
-    sentences = [f"{_conditions(shown.values(), cells)}.{lines}", about, *bars.left_out]
-    caption = " ".join([*filter(None, sentences), _overlap_note(shown.values(), cells)])
-    return _Chart(title, bars, _names(shown), caption.strip())
+def _bar_chart(title: str, bars: BarChart, runs: NumberedRuns, kind: str, about: str) -> _Chart:
+    drawn = [bar for of_layout in bars.layouts.values() for row in of_layout for bar in row.bars]
+    shown = {number: run for number, run in runs.items() if number in {bar.series for bar in drawn}}
+    cells = {cell for run in shown.values() for cell in run.cells if cell.kind == kind}
+    lines = "Lines: 95 % intervals over the instances." if any(bar.interval for bar in drawn) else ""
+    return _Chart(title, bars, _series(shown), _caption(shown.values(), cells, lines, about, *bars.left_out))
 
 
-def _curve_charts(protocol: str, runs: Mapping[int, EvaluationRun]) -> list[_Chart]:
+def _curve_charts(protocol: str, runs: NumberedRuns) -> list[_Chart]:
     charts = []
-    for of_sweep in (False, True):
-        some = {number: run for number, run in runs.items() if (run.variant is not None) == of_sweep}
-        parts = split_cells({cell for run in some.values() for cell in run.cells}, MOST_PANELS)
-        kinds = [group_of(cells[0]) for cells in parts]
-        for cells in parts:
-            shown = {number: run for number, run in some.items() if not run.cells.keys().isdisjoint(cells)}
-            caption = f"{_conditions(shown.values(), cells)}. {_overlap_note(shown.values(), cells)}".strip()
-            kind = group_of(cells[0])
-            title = f"{kind.capitalize()} tasks{' of the sweeps' if of_sweep else ''}"
-            if kinds.count(kind) > 1:
-                title += f" on {', '.join(dict.fromkeys(layout for layout, _ in cells))}"
-            charts.append(_Chart(title, curve_figure(shown, cells), _names(shown), caption))
+    parts = split_cells({cell for run in runs.values() for cell in run.cells}, MOST_PANELS)
+    kinds = [cells[0].kind for cells in parts]
+    for cells in parts:
+        shown = {number: run for number, run in runs.items() if not run.cells.keys().isdisjoint(cells)}
+        title = f"{cells[0].kind.capitalize()} tasks"
+        if kinds.count(cells[0].kind) > 1:
+            title += f" on {', '.join(dict.fromkeys(cell.layout for cell in cells))}"
+        charts.append(_Chart(title, curve_figure(shown, cells), _series(shown), _caption(shown.values(), cells)))
     return charts
 
 
-def _sweeps(protocol: str, runs: Mapping[int, EvaluationRun]) -> list[_Sweep]:
-    sweeps = []
-    for quantity, title in _SWEEPS.items():
-        of_quantity = [run for run in runs.values() if run.variant and run.variant[0] == quantity]
-        if of_quantity:
-            scores = sweep_scores(of_quantity, quantity)
-            agents = list(dict.fromkeys(agent for lines in scores.values() for agent in lines))
-            diamonds = "Diamonds: the paper. " if protocol == PUBLISHED_PROTOCOL else ""
-            caption = (
-                f"{_conditions(of_quantity)}. Mean return over families; bands: std over families' means. {diamonds}"
-                f"{_overlap_note(of_quantity)}"
-            )
-            figure = sweep_figure(sweep_points(of_quantity, quantity), quantity)
-            sweeps.append(_Sweep(title, figure, list(enumerate(agents)), caption, _sweep_table(scores, quantity)))
-    return sweeps
-
-
-def _sweep_table(panels: Mapping[str, Mapping[str, Sequence[tuple[Any, TableScore]]]], quantity: str) -> _Table:
-    """Returns a table with a column for each value of what is varied."""
-    points = [point for lines in panels.values() for of_agent in lines.values() for point in of_agent]
-    values = list(dict.fromkeys(value for value, _ in points))
-    not_run = TableScore(None, None, None, None, (0, 0), (0, 0))
-    rows = [
-        _Row([layout, agent], agent, [dict(scores).get(value, not_run) for value in values])
-        for layout, lines in panels.items()
-        for agent, scores in lines.items()
-    ]
-    columns = ["layout", "agent", *(f"{quantity} = {value}" for value in values)]
-    return _Table("Returns", "Means over the families of teammates.", columns, rows)
-
-
-def _names(runs: Mapping[int, EvaluationRun]) -> list[tuple[int, str]]:
+def _series(runs: NumberedRuns) -> list[tuple[int, str]]:
     return [(number, run.label) for number, run in runs.items()]
 
 
-def _returns_tables(protocol: str, runs: Mapping[int, EvaluationRun]) -> list[_Table]:
-    """Returns a table for each kind of tasks that was played, without sweeps."""
-    plain = [run for run in runs.values() if run.variant is None]
-    tables = []
-    for kind in ("test", *GROUP_TEXTS):
-        cells = sorted({cell for run in plain for cell in run.cells if group_of(cell) == kind}, key=cell_order)
-        if cells:
-            columns, rows = returns_table(plain, cells, protocol)
-            shown = [run for run in plain if not run.cells.keys().isdisjoint(cells)]
-            single = len(shown) == 1
-            caption = f"{_conditions(shown, cells)}."
-            title = f"{kind.capitalize()} tasks{f': {shown[0].label}' if single else ''}"
-            headers = ["family"] if single else ["family", "agent"]
-            tables.append(_Table(title, caption, [*headers, *columns], _table_rows(rows, len(headers))))
-    return tables
+def _caption(runs: Iterable[EvaluationRun], cells: Container[ResultCell] | None, *sentences: str) -> str:
+    """Return the caption of a figure of some cells, or all: conditions, sentences, and overlap with the training data.
 
-
-def _table_rows(rows: Sequence[TableRow], headers: int) -> list[_Row]:
-    found, before = [], None
-    for row in rows:
-        labels = [group_title(row.label), row.agent]
-        found.append(_Row(labels[:headers], row.agent, row.scores, row.label != before))
-        before = row.label
-    return found
-
-
-def _paper_tables(runs: Sequence[EvaluationRun]) -> list[_Table]:
-    """Returns the paper's tables with our results, if there are some of its protocol."""
-    ours = [run for run in runs if run.protocol == PUBLISHED_PROTOCOL and run.variant is None]
-    tables = []
-    for number, table in enumerate(PAPER_TABLES, start=1):
-        rows = fill_table(table, ours, PUBLISHED_PROTOCOL) if ours else []
-        if rows:
-            cells = table_cells(table)
-            agents = {row.agent for row in rows}
-            shown = [run for run in ours if run.label in agents and not cells.isdisjoint(run.cells)]
-            text = f"{_conditions(shown, cells)}." if shown else "Not run."
-            text += f" {_PAPER_CONDITIONS}{'' if table.group == 'cell' else ' ± is the std over cells.'}"
-            single = [row._replace(scores=[score._replace(gain=None) for score in row.scores]) for row in rows]
-            body = _table_rows(single, 2)
-            if table.group != "cell":
-                body = [row._replace(headers=row.headers[1:]) for row in body]
-            headers = ["family", "agent"] if table.group == "cell" else ["agent"]
-            tables.append(_Table(f"Table {number}. {table.title}", text, [*headers, *table.columns], body))
-    return tables
-
-
-def _conditions(runs: Iterable[EvaluationRun], cells: Container[Cell] | None = None) -> str:
-    """Returns text with protocol, seeds, length and instances of the results of some runs, all or those of `cells`.
-
-    If the conditions differ, it says which agents they are of.
+    A figure has no marks, so its caption names the cells that overlap.
     """
-    shown = [(run, cell) for run in runs for cell in run.cells if cells is None or cell in cells]
-    labels: dict[str, dict[str, None]] = {}
-    for run, cell in shown:
-        labels.setdefault(run.source(cell).conditions, {})[run.label] = None
-    several = len(labels) > 1
-    texts = [f"{' and '.join(names)} under {text}" if several else f"under {text}" for text, names in labels.items()]
-    instances = instances_range(len(run.cells[cell]) for run, cell in shown)
-    return f"Evaluated {'; '.join(texts)}; {instances} in a cell"
-
-
-def _overlap_note(runs: Iterable[EvaluationRun], drawn: Container[Cell] | None = None) -> str:
-    """Returns a sentence that names the cells of a figure which overlap with training; a figure has no marks."""
-    marked = []
+    runs, marked = list(runs), []
     for run in runs:
-        shown = [cell for cell in run.cells if drawn is None or cell in drawn]
-        cells = [(cell, overlap_marks(run.overlaps([cell]))) for cell in shown]
-        named = [f"{layout} {group}{marks}" for (layout, group), marks in cells if marks]
+        marks = {cell: overlap_marks(run.overlaps([cell])) for cell in run.cells if cells is None or cell in cells}
+        named = [f"{cell.layout} {cell.group}{mark}" for cell, mark in marks.items() if mark]
         if named:
-            everywhere = len(named) == len(cells) and len({marks for _, marks in cells}) == 1
-            marked.append(f"{run.label}: {f'all cells{cells[0][1]}' if everywhere else ', '.join(named)}")
-    return f"Overlap with the training data: {'; '.join(marked)}." if marked else ""
+            everywhere = len(named) == len(marks) and len(set(marks.values())) == 1
+            marked.append(f"{run.label}: {f'all cells{marks.popitem()[1]}' if everywhere else ', '.join(named)}")
+    overlap = f"Overlap with the training data: {'; '.join(marked)}." if marked else ""
+    return " ".join(filter(None, [describe_conditions(runs, cells), *sentences, overlap]))
 
 
-def _reference_table(protocol: str, runs: Mapping[int, EvaluationRun]) -> list[_Table]:
-    """Returns a table with the returns of the reference egos on the layouts that were tested; none without them."""
-    measured = read_headroom(protocol)
-    played = {cell[0] for run in runs.values() for cell in run.cells if cell in measured}
-    layouts = [layout for layout in dict.fromkeys(layout for layout, _ in measured) if layout in played]
-    if not layouts:
-        return []
-    body = [
-        [family, *(" / ".join(f"{measured[layout, family][ego]:z.1f}" for ego in REFERENCES) for layout in layouts)]
-        for family in HEURISTICS
-    ]
-    caption = (
-        f"Mean returns of {' / '.join(REFERENCES)} (scripted, full information) with the published test tasks, "
-        f"{INSTANCES} instances, 1 seed (0), 100 episodes of 100 steps."
-    )
-    return [_Table("Reference egos", caption, ["family", *layouts], body)]
-
-
-def _settings_table(runs: Sequence[EvaluationRun]) -> _Table:
-    """Returns a table with a column for each source of results."""
+def _settings_table(runs: Sequence[EvaluationRun]) -> _TextTable:
+    """Return a table with a column for each source of results."""
     sources = [(run, source) for run in runs for source in run.sources]
     found = [_source_settings(source) for _, source in sources]
     names = [name for name in found[0] if any(of_source[name] for of_source in found)]
-    rows = [[name, *(of_source[name] for of_source in found)] for name in names]
-    caption = f"{counted_noun(len(sources), 'source')} of results."
-    return _Table("Evaluation and training", caption, ["setting", *(run.label for run, _ in sources)], rows)
+    body = [[name, *(of_source[name] for of_source in found)] for name in names]
+    return _TextTable("Evaluation and training", "", ["setting", *(run.label for run, _ in sources)], body)
 
 
 def _source_settings(source: ResultSource) -> dict[str, str]:
     settings, trained = source.settings, source.trained or {}
-    config = trained.get("config", {})
-    histories, train = config.get("histories", {}), config.get("train", {})
-    protocol, model = settings["protocol"], config.get("model", {})
-    training = {name: train[name] for name in _SHOWN_TRAINING if name in train}
-    training |= {name: model[name] for name in _SHOWN_MODEL if name in model}
-    training |= {"channels": histories["channels"]} if "channels" in histories else {}
+    config, protocol = trained.get("config", {}), source.settings["protocol"]
+    training = [
+        f"{name} {config[part][name]}"
+        for part, names in _SHOWN_SETTINGS.items()
+        for name in names
+        if name in config.get(part, {})
+    ]
     return {
         "layouts": ", ".join(source.layouts),
         "protocol": protocol["name"],
         "episodes × steps": f"{protocol['episodes']} × {protocol['steps']}",
         "seeds": ", ".join(map(str, settings["seeds"])),
-        "acting": source.acting,
+        "acting": source.detail("acting"),
         "settings hash": json_hash(settings),
         "package version": settings["code_version"],
         "trained on": describe_training(source.seen),
-        "data version": histories.get("data_version", ""),
-        "training": ", ".join(f"{name} {value}" for name, value in training.items()),
+        "data version": config.get("histories", {}).get("data_version", ""),
+        "training": ", ".join(training),
         "run hash": trained.get("run_hash", ""),
         "data manifest (SHA-256)": trained.get("manifest_sha256") or "",
         "results": source.folder,
     }
-
-
-def _paper_sources() -> list[str]:
-    published = read_published()
-    texts = [published["source"], *(published[part]["source"] for part in ("tracks", "contexts", "auxiliary"))]
-    return [*texts, f"auxiliary losses: {json.dumps(published['auxiliary']['methods'])}", published["not_stated"]]

@@ -1,9 +1,15 @@
-"""Results of evaluation as runs of one agent, and the paper's published numbers.
+"""Results of evaluation as one table, and the stored results of reference models (`cards/results.json`).
 
-Reports group results by cell, a layout and a group of teammates. The cells of the benchmark consist of the published
-test tasks: ("demo_wide", "H4"). Other tasks never share a cell with those, since the paper's numbers and the headroom
-do not apply to them: ("demo_wide", "H4 (validation)") are tasks of the split `validation`, "(training)" of the split
-`train`, "(held out)" of the split `heldout`, and "(own)" other tasks of the split `test`.
+A table of results is a data frame with a row for each task, seed and block of episodes:
+
+    agent, protocol, layout, family, kind   the agent, and the cell of the task, see `ResultCell`
+    task, seed                              id of the task, or its number in stored results; seed, or its number
+    block                                   mean: all episodes; first, last: up to 20 at each end; opening: episode 1
+    return                                  mean return of the team in an episode of the block
+    overlap                                 overlaps of training data and the cell's tasks, see `overlap.OVERLAPS`
+    stay, oracle                            mean returns of these egos in the cell; NaN where they were not measured
+
+Tasks of different kinds never share a cell, since the paper's numbers and the headroom are of published test tasks.
 """
 
 from __future__ import annotations
@@ -14,17 +20,17 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from icrl4aht_baselines.evaluate.protocols import bundled_tasks
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks
 from icrl4aht_baselines.evaluate.results import Result, read_result
-from icrl4aht_baselines.report.overlap import OVERLAPS, find_overlaps
 from icrl4aht_baselines.training.run_folder import read_config
-from icrl4aht_baselines.training.seen import TRAINED_ON, SeenInTraining, read_trained_on
+from icrl4aht_baselines.training.seen import OVERLAPS, TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, TRACKS, family_order, layout_order, track_of
-from icrl4aht_data.benchmark.reference_returns import REFERENCES, Cell, has_headroom
+from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_headroom
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
@@ -40,10 +46,17 @@ OWN_TASKS, TRAINED_RUN = "tasks.jsonl", "run.json"
 PUBLISHED_PROTOCOL = "published"
 """Name of the protocol that the paper's numbers belong to."""
 
-_GROUPS = {"validation": "validation", "train": "training", "heldout": "held out", "test": "own"}
-"""Split of tasks that are not published test tasks -> name of their group in reports."""
+ENDS = 20
+"""Most episodes at each end of a task for the adaptation gain (paper, App. F)."""
 
-GROUP_TEXTS = {
+BLOCKS = ("mean", "first", "last", "opening")
+"""Blocks of episodes, see the module's docstring."""
+
+CELL_COLUMNS = ["layout", "family", "kind"]
+AGENT_COLUMNS = ["agent", "protocol"]
+
+TASK_KINDS = {
+    "test": "",
     "validation": "Validation tasks (split validation): training layouts with teammates that are drawn from the "
     "training ranges and are in no training history. They are for choosing models, so the returns of a model that was "
     "chosen by them are too high, and they are no test results.",
@@ -56,13 +69,38 @@ GROUP_TEXTS = {
     "gives these as a figure without numbers (App. F).",
     "own": "Own tasks: not among the published test tasks, so the paper has no numbers of them.",
 }
-"""Group of tasks that are not published test tasks -> explanation."""
+"""Kind of tasks -> explanation; "test" are the published test tasks."""
 
-Returns = TypeVar("Returns", float, np.ndarray)
-"""A return or several."""
+_KIND_OF_SPLIT = {"validation": "validation", "train": "training", "heldout": "held out", "test": "own"}
 
-_KINDS = ("test", *GROUP_TEXTS)
-_ENDS = 20  # episodes at each end for the adaptation gain (paper, App. F)
+
+class ResultCell(NamedTuple):
+    """Tasks that reports average over: those with the same layout, family of teammates and kind.
+
+    Attributes:
+        layout: short name.
+        family: family of the teammates.
+        kind: one of `TASK_KINDS`.
+    """
+
+    layout: str
+    family: str
+    kind: str = "test"
+
+    @property
+    def group(self) -> str:
+        """Family and kind, such as "H4" and "H4 (validation)"."""
+        return self.family if self.kind == "test" else f"{self.family} ({self.kind})"
+
+    @property
+    def title(self) -> str:
+        """Layout and teammates as people read them: learned teammates, family "rl", are called "learned"."""
+        return f"{self.layout}, {self._replace(family=family_title(self.family)).group}"
+
+    @property
+    def order(self) -> tuple[Any, ...]:
+        """Sort key: layouts and families in the paper's order."""
+        return layout_order(self.layout), family_order(self.family), list(TASK_KINDS).index(self.kind)
 
 
 class ResultSource(NamedTuple):
@@ -70,7 +108,6 @@ class ResultSource(NamedTuple):
 
     Attributes:
         folder: folder that the results were read from.
-        layouts: layouts that were played.
         settings: settings of the evaluation, see `evaluate.results.Result`.
         trained: content of run.json, see `note_results`; None for an agent that was not trained here.
         tasks: cell -> the tasks that were played, in the order of the returns.
@@ -78,39 +115,30 @@ class ResultSource(NamedTuple):
     """
 
     folder: str
-    layouts: tuple[str, ...]
     settings: dict[str, Any]
     trained: dict[str, Any] | None
-    tasks: Mapping[Cell, tuple[Task, ...]] = MappingProxyType({})
+    tasks: Mapping[ResultCell, tuple[Task, ...]] = MappingProxyType({})
     seen: SeenInTraining | None = None
 
     @property
-    def acting(self) -> str:
-        """Way of acting of a trained model, see `agents.egos.ACTING`; empty for other agents."""
-        return self.settings.get("details", {}).get("acting", "")
+    def layouts(self) -> tuple[str, ...]:
+        """Layouts that were played."""
+        return tuple(dict.fromkeys(cell.layout for cell in self.tasks))
 
-    @property
-    def playing(self) -> tuple[bool, bool]:
-        """Whether a trained model drew its actions, and whether its memory was cleared before each episode."""
-        details = self.settings.get("details", {})
-        return bool(details.get("sampled")), bool(details.get("forget"))
-
-    @property
-    def encoder(self) -> str:
-        """Kind of a trained model's encoder, see `methods.options.ModelOptions`; empty for other agents."""
-        return self.settings.get("details", {}).get("encoder", "")
+    def detail(self, name: str, default: Any = "") -> Any:
+        """Return a detail of the agent, such as `acting` or `encoder` of a trained model; by default an empty text."""
+        return self.settings.get("details", {}).get(name, default)
 
     @property
     def conditions(self) -> str:
         """Text with protocol, seeds, episodes and steps of the evaluation, and a model's way of playing."""
         protocol, seeds = self.settings["protocol"], self.settings["seeds"]
-        listed, (sampled, forgets) = ", ".join(map(str, seeds)), self.playing
         return (
-            f"protocol {protocol['name']}, {counted_noun(len(seeds), 'seed')} ({listed}), "
+            f"protocol {protocol['name']}, {counted_noun(len(seeds), 'seed')} ({', '.join(map(str, seeds))}), "
             f"{counted_noun(protocol['episodes'], 'episode')} of {counted_noun(protocol['steps'], 'step')}"
-            + (f", {self.acting} acting" if self.acting else "")
-            + (", sampled actions" if sampled else "")
-            + (", memory cleared before each episode" if forgets else "")
+            + (f", {self.detail('acting')} acting" if self.detail("acting") else "")
+            + (", sampled actions" if self.detail("sampled") else "")
+            + (", memory cleared before each episode" if self.detail("forget") else "")
         )
 
 
@@ -121,8 +149,9 @@ class EvaluationRun:
     Attributes:
         agent: name of the agent.
         protocol: name of the protocol.
-        cells: cell, see the module's docstring -> returns of the team, float64 (instances, episodes), means over the
-            seeds.
+        table: the results, see the module's docstring.
+        cells: cell -> returns of the team in each episode, float64 (instances, episodes), means over the seeds; in the
+            paper's order.
         variant: name and value of the varied quantity in a sweep, such as ("K", 250); None otherwise.
         note: text that distinguishes results of one agent on the same cells; usually empty.
         sources: origins of the results; each cell has one.
@@ -130,54 +159,37 @@ class EvaluationRun:
 
     agent: str
     protocol: str
-    cells: dict[Cell, np.ndarray]
+    table: pd.DataFrame
+    cells: dict[ResultCell, np.ndarray]
     variant: tuple[str, Any] | None = None
     note: str = ""
     sources: tuple[ResultSource, ...] = ()
 
-    def source(self, cell: Cell) -> ResultSource:
-        """Returns the origin of a cell's results."""
+    def source(self, cell: ResultCell) -> ResultSource:
+        """Return the origin of a cell's results."""
         return next(source for source in self.sources if cell in source.tasks)
 
-    def tasks(self, cell: Cell) -> tuple[Task, ...]:
-        """Returns the tasks of a cell that were played."""
+    def tasks(self, cell: ResultCell) -> tuple[Task, ...]:
+        """Return the tasks of a cell that were played."""
         return self.source(cell).tasks[cell]
 
-    def overlaps(self, cells: Iterable[Cell]) -> tuple[str, ...]:
-        """Returns the kinds of overlap between training data and the tasks of some cells, see `OVERLAPS`."""
+    def overlaps(self, cells: Iterable[ResultCell]) -> tuple[str, ...]:
+        """Return the kinds of overlap between training data and the tasks of some cells, see `overlap.OVERLAPS`."""
         found = {name for cell in cells for name in find_overlaps(self.tasks(cell), self.source(cell).seen)}
         return tuple(name for name in OVERLAPS if name in found)
 
-    def is_complete(self, cell: Cell) -> bool:
-        """Returns whether all published test tasks of a cell were played, and no others."""
+    def is_comparable(self, cell: ResultCell) -> bool:
+        """Return whether episodes have the benchmark's length, and all published tasks of a test cell were played."""
+        return self.is_complete(cell) and self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
+
+    def is_complete(self, cell: ResultCell) -> bool:
+        """Return whether all published test tasks of a cell were played, and no others."""
         return len(self.tasks(cell)) == published_instances(cell)
 
-    def has_usual_steps(self, cell: Cell) -> bool:
-        """Returns whether episodes have the benchmark's length; returns of other lengths compare with nothing."""
-        return self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
-
-    def is_like_the_papers(self, cell: Cell) -> bool:
-        """Returns whether the paper's numbers of a cell are of the same tasks, protocol and episode length."""
-        return self.protocol == PUBLISHED_PROTOCOL and bool(published_instances(cell)) and self.has_usual_steps(cell)
-
-    def means(self, cell: Cell) -> np.ndarray:
-        """Returns the mean return of each instance of a cell, float64 (instances,)."""
-        return self.cells[cell].mean(axis=1)
-
-    def ends(self, cell: Cell) -> np.ndarray:
-        """Returns the mean returns of the first and the last 20 episodes, or of the halves if there are fewer than 40.
-
-        Returns:
-            float64 (2, instances).
-        """
-        returns = self.cells[cell]
-        count = end_episodes(returns.shape[1])
-        return np.stack([returns[:, :count].mean(axis=1), returns[:, -count:].mean(axis=1)])
-
-    def gain(self, cell: Cell) -> float:
-        """Returns the mean return of the last episodes minus that of the first (paper, App. F), see `ends`."""
-        first, last = self.ends(cell)
-        return float(last.mean() - first.mean())
+    def is_like_the_papers(self, cell: ResultCell) -> bool:
+        """Return whether the paper's numbers of a cell are of the same tasks, protocol and episode length."""
+        usual = self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
+        return self.protocol == PUBLISHED_PROTOCOL and bool(published_instances(cell)) and usual
 
     @cached_property
     def label(self) -> str:
@@ -191,9 +203,54 @@ class EvaluationRun:
         return f"{self.label} ({self.protocol})"
 
 
+def results_table(rows: Sequence[tuple[Any, ...]]) -> pd.DataFrame:
+    """Return rows of `cell_rows` as a table, with the returns of `stay` and `oracle`."""
+    names = [*AGENT_COLUMNS, *CELL_COLUMNS, "task", "seed", "block", "return", "overlap"]
+    egos = [
+        (protocol, layout, family, "test", returns["stay"], returns["oracle"])
+        for protocol in PROTOCOLS
+        for (layout, family), returns in read_headroom(protocol).items()
+    ]
+    references = pd.DataFrame(egos, columns=["protocol", *CELL_COLUMNS, "stay", "oracle"])
+    return pd.DataFrame(rows, columns=names).merge(references, how="left", on=["protocol", *CELL_COLUMNS])
+
+
+def cell_rows(
+    agent: tuple[str, str],
+    cell: ResultCell,
+    blocks: Mapping[str, Any],
+    overlaps: Iterable[str] = (),
+    tasks: Sequence[str] = (),
+    seeds: Sequence[int] = (),
+) -> list[tuple[Any, ...]]:
+    """Return the rows of a table for one cell.
+
+    Args:
+        agent: agent and protocol.
+        cell: the cell.
+        blocks: block -> returns (tasks, seeds).
+        overlaps: see the module's docstring.
+        tasks, seeds: names of the tasks and seeds; numbers by default.
+    """
+    marks = " ".join(overlaps)
+    return [
+        (*agent, *cell, tasks[row] if tasks else row, seeds[column] if seeds else column, block, float(value), marks)
+        for block, values in blocks.items()
+        for row, of_task in enumerate(values)
+        for column, value in enumerate(of_task)
+    ]
+
+
+def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the mean returns of each block, (...), of the returns of all episodes, (..., episodes)."""
+    count = end_episodes(returns.shape[-1])
+    first, last = returns[..., :count].mean(axis=-1), returns[..., -count:].mean(axis=-1)
+    return {"mean": returns.mean(axis=-1), "first": first, "last": last, "opening": returns[..., 0]}
+
+
 def end_episodes(episodes: int) -> int:
-    """Returns the number of episodes at each end of a task that the adaptation gain compares."""
-    return max(1, min(_ENDS, episodes // 2))
+    """Return the number of episodes at each end of a task that the adaptation gain compares, half if they are few."""
+    return max(1, min(ENDS, episodes // 2))
 
 
 def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] = ()) -> None:
@@ -229,7 +286,7 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
 
 
 def read_run(folder: Path) -> EvaluationRun:
-    """Returns the results in a folder that `icrl4aht-data evaluate` made.
+    """Return the results in a folder that `icrl4aht-data evaluate` made.
 
     Raises:
         OptionError: if there are none, if they mix settings, or if the task of one is unknown.
@@ -245,7 +302,7 @@ def read_run(folder: Path) -> EvaluationRun:
 def as_run(
     results: Sequence[Result], where: str = "results", tasks: Sequence[Task] = (), trained: dict[str, Any] | None = None
 ) -> EvaluationRun:
-    """Returns the results of one agent as a run, which reports take.
+    """Return the results of one agent as a run, which reports take.
 
     Args:
         results: results of `icrl4aht_baselines.evaluate.evaluate`, all under the same settings.
@@ -263,8 +320,7 @@ def as_run(
     known = published_test_tasks() | {task.task_id: task for task in tasks}
     if any(result.task_id not in known for result in results):
         known = shipped_validation_tasks() | _bundled_by_id("diverse") | known
-    cells: dict[Cell, list[np.ndarray]] = defaultdict(list)
-    played: dict[Cell, list[Task]] = defaultdict(list)
+    played: dict[ResultCell, list[tuple[Task, list[list[float]]]]] = defaultdict(list)
     for result in results:
         if result.task_id not in known:
             raise OptionError(
@@ -272,206 +328,146 @@ def as_run(
                 f"nor in the results' {OWN_TASKS}; evaluate again, or copy the manifest of the tasks to {OWN_TASKS}"
             )
         task = known[result.task_id]
-        cells[cell_of(task)].append(np.mean(result.returns, axis=0))
-        played[cell_of(task)].append(task)
-    variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
-    arrays = {cell: np.array(cells[cell]) for cell in sorted(cells, key=cell_order)}
-    layouts = tuple(dict.fromkeys(layout for layout, _ in arrays))
-    of_cell = {cell: tuple(found) for cell, found in played.items()}
+        played[cell_of(task)].append((task, result.returns))
     seen = _find_seen(settings, trained, where)
-    sources = [ResultSource(where, layouts, settings, trained, of_cell, seen.get(""))]
-    if "" not in seen:  # a model for each track
-        sources = [
-            ResultSource(
-                where, tuple(dict.fromkeys(layout for layout, _ in own)), settings, trained, own, seen.get(track)
-            )
-            for track in TRACKS
-            if (own := {cell: found for cell, found in of_cell.items() if track_of(cell[0]) == track})
-        ]
-    return EvaluationRun(settings["agent"], settings["protocol"]["name"], arrays, variant, sources=tuple(sources))
+    agent, protocol = settings["agent"], settings["protocol"]["name"]
+    sources = []
+    for track, of_track in seen.items():
+        own = {
+            cell: tuple(task for task, _ in found)
+            for cell, found in played.items()
+            if track in ("", track_of(cell.layout))
+        }
+        sources += [ResultSource(where, settings, trained, own, of_track)] if own else []
+    variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
+    run = EvaluationRun(agent, protocol, pd.DataFrame(), {}, variant, sources=tuple(sources))
+    rows, cells = [], {}
+    for cell in sorted(played, key=lambda cell: cell.order):
+        returns = np.array([of_task for _, of_task in played[cell]], np.float64)  # (tasks, seeds, episodes)
+        cells[cell] = returns.mean(axis=1)
+        names, blocks = [task.task_id for task, _ in played[cell]], episode_blocks(returns)
+        rows += cell_rows((agent, protocol), cell, blocks, run.overlaps([cell]), names, settings["seeds"])
+    return replace(run, table=results_table(rows), cells=cells)
 
 
 def _find_seen(
     settings: dict[str, Any], trained: dict[str, Any] | None, where: str
 ) -> dict[str, SeenInTraining | None]:
-    """Returns what an agent was trained on: nothing for reference egos, None if the results do not say.
+    """Return what an agent was trained on: nothing for reference egos, None if the results do not say.
 
     The key is empty, or the track for an agent with a model for each track.
     """
     details = settings.get("details", {})
-    config = (trained or {}).get("config", {})
-    for record in (details, config):
+    for record in (details, (trained or {}).get("config", {})):
         entries = record.get(TRAINED_ON)
         if isinstance(entries, dict) and entries.keys() <= TRACKS.keys():
-            return {track: read_trained_on(of_track, where) for track, of_track in entries.items()}
+            return {track: read_trained_on(entries[track], where) if track in entries else None for track in TRACKS}
         if TRAINED_ON in record:
             return {"": read_trained_on(entries, where)}
     is_reference = settings["agent"] in REFERENCES and not details and trained is None
     return {"": SeenInTraining() if is_reference else None}
 
 
-def published_test_tasks() -> dict[str, Task]:
-    """Returns the 160 published test tasks by id."""
-    return _bundled_by_id("test")
-
-
-def shipped_validation_tasks() -> dict[str, Task]:
-    """Returns the package's validation tasks with teammates of the published training ranges, by id."""
-    return _bundled_by_id("validation")
-
-
-@cache
-def _bundled_by_id(split: str) -> dict[str, Task]:
-    """Returns the package's tasks of one of `EVALUATION_SPLITS`, by id."""
-    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
-
-
-@cache
-def _instances() -> Counter[Cell]:
-    return Counter((task.layout.name, task.teammate_family) for task in published_test_tasks().values())
-
-
-def published_instances(cell: Cell) -> int:
-    """Returns the number of published test tasks of a cell; 0 for cells of other tasks."""
-    return _instances()[cell]
-
-
-def cell_of(task: Task) -> Cell:
-    """Returns the cell of a task, see the module's docstring."""
-    if task.task_id in published_test_tasks():
-        return task.layout.name, task.teammate_family
-    group = "diverse" if task.task_id in _bundled_by_id("diverse") else _GROUPS[task.split]
-    return task.layout.name, f"{task.teammate_family} ({group})"
-
-
-def instances_text(cell: Cell, played: int) -> str:
-    """Returns the number of instances, such as "1 of 5 instances", or "1 instance" for tasks that are not published."""
-    total = published_instances(cell)
-    return f"{played} of {counted_noun(total, 'instance')}" if total else counted_noun(played, "instance")
-
-
-def instances_range(numbers: Iterable[int]) -> str:
-    """Returns numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
-    found = sorted(set(numbers))
-    return counted_noun(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
-
-
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
-    """Returns the runs with those of one agent on different cells, such as models of each layout, merged into one run.
+    """Return the runs with those of one agent on different cells, such as models of each layout, merged into one run.
 
     Runs that played the same cell, or under other rules or seeds, are not merged; the `note` of the later ones is their
     folder.
     """
     merged: list[EvaluationRun] = []
     for run in runs:
-        same = [k for k, other in enumerate(merged) if other.name == run.name]
+        same = [number for number, other in enumerate(merged) if other.name == run.name]
         fitting = [
             k for k in same if _rules(merged[k]) == _rules(run) and not merged[k].cells.keys() & run.cells.keys()
         ]
-        if fitting:
-            other = merged[fitting[0]]
-            cells = other.cells | run.cells
-            ordered = {cell: cells[cell] for cell in sorted(cells, key=cell_order)}
-            merged[fitting[0]] = replace(other, cells=ordered, sources=other.sources + run.sources)
-        else:
+        if not fitting:
             merged.append(replace(run, note=run.sources[0].folder) if same else run)
+            continue
+        other = merged[fitting[0]]
+        cells = dict(sorted((other.cells | run.cells).items(), key=lambda found: found[0].order))
+        table, sources = pd.concat([other.table, run.table], ignore_index=True), other.sources + run.sources
+        merged[fitting[0]] = replace(other, table=table, cells=cells, sources=sources)
     return merged
 
 
 def _rules(run: EvaluationRun) -> tuple[Any, ...]:
-    """Returns what merged results must agree in: protocol, seeds, way of playing, and encoder."""
+    """Return what merged results must agree in: protocol, seeds, way of playing, and encoder."""
     source = run.sources[0]
-    return source.settings["protocol"], source.settings["seeds"], source.acting, source.playing, source.encoder
+    playing = [source.detail(name) or False for name in ("acting", "sampled", "forget", "encoder")]
+    return source.settings["protocol"], source.settings["seeds"], playing
 
 
-def cell_order(cell: Cell) -> tuple[tuple[int, str], tuple[int, str], str]:
-    """Returns the sort key of a cell in the paper's order."""
-    return layout_order(cell[0]), family_order(family_of(cell)), cell[1]
+def published_test_tasks() -> dict[str, Task]:
+    """Return the 160 published test tasks by id."""
+    return _bundled_by_id("test")
 
 
-def group_title(group: str) -> str:
-    """Returns a group of teammates as people read it: learned teammates, family "rl", are called "learned"."""
-    family, space, kind = group.partition(" ")
-    return f"{'learned' if family == 'rl' else family}{space}{kind}"
+def shipped_validation_tasks() -> dict[str, Task]:
+    """Return the package's validation tasks with teammates of the published training ranges, by id."""
+    return _bundled_by_id("validation")
 
 
-def family_of(cell: Cell) -> str:
-    """Returns the teammate family of a cell."""
-    return cell[1].partition(" ")[0]
+@cache
+def _bundled_by_id(split: str) -> dict[str, Task]:
+    return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
 
 
-def group_of(cell: Cell) -> str:
-    """Returns the kind of a cell's tasks: "test" for published test tasks, otherwise one of `GROUP_TEXTS`."""
-    return cell[1].partition(" (")[2].removesuffix(")") or "test"
+@cache
+def _instances() -> Counter[tuple[str, str]]:
+    return Counter((task.layout.name, task.teammate_family) for task in published_test_tasks().values())
 
 
-def split_cells(cells: Iterable[Cell], most: int) -> list[list[Cell]]:
-    """Returns cells in lists of at most `most`, such as for pictures, in the paper's order.
+def published_instances(cell: ResultCell) -> int:
+    """Return the number of published test tasks of a cell; 0 for cells of other kinds."""
+    return _instances()[cell.layout, cell.family] if cell.kind == "test" else 0
+
+
+def cell_of(task: Task) -> ResultCell:
+    """Return the cell of a task."""
+    kind = _KIND_OF_SPLIT[task.split]
+    if task.task_id in published_test_tasks():
+        kind = "test"
+    elif task.task_id in _bundled_by_id("diverse"):
+        kind = "diverse"
+    return ResultCell(task.layout.name, task.teammate_family, kind)
+
+
+def instances_range(numbers: Iterable[int]) -> str:
+    """Return numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
+    found = sorted(set(numbers))
+    return counted_noun(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
+
+
+def family_title(family: str) -> str:
+    """Return a family of teammates as people read it."""
+    return "learned" if family == "rl" else family
+
+
+def split_cells(cells: Iterable[ResultCell], most: int) -> list[list[ResultCell]]:
+    """Return cells in lists of at most `most`, such as for pictures.
 
     A list has one kind of tasks, and all cells of a layout unless these are more than `most`.
     """
-    by_layout: dict[tuple[str, str], list[Cell]] = {}
-    for cell in sorted(cells, key=cell_order):
-        by_layout.setdefault((group_of(cell), cell[0]), []).append(cell)
-    split: list[list[Cell]] = []
-    for (kind, _), of_layout in sorted(by_layout.items(), key=lambda found: _KINDS.index(found[0][0])):
+    by_layout: dict[tuple[int, str], list[ResultCell]] = {}
+    for cell in sorted(cells, key=lambda cell: cell.order):
+        by_layout.setdefault((list(TASK_KINDS).index(cell.kind), cell.layout), []).append(cell)
+    split: list[list[ResultCell]] = []
+    for _, of_layout in sorted(by_layout.items(), key=lambda found: found[0][0]):
         for start in range(0, len(of_layout), most):
             part = of_layout[start : start + most]
-            if split and group_of(split[-1][0]) == kind and len(split[-1]) + len(part) <= most:
+            if split and split[-1][0].kind == part[0].kind and len(split[-1]) + len(part) <= most:
                 split[-1] += part
             else:
                 split.append(part)
     return split
 
 
-def groups_of(cells: Iterable[Cell]) -> list[str]:
-    """Returns the groups of teammates of cells, such as "H4" and "H4 (training)", in the paper's order."""
-    return list(dict.fromkeys(group for _, group in sorted(cells, key=lambda cell: cell_order(cell)[1:])))
-
-
 @cache
 def read_published() -> dict[str, Any]:
-    """Returns the paper's numbers, each part with its source, from cards/published.json."""
+    """Return the paper's numbers, each part with its source, from cards/published.json."""
     return parse_json(read_text(card_file("published.json")))
 
 
 def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
-    """Returns layout -> family or "Average" -> published mean and std; empty for an agent that is not in the paper."""
+    """Return layout -> family or "Average" -> published mean and std; empty for an agent that is not in the paper."""
     return read_published()["methods"].get(agent, {})
-
-
-def normalise(returns: Returns, references: Mapping[str, float]) -> Returns:
-    """Returns (return - stay) / (oracle - stay).
-
-    Args:
-        returns: a return, or float64 (U,), in a cell with headroom.
-        references: reference ego -> its mean return in the cell.
-    """
-    return (returns - references["stay"]) / (references["oracle"] - references["stay"])
-
-
-def normalized_return(mean: float, references: Mapping[str, float] | None) -> float | None:
-    """Returns the normalised mean return of a cell, or None if the cell has no headroom or was not measured.
-
-    Args:
-        mean: mean return of a cell.
-        references: reference ego -> its mean return in the cell.
-    """
-    if references is None or not has_headroom(references):
-        return None
-    return normalise(mean, references)
-
-
-def normalised_score(run: EvaluationRun, cell: Cell, headroom: Mapping[Cell, Mapping[str, float]]) -> float | None:
-    """Returns the normalised return of a cell of a run, see `normalized_return`.
-
-    None also if the results are not of the tasks and the episode length that the references were measured with.
-
-    Args:
-        run: results.
-        cell: one of the run's cells.
-        headroom: cell -> reference ego -> its mean return.
-    """
-    if not run.is_complete(cell) or not run.has_usual_steps(cell):
-        return None
-    return normalized_return(float(run.means(cell).mean()), headroom.get(cell))

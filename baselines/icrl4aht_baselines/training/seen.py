@@ -1,11 +1,12 @@
-"""Layouts and teammates that a model has seen in training, which reports compare with those it is tested on."""
+"""Layouts and teammates that a model has seen in training, and their overlap with the tasks it is tested on."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS, all_families
+from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 
@@ -76,3 +77,77 @@ def _read_entry(entry: Any, where: str) -> tuple[str, tuple[str, ...], list[str]
     except UnknownNameError as error:
         raise OptionError(f"{where}: {TRAINED_ON}: {error}") from error
     return name, (algorithm,) if algorithm else kinds, ids if ids is None else list(ids)
+
+
+class OverlapKind(NamedTuple):
+    """One way in which the training data and the tasks of an evaluation overlap.
+
+    Attributes:
+        mark: character behind a score.
+        meaning: explanation of the mark, for the reader of a table.
+    """
+
+    mark: str
+    meaning: str
+
+
+OVERLAPS = {
+    "teammate": OverlapKind("‡", "the agent was trained with one of these very teammates"),
+    "family": OverlapKind(
+        "†",
+        "the agent was trained with other teammates of this family, or of this algorithm if they are learned; members "
+        "of a family may act alike, so this is no result with unknown kinds of teammates",
+    ),
+    "layout": OverlapKind("§", "the agent was trained on this layout, which the track reserves for tests"),
+    "unknown": OverlapKind("?", "unknown training data: nothing says what the agent was trained on"),
+}
+"""Name in reports -> kind of overlap, in the order of marks."""
+
+
+def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[str, ...]:
+    """Return the names of the kinds of overlap between tasks and training data, in the order of `OVERLAPS`.
+
+    Args:
+        tasks: tasks that an agent was evaluated on.
+        seen: what it was trained on; None if that is not known.
+    """
+    if seen is None:
+        return ("unknown",)
+    found = set()
+    for task in tasks:
+        if task.teammate_kind in seen.teammates:
+            known = teammate_id(task.teammate) in (seen.teammates[task.teammate_kind] or ())
+            found.add("teammate" if known else "family")
+        # Other tasks than the tests of the layout track are on training layouts by design.
+        if (task.track, task.split) == ("layout", "test") and task.layout.name in seen.layouts:
+            found.add("layout")
+    return tuple(name for name in OVERLAPS if name in found)
+
+
+def overlap_marks(overlaps: Iterable[str]) -> str:
+    """Return the marks of kinds of overlap, such as " †§"; empty if there is none."""
+    found = set(overlaps)
+    marks = "".join(kind.mark for name, kind in OVERLAPS.items() if name in found)
+    return f" {marks}" if marks else ""
+
+
+def overlap_legend(overlaps: Iterable[str]) -> list[str]:
+    """Return an explanation of each mark, such as "† ...", in the order of `OVERLAPS`."""
+    found = set(overlaps)
+    return [f"{kind.mark} {kind.meaning}" for name, kind in OVERLAPS.items() if name in found]
+
+
+def describe_overlap(overlaps: Iterable[str]) -> str:
+    """Return a sentence on kinds of overlap."""
+    texts = [OVERLAPS[name].meaning for name in OVERLAPS if name in set(overlaps)]
+    return f"Overlap with the training data: {'; '.join(texts)}." if texts else "No overlap with the training data."
+
+
+def describe_training(seen: SeenInTraining | None) -> str:
+    """Return layouts and teammates in training as text, such as "demo_wide; with utility_greedy (1), fcp (5)"."""
+    if seen is None:
+        return "unknown"
+    if not seen.layouts and not seen.teammates:
+        return "not trained"
+    kinds = [f"{kind} ({'number unknown' if ids is None else len(ids)})" for kind, ids in seen.teammates.items()]
+    return f"{', '.join(seen.layouts)}; with {', '.join(kinds)}"

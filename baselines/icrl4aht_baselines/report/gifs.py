@@ -14,9 +14,9 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent
 from icrl4aht_baselines.evaluate.evaluator import play_tasks
 from icrl4aht_baselines.evaluate.protocols import Protocol
-from icrl4aht_baselines.report.overlap import describe_overlap
-from icrl4aht_baselines.report.results import EvaluationRun, ResultSource, cell_of, cell_order, group_of, groups_of
-from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
+from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, ResultSource
+from icrl4aht_baselines.report.scores import cell_scores
+from icrl4aht_baselines.training.seen import describe_overlap
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.layouts import Layout
@@ -24,6 +24,8 @@ from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.utils.system import usable_cores
 
 _PROGRESS = "episodes of the report"
+
+MakeEgo = Callable[[Layout], Policy]
 
 
 class ShownEpisode(NamedTuple):
@@ -44,13 +46,13 @@ class EpisodePair(NamedTuple):
     """The first and the last episode of a task that a reported agent played with a teammate of one family.
 
     Attributes:
-        family: of the teammate.
-        title: who plays on which layout.
+        cell: cell of the task.
+        title: agent, teammate and layout.
         caption: the task and the training data; or why there is no picture.
         episodes: the first and the last episode, one if the task has only one, none if the agent cannot be restored.
     """
 
-    family: str
+    cell: ResultCell
     title: str
     caption: str
     episodes: tuple[ShownEpisode, ...] = ()
@@ -59,14 +61,14 @@ class EpisodePair(NamedTuple):
 def save_episodes(
     paths: Mapping[int, Path],
     task: Task,
-    make_ego: Callable[[Layout], Policy],
+    make_ego: MakeEgo,
     protocol: Protocol,
     *,
     seed: int = 0,
     cell: int = 32,
     suite: Path | None = None,
 ) -> tuple[ShownEpisode, ...]:
-    """Play a task, and write some of its episodes as GIFs. Returns them; they earn what `evaluate` stores.
+    """Play a task, and write some of its episodes as GIFs. Return them; they earn what `evaluate` stores.
 
     Args:
         paths: number of an episode, from 1 -> path of its GIF. Later episodes than these are not played.
@@ -94,7 +96,7 @@ def family_gifs(
     The task is on a layout where that family leaves headroom, if there is one among the results.
 
     Args:
-        runs: what is reported.
+        runs: the results.
         folder: for the GIFs.
         suite: folder of learned teammates' checkpoints.
         progress: called with (description, tasks drawn, tasks), from the calling thread.
@@ -104,18 +106,16 @@ def family_gifs(
     """
     chosen = []
     for run in runs:
-        headroom = read_headroom(run.protocol)
-        played = [(source, cell) for source in run.sources for cell in source.tasks]
-        for family in groups_of(cell for _, cell in played):
-            of_family = [found for found in played if found[1][1] == family]
-            open_cells = [found for found in of_family if found[1] in headroom and has_headroom(headroom[found[1]])]
-            source, cell = min(open_cells or of_family, key=lambda found: cell_order(found[1]))
-            chosen.append((run, source, source.tasks[cell][0]))
-    egos = {source.folder: _restore(source) for _, source, _ in chosen}
+        scores = cell_scores(run)
+        for group in dict.fromkeys(cell[1:] for cell in sorted(run.cells, key=lambda cell: cell.order[1:])):
+            cells = [cell for cell in run.cells if cell[1:] == group]
+            chosen.append((run, next((cell for cell in cells if scores[cell].has_headroom), cells[0])))
+    sources = {source.folder: source for source in (run.source(cell) for run, cell in chosen)}
+    egos = {name: _restore(source) for name, source in sources.items()}
 
     def draw(number: int) -> EpisodePair:
-        run, source, task = chosen[number]
-        return _draw_result(run, source, task, egos[source.folder], folder / str(number), suite)
+        run, cell = chosen[number]
+        return _draw_result(run, cell, egos[run.source(cell).folder], folder / str(number), suite)
 
     progress(_PROGRESS, 0, len(chosen))
     with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes longer than playing
@@ -127,39 +127,33 @@ def family_gifs(
 
 
 def _draw_result(
-    run: EvaluationRun,
-    source: ResultSource,
-    task: Task,
-    ego: Callable[[Layout], Policy] | Icrl4ahtError,
-    prefix: Path,
-    suite: Path | None,
+    run: EvaluationRun, cell: ResultCell, ego: MakeEgo | Icrl4ahtError, prefix: Path, suite: Path | None
 ) -> EpisodePair:
+    source, task = run.source(cell), run.tasks(cell)[0]
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
-    family = task.teammate_family
-    group = group_of(cell_of(task))
-    kind = "" if group == "test" else f" ({group})"  # a number without it names a published teammate
-    title = f"{run.label} with {family}/t{task.teammate['theta_id']}{kind} on {task.layout.name}"
-    trained = describe_overlap([task], source.seen)
-    origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {trained}"
+    # A number without a kind of tasks names a published teammate.
+    kind = "" if cell.kind == "test" else f" ({cell.kind})"
+    title = f"{run.label} with {cell.family}/t{task.teammate['theta_id']}{kind} on {cell.layout}"
+    origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {describe_overlap(run.overlaps([cell]))}"
     try:
         if isinstance(ego, Icrl4ahtError):
             raise ego
         paths = {number: prefix.with_name(f"{prefix.name}-{number}.gif") for number in (1, protocol.episodes)}
         shown = save_episodes(paths, task, ego, protocol, seed=seed, cell=24, suite=suite)
-        return EpisodePair(family, title, origin, shown)
+        return EpisodePair(cell, title, origin, shown)
     except Icrl4ahtError as error:
-        return EpisodePair(family, title, f"No picture: {error}. {origin}")
+        return EpisodePair(cell, title, f"No picture: {error}. {origin}")
 
 
-def _restore(source: ResultSource) -> Callable[[Layout], Policy] | Icrl4ahtError:
+def _restore(source: ResultSource) -> MakeEgo | Icrl4ahtError:
     try:
         return restore_ego(source)
     except Icrl4ahtError as error:
         return error
 
 
-def restore_ego(source: ResultSource) -> Callable[[Layout], Policy]:
-    """Returns the function that makes the ego of some results, layout -> policy.
+def restore_ego(source: ResultSource) -> MakeEgo:
+    """Return the function that makes the ego of some results, layout -> policy.
 
     Raises:
         OptionError: if the ego is neither a reference ego nor trained, or its run folder is missing or has changed.
@@ -167,9 +161,9 @@ def restore_ego(source: ResultSource) -> Callable[[Layout], Policy]:
     name, details = source.settings["agent"], dict(source.settings.get("details", {}))
     if name in AGENTS:
         return AGENTS[name]
-    if source.trained is None and "model" not in details:
+    folder = details.get("model") or (source.trained or {}).get("run")
+    if folder is None:
         raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor of a run folder")
-    folder = details.get("model") or (source.trained or {})["run"]
     if "model" not in details and not Path(folder).is_dir():
         raise OptionError(f"its run folder {folder} is missing")
     details.pop("variant", None)

@@ -1,0 +1,252 @@
+"""Cards made of results, in Markdown: of trained models, and of the headroom of the benchmark."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
+from html import escape
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from icrl4aht_baselines.agents.egos import AGENTS
+from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.methods.options import UNUSED_OPTIONS
+from icrl4aht_baselines.report.page import markdown_sections
+from icrl4aht_baselines.report.results import (
+    TEST_LAYOUTS,
+    EvaluationRun,
+    ResultSource,
+    as_run,
+    instances_range,
+    published_cells,
+)
+from icrl4aht_baselines.report.scores import PAPER_METHODS, cell_scores
+from icrl4aht_baselines.training.options import FILTERS, HistoryOptions
+from icrl4aht_baselines.training.seen import (
+    TASKS_SOURCE,
+    TRAINED_ON,
+    describe_training,
+    overlap_legend,
+)
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
+from icrl4aht_data.utils.progress import counted
+from icrl4aht_data.utils.templates import fill_template, markdown_table
+
+CARD_BEGINS = b"---\nlicense: mit\nlibrary_name: icrl4aht-data\n"
+"""First bytes of a model's card, by which it is recognised before it is replaced."""
+
+HEADROOM_BEGINS: dict[str, bytes | tuple[bytes, ...]] = {
+    "headroom.json": tuple(f'{{\n "{name}": {{\n  "'.encode() for name in PROTOCOLS),
+    "headroom.md": b"# Headroom: what an ego can change\n",
+}
+"""Files with the headroom -> their first bytes, by which they are recognised before they are replaced."""
+
+_HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
+_NOT_LISTED = ("layouts", "root", "split", "labels", "held_out", "obs", "channels", "hide_recipe", *FILTERS)
+
+HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
+"""Layout -> family -> reference ego -> mean return."""
+
+
+def model_card(
+    run: EvaluationRun,
+    title: str = "",
+    command: str = "",
+    validation: Sequence[EvaluationRun] = (),
+    pictures: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """Return README.md of a model, to publish with its run folder.
+
+    Args:
+        run: results of a model that was trained here. A run that was merged from models of several layouts has one
+            card, with a row of the table of models for each, and settings for each that differ. Several results of
+            one model are one row.
+        title: name of the model; by default the agent's.
+        command: command that makes the model.
+        validation: further results of the model, on validation tasks under the same protocol, which get tables, too.
+        pictures: path of a picture with curves, relative to the card -> what it shows.
+    """
+    models: dict[str, list[ResultSource]] = defaultdict(list)
+    settings: dict[str, list[ResultSource]] = defaultdict(list)
+    for source in run.sources:
+        if source.trained:
+            models[source.trained["run_hash"]].append(source)
+            settings[_settings(source.trained["config"])].append(source)
+    config = next(iter(models.values()))[0].trained["config"]  # type: ignore[index]
+    histories, on_hub = config["histories"], _HUB.match(config["histories"]["root"])
+    seeds = dict.fromkeys(str(sources[0].trained["config"]["train"]["seed"]) for sources in models.values())  # type: ignore[index]
+    single = "It is one run" if len(models) == 1 else "Each model is one run"
+    limits = [
+        f"{single}, of seed {', '.join(seeds)}: the variation between seeds is not known.",
+        "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
+        *overlap_legend(dict.fromkeys(name for one in (run, *validation) for name in one.overlaps(one.cells))),
+    ]
+    name = escape(title or run.agent, quote=False)
+    method = config["method"] if title else name
+    dataset = on_hub[1] if on_hub else "icrl4aht"
+    properties = {
+        "method": method,
+        "data": f"{dataset}, data version {histories['data_version']}",
+        "created with": f"icrl4aht-data {config['package_version']}",
+        "made by": command and f"`{command}`",
+    }
+    sections = [section for one in (run, *validation) for section in markdown_sections([one], one.protocol)]
+    shown = [f"{text}:\n\n![{Path(at).stem}]({at})" for at, text in pictures.items()]
+    listed = [f"Tested on {_layouts(of)}:\n\n{text}" if len(settings) > 1 else text for text, of in settings.items()]
+    return fill_template(
+        "baseline.md",
+        title=name,
+        method=method,
+        dataset=dataset,
+        properties="\n".join(f"| {name} | {value} |" for name, value in properties.items() if value),
+        models="\n".join(_model_row(run, sources) for sources in models.values()),
+        settings="\n\n".join(listed),
+        protocol=run.protocol,
+        results="\n\n".join(f"#{section}" for section in sections),
+        curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
+        limits="\n".join(f"* {limit}" for limit in limits),
+    )
+
+
+def _layouts(sources: Sequence[ResultSource]) -> str:
+    return ", ".join(dict.fromkeys(layout for source in sources for layout in source.layouts))
+
+
+def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
+    """Return a row of the table of models: training data and seed of one model, and its evaluation."""
+    trained: dict[str, Any] = sources[0].trained or {}
+    config, histories = trained["config"], trained["config"]["histories"]
+    layouts = ", ".join(histories["layouts"])
+    if "groups" in histories:  # trained by playing
+        others = sum(cell["tasks"] for cell in config.get(TRAINED_ON, ()) if cell.get("source") == TASKS_SOURCE)
+        selection = f"none: {sum(histories['groups'].values())} tasks at a time, played with the teammates of the "
+        selection += f"release's histories of {layouts}"
+        selection += f", and with those of {others} other tasks" if others else ""
+    else:
+        selection = f"{histories['sizes']['train']} of {layouts}"
+    instances = instances_range(len(run.cells[cell]) for source in sources for cell in source.tasks)
+    values = [
+        _layouts(sources),
+        f"{selection}; the release's manifest has SHA-256 `{trained['manifest_sha256']}`",
+        describe_training(sources[0].seen),
+        str(config["train"]["seed"]),
+        f"{sources[0].conditions}, {instances} in a cell",
+    ]
+    return f"| {' | '.join(values)} |"
+
+
+def _settings(config: Mapping[str, Any]) -> str:
+    """Return the settings of a model as a list."""
+    histories, unused = config["histories"], UNUSED_OPTIONS.get(config.get("method", ""), ())
+    settings = {name: value for name, value in (config["model"] | config["train"]).items() if name not in unused}
+    # Models of earlier versions have a layout's own channels.
+    settings |= {**config.get("play", {}), "channels": histories.get("channels", "own")}
+    init = config.get("init")
+    made_by = {cell["source"] for cell in config.get(TRAINED_ON, ()) if "source" in cell}
+    given = {
+        "sources of histories": ", ".join(sorted(made_by)),
+        "labels": histories.get("labels"),
+        **{
+            name: histories[name]
+            for name, default in asdict(HistoryOptions(())).items()
+            if name not in _NOT_LISTED and histories.get(name, default) != default
+        },
+        "hidden recipe indicators": ", ".join(histories.get("hide_recipe", ())),
+        "started from run": init.get("run") if isinstance(init, dict) else None,
+    }
+    settings |= {name: value for name, value in given.items() if value}
+    return "\n".join(f"* {name.replace('_', ' ')}: {value}" for name, value in settings.items())
+
+
+def write_model_cards(runs: Iterable[EvaluationRun], folder: Path) -> list[Path]:
+    """Write the card of every model that was trained here into a folder. Return their paths, NAME.md by run's name."""
+    trained = [run for run in runs if any(source.trained for source in run.sources)]
+    paths = [folder / card_name(run) for run in trained]
+    for path, run in zip(paths, trained, strict=True):
+        path.write_text(model_card(run), encoding="utf-8")
+    return paths
+
+
+def card_name(run: EvaluationRun) -> str:
+    """Return the file name of a model's card."""
+    return f"{re.sub(r'[^A-Za-z0-9+]+', '-', run.name).strip('-')}.md"
+
+
+def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:
+    """Evaluate every reference ego under every protocol into out/<protocol>/<agent>; finished tasks are kept.
+
+    Args:
+        out: folder of the results.
+        protocols: their names.
+        show: called with (name, tasks done, tasks), for progress.
+    """
+    tasks = [task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))]
+    runs = []
+    for protocol in protocols:
+        for agent in REFERENCES:
+            done = counted(show, f"{agent}, {protocol}", len(tasks))
+            folder = out / protocol / agent
+            runs.append(as_run(evaluate(agent, AGENTS[agent], tasks, get_protocol(protocol), out=folder, done=done)))
+    return runs
+
+
+def write_headroom_cards(runs: Sequence[EvaluationRun], folder: Path) -> list[Path]:
+    """Write headroom.json and headroom.md into a folder. Return their paths.
+
+    headroom.json holds protocol -> layout -> family -> reference ego -> mean return.
+    """
+    content: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    for run in runs:
+        for cell, score in cell_scores(run).items():
+            egos = content.setdefault(run.protocol, {}).setdefault(cell.layout, {}).setdefault(cell.family, {})
+            egos[run.agent] = round(float(score.means.mean()), 3)
+    paths = [folder / name for name in HEADROOM_BEGINS]
+    paths[0].write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    paths[1].write_text(headroom_markdown(content), encoding="utf-8")
+    return paths
+
+
+def headroom_markdown(protocols: Mapping[str, HeadroomCells]) -> str:
+    """Return the headroom card: protocol -> cells, as Markdown."""
+    lines = [
+        "# Headroom: what an ego can change",
+        "",
+        "Mean return of the reference egos `stay` / `random` / `oracle` (scripted, full information) over the five",
+        "published test instances of a cell, each played with seed 0 for 100 episodes of 100 steps. **bold**: the",
+        "oracle gets over one point more than staying does; elsewhere no reference ego can raise the return by more,",
+        "so a method's score there says nothing about adaptation.",
+    ]
+    for protocol, layouts in protocols.items():
+        names = [layout for layout in TEST_LAYOUTS if layout in layouts]
+        cells = {(layout, family): cell for layout in names for family, cell in layouts[layout].items()}
+        lines += ["", f"## Protocol `{protocol}`", "", headroom_table(cells, names)]
+    if "published" in protocols:
+        lines += ["", "## The paper's methods and the reference egos", "", published_table(protocols["published"])]
+    return "\n".join(lines) + "\n"
+
+
+def published_table(layouts: HeadroomCells) -> str:
+    """Return a Markdown table of reference egos and the paper's methods: a row per layout, means over families.
+
+    Args:
+        layouts: measured under the protocol `published`.
+    """
+    body, paper = [], ("random", *PAPER_METHODS)
+    for layout in (name for name in TEST_LAYOUTS if name in layouts):
+        cells = layouts[layout]
+        egos = {agent: np.mean([cell[agent] for cell in cells.values()]) for agent in REFERENCES}
+        stated = [np.mean([published_cells(name)[layout][family][0] for family in cells]) for name in paper]
+        numbers = [egos["stay"], egos["random"], *stated, egos["oracle"]]
+        open_count = sum(map(has_headroom, cells.values()))
+        body.append([layout, *(f"{number:z.1f}" for number in numbers), f"{open_count} of {len(cells)}"])
+    names = ["stay", "random", *(f"{name} (paper)" for name in paper), "oracle", "cells with headroom"]
+    return markdown_table(["layout", *names], body)
