@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -14,27 +14,17 @@ from rich.console import Console
 from icrl4aht_baselines.agents.egos import AGENTS, find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
-from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
 from icrl4aht_baselines.plotting import plot_family_curves
-from icrl4aht_baselines.report.lead import (
-    FLOOR,
-    FamilyReturns,
-    describe_rise,
-    family_returns,
-    find_lead,
-    lead_table,
-    lead_verdict,
-)
-from icrl4aht_baselines.report.overlap import overlap_legend
-from icrl4aht_baselines.report.page import write_page_with_episodes
-from icrl4aht_baselines.report.rendering import check_can_render
-from icrl4aht_baselines.report.results import EvaluationRun, note_results, read_run, shipped_validation_tasks
+from icrl4aht_baselines.report.page import check_can_render, write_page_with_episodes
+from icrl4aht_baselines.report.results import note_results, read_run, shipped_validation_tasks
+from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
+from icrl4aht_baselines.training.seen import overlap_legend
 from icrl4aht_baselines.training.trainer import format_loss, train
-from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, family_order
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
@@ -45,6 +35,12 @@ from icrl4aht_data.plotting import check_can_draw, plot_layout_curves
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.new_file import check_new_file
 from icrl4aht_data.utils.progress import counted, progress_bars
+
+FLOOR = ("stay", "random")
+"""Reference egos that an agent has to exceed before its return says anything."""
+
+FamilyReturns = dict[str, dict[str, np.ndarray]]
+"""Teammate family -> agent -> returns (U, E) of U pairs of a task and a seed in E episodes."""
 
 DEMO_LAYOUT = "demo_wide"
 _MODEL = ModelOptions(**SIZES["tiny"].model)
@@ -79,6 +75,28 @@ class DemoSettings:
     seeds: Sequence[int] = range(10)
 
 
+class Lead(NamedTuple):
+    """Difference between an agent's mean return and that of the better of two reference egos with one family.
+
+    Attributes:
+        difference: per episode, with its 95 % bootstrap interval over pairs of a task and a seed.
+        better: whether the intervals of the differences to both reference egos are above 0.
+    """
+
+    difference: MeanInterval
+    better: bool
+
+
+def find_lead(returns: Mapping[str, np.ndarray], agent: str) -> Lead:
+    """Return an agent's lead with one family: agent -> returns (U, E).
+
+    Differences are paired, since episodes of a task and a seed start alike for all agents.
+    """
+    own = returns[agent].mean(axis=1)
+    differences = [mean_interval(own - returns[name].mean(axis=1)) for name in FLOOR]
+    return Lead(min(differences), all(found.low > 0 for found in differences))
+
+
 def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) -> Path:
     """Load, sample, verify, train, evaluate, report, and print what is done.
 
@@ -98,8 +116,11 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     check_can_render()
     started = time.perf_counter()
     settings = settings or DemoSettings()
-    model, training = settings.model, settings.training
-    curves, episode, picture, page = _output_files(out)
+    paths = [out / name for name in ("learning_curves.png", "episode.gif", "adaptation.png", "report.html")]
+    for path in paths:
+        check_new_file(path, overwrite=(out / "ad").is_dir())  # of a stopped run
+    out.mkdir(parents=True, exist_ok=True)
+    curves, episode, picture, page = paths
 
     def say(number: int, text: str) -> None:
         console.print(f"[bold]{number}/{_STEPS}[/bold] ({time.perf_counter() - started:.0f} s) {text}")
@@ -121,44 +142,37 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     write(_verify(settings.root))
 
     targets = f"{settings.labels} labels" if settings.labels else "the actions taken"
+    model, training = settings.model, settings.training
     size = f"{model.layers} layers of width {model.width}, K = {training.context}"
     say(4, f"training AD on {targets}, {size}: {training.steps} steps")
     _train_demo(out / "ad", settings)
     write(f"losses on training and held-out histories: {out / 'ad' / RUN_CURVES}")
 
-    tasks = _demo_tasks() if settings.tasks is None else settings.tasks
+    tasks = settings.tasks
+    if tasks is None:
+        tasks = tuple(task for task in shipped_validation_tasks().values() if task.layout.name == DEMO_LAYOUT)
     others = [*AGENTS, *([settings.reference] if settings.reference else [])]
     say(5, f"evaluating it and {', '.join(others)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
-    compared = _evaluate_all(out, tasks, settings)
-    write(lead_table(compared.families, compared.agent))
+    returns = {name: _evaluate(name, out, tasks, settings) for name in (*others, str(out / "ad"))}
+    runs = [read_run(folder) for folder, _ in returns.values()]
+    agent, by_agent = runs[-1].agent, {run.agent: of for run, (_, of) in zip(runs, returns.values(), strict=True)}
+    families = _by_family(tasks, by_agent)
+    leads = {family: find_lead(found, agent) for family, found in families.items()}
+    write(_lead_table(families, leads, agent))
 
     say(6, "drawing the curves and the report")
-    _draw_families(compared, picture)
-    write_page_with_episodes(compared.runs, page)
+    title = f"{agent} on {DEMO_LAYOUT} with validation teammates: return in each episode of a task"
+    notes = {family: f"{_signed(lead.difference)} above {' and '.join(FLOOR)}" for family, lead in leads.items()}
+    plot_family_curves(families, agent, picture, title, notes)
+    write_page_with_episodes(runs, page)
     write(f"return in each episode: {picture}\nreport: {page}")
-    write(f"done in {time.perf_counter() - started:.0f} s\n\n{_conclusion(compared)}")
+    write(f"done in {time.perf_counter() - started:.0f} s\n")
+    write("\n".join([*overlap_legend(runs[-1].overlaps(runs[-1].cells)), *_conclusion(families, leads, agent)]))
     return page
 
 
-def _output_files(out: Path) -> list[Path]:
-    """Returns the paths of the files to write into a folder, which is made."""
-    paths = [out / name for name in ("learning_curves.png", "episode.gif", "adaptation.png", "report.html")]
-    for path in paths:
-        check_new_file(path, overwrite=(out / "ad").is_dir())  # of a stopped run
-    out.mkdir(parents=True, exist_ok=True)
-    return paths
-
-
-class _Compared(NamedTuple):
-    """Evaluated agents, the trained one last."""
-
-    agent: str
-    runs: list[EvaluationRun]
-    families: list[FamilyReturns]
-
-
 def _verify(root: Path) -> str:
-    """Returns text on what was verified."""
+    """Return text on what was verified."""
     report = verify_release(root, level="deep")
     if not report.ok:
         raise ReleaseError(f"{root}: {report.findings[0].file}: {report.findings[0].problem}")
@@ -176,58 +190,69 @@ def _train_demo(folder: Path, settings: DemoSettings) -> None:
         train(job.method, job.data, job.options, folder, job.about, done=done)
 
 
-def _demo_tasks() -> tuple[Task, ...]:
-    return tuple(task for task in shipped_validation_tasks().values() if task.layout.name == DEMO_LAYOUT)
+def _evaluate(name: str, out: Path, tasks: Sequence[Task], settings: DemoSettings) -> tuple[Path, list[np.ndarray]]:
+    """Evaluate an agent. Return the folder of its results, and its returns in each task, (seeds, episodes)."""
+    agent = find_agent(name)
+    folder = out / "results" / agent.name
+    total = len(tasks) * len(settings.seeds) * settings.protocol.episodes
+    with progress_bars(unit="episodes") as show:
+        results = evaluate(
+            agent.name,
+            agent.make,
+            tasks,
+            settings.protocol,
+            seeds=settings.seeds,
+            out=folder,
+            details=agent.details,
+            played=counted(show, agent.name, total),
+        )
+    note_results(folder, agent.run, tasks)
+    return folder, [np.array(result.returns) for result in results]
 
 
-def _evaluate_all(out: Path, tasks: Sequence[Task], settings: DemoSettings) -> _Compared:
-    """Evaluate the reference egos and the trained model."""
-    protocol, seeds = settings.protocol, settings.seeds
-    results: dict[str, list[Result]] = {}
-    runs = []
-    references = [settings.reference] if settings.reference else []
-    for name in (*AGENTS, *references, str(out / "ad")):
-        agent = find_agent(name)
-        folder = out / "results" / agent.name
-        with progress_bars(unit="episodes") as show:
-            results[agent.name] = evaluate(
-                agent.name,
-                agent.make,
-                tasks,
-                protocol,
-                seeds=seeds,
-                out=folder,
-                details=agent.details,
-                played=counted(show, agent.name, len(tasks) * len(seeds) * protocol.episodes),
-            )
-        note_results(folder, agent.run, tasks)
-        runs.append(read_run(folder))
-    return _Compared(runs[-1].agent, runs, family_returns(tasks, results))
+def _by_family(tasks: Sequence[Task], returns: Mapping[str, Sequence[np.ndarray]]) -> FamilyReturns:
+    found: FamilyReturns = {}
+    for family in sorted({task.teammate_family for task in tasks}, key=family_order):
+        chosen = [number for number, task in enumerate(tasks) if task.teammate_family == family]
+        found[family] = {agent: np.concatenate([of[number] for number in chosen]) for agent, of in returns.items()}
+    return found
 
 
-def _draw_families(compared: _Compared, path: Path) -> None:
-    notes = {}
-    for of_family in compared.families:
-        lead = find_lead(of_family, compared.agent)
-        notes[of_family.family] = f"{lead.mean:+.1f} above {' and '.join(FLOOR)} ({lead.low:+.1f} to {lead.high:+.1f})"
-    panels = {of_family.family: of_family.returns for of_family in compared.families}
-    title = f"{compared.agent} on {DEMO_LAYOUT} with validation teammates: return in each episode of a task"
-    plot_family_curves(panels, compared.agent, path, title, notes)
+def _signed(found: MeanInterval) -> str:
+    return f"{found.mean:+.1f} (95 % interval {found.low:+.1f} to {found.high:+.1f})"
 
 
-def _conclusion(compared: _Compared) -> str:
-    """Returns what was measured and its limits, in a few lines; the last one is the verdict."""
-    run, families = compared.runs[-1], compared.families
-    episodes = families[0].returns[compared.agent].shape[1]
-    pairs = ", ".join(f"{of_family.family} {len(of_family.returns[compared.agent])}" for of_family in families)
-    lines = [
-        *overlap_legend(run.overlaps(run.cells)),
-        f"Measured on {episodes} episodes of each task and seed ({pairs}). It is one training run: the intervals leave "
-        f"out how much trainings differ. Validation tasks are for choosing models, so this is no test result.",
-        f"Within a task, {describe_rise(families, compared.agent)}.",
-        f"{lead_verdict(families, compared.agent)}.",
-    ]
+def _lead_table(families: FamilyReturns, leads: Mapping[str, Lead], agent: str) -> str:
+    """Return text with a line per family: mean returns of all agents, and the lead of one of them."""
+    names = list(next(iter(families.values())))
+    widths = [max(9, len(name) + 2) for name in names]
+    head = "".join(f"{name:>{width}}" for name, width in zip(names, widths, strict=True))
+    lines = [f"family{head}   {agent} - better of {' and '.join(FLOOR)}"]
+    for family, returns in families.items():
+        means = "".join(f"{returns[name].mean():>{width}.1f}" for name, width in zip(names, widths, strict=True))
+        lines.append(f"{family:6}{means}   {_signed(leads[family].difference)}")
     return "\n".join(lines)
+
+
+def _conclusion(families: FamilyReturns, leads: Mapping[str, Lead], agent: str) -> list[str]:
+    """Return what was measured and its limits, in a few lines; the last one is the verdict."""
+    own = {family: returns[agent] for family, returns in families.items()}
+    curve = np.mean([returns.mean(axis=0) for returns in own.values()], axis=0)
+    half, pairs = len(curve) // 2, ", ".join(f"{family} {len(returns)}" for family, returns in own.items())
+    better = [family for family, lead in leads.items() if lead.better]
+    others, floor = [family for family in leads if family not in better], " and ".join(FLOOR)
+    verdict = f"{agent} earns no more than {floor} with any of these families: {', '.join(others)}."
+    if better:
+        missed = f"; no more with {', '.join(others)}" if others else ""
+        count = f"{len(better)} of {len(leads)} families"
+        verdict = f"{agent} earns more than {floor} with {count}: {', '.join(better)}{missed}."
+    return [
+        f"Measured on {len(curve)} episodes of each task and seed ({pairs}). It is one training run: the intervals "
+        f"leave out how much trainings differ. Validation tasks are for choosing models, so this is no test result.",
+        f"Within a task, its first episode earns {curve[0]:.1f}, episodes {half + 1} to {len(curve)} "
+        f"{curve[half:].mean():.1f}.",
+        verdict,
+    ]
 
 
 def _draw_best_episode(dataset: Dataset, path: Path) -> None:

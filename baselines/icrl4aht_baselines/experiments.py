@@ -23,12 +23,9 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
 from icrl4aht_baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
-from icrl4aht_baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
-from icrl4aht_baselines.report.page import write_page_with_episodes
-from icrl4aht_baselines.report.rendering import check_can_render
+from icrl4aht_baselines.report.cards import CARD_BEGINS, card_name, write_model_cards
+from icrl4aht_baselines.report.page import check_can_render, report_begins, write_page_with_episodes, write_report
 from icrl4aht_baselines.report.results import merge, note_results, read_run
-from icrl4aht_baselines.report.summary import report_begins, write_report
-from icrl4aht_baselines.training.ablations import ABLATIONS, ExperimentEntry
 from icrl4aht_baselines.training.histories import TrainingTask, filter_histories, prepare
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.trainer import train
@@ -47,6 +44,23 @@ CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
 """K of the paper's context sweeps (Sec. 5.3; App. F, "Extended Context Lengths")."""
 
 
+@dataclass(frozen=True)
+class ExperimentEntry:
+    """One model of an experiment: the differences from the default settings.
+
+    Attributes:
+        name: of its folder, without the method.
+        model: values of `ModelOptions`.
+        train: values of `TrainOptions`.
+        variant: of a sweep: the varied quantity and its value.
+    """
+
+    name: str
+    model: dict[str, Any] = field(default_factory=dict)
+    train: dict[str, Any] = field(default_factory=dict)
+    variant: dict[str, Any] | None = None
+
+
 class Experiment(NamedTuple):
     """Entries of an experiment, and the layouts that the paper runs them on.
 
@@ -57,27 +71,21 @@ class Experiment(NamedTuple):
         varies: options that the entries set and that can therefore not be set for all of them.
         held_out: whether to evaluate with learned teammates held out of training, on the training layouts.
         acting: way of acting of the trained models; see `agents.egos.ACTING`.
-        methods: the methods that it is about.
-        split: which tasks its models are evaluated on, see `EVALUATION_SPLITS`.
     """
 
     title: str
     entries: tuple[ExperimentEntry, ...]
-    layouts: tuple[str, ...]
+    layouts: tuple[str, ...] = tuple(TESTED_ON)
     varies: tuple[str, ...] = ()
     held_out: bool = False
     acting: Acting = "cached"
-    methods: tuple[str, ...] = ("ad", "dpt")
-    split: str = "test"
 
 
-def _size_entry(name: str) -> ExperimentEntry:
-    size = SIZES[name]
-    return ExperimentEntry(name, {"layers": size.layers, "width": size.width}, {"steps": size.steps}, {"size": name})
-
+_PLAIN = (ExperimentEntry("plain"),)
+_TA, _NEXT_OBS = {"teammate_actions": True}, {"next_obs": True}
 
 EXPERIMENTS = {
-    "tracks": Experiment("Teammate and layout generalization", (ExperimentEntry("plain"),), tuple(TESTED_ON)),
+    "tracks": Experiment("Teammate and layout generalization", _PLAIN),
     "sweep context": Experiment(
         "Context length",
         tuple(ExperimentEntry(f"K{k}", train={"context": k}, variant={"K": k}) for k in CONTEXTS),
@@ -87,35 +95,27 @@ EXPERIMENTS = {
     ),
     "sweep size": Experiment(
         "Model scale and training budget",
-        tuple(map(_size_entry, PAPER_SIZES)),
-        tuple(TESTED_ON),
+        tuple(
+            ExperimentEntry(
+                name, {"layers": size.layers, "width": size.width}, {"steps": size.steps}, variant={"size": name}
+            )
+            for name, size in SIZES.items()
+            if name in PAPER_SIZES
+        ),
         varies=("layers", "width"),
     ),
     "ablate ta": Experiment(
         "Teammate actions and auxiliary losses",
         (
             ExperimentEntry("none"),
-            ExperimentEntry("ta", {"teammate_actions": True}),
-            ExperimentEntry("next_obs", {"next_obs": True}),
-            ExperimentEntry("ta-next_obs", {"teammate_actions": True, "next_obs": True}),
+            ExperimentEntry("ta", _TA),
+            ExperimentEntry("next_obs", _NEXT_OBS),
+            ExperimentEntry("ta-next_obs", {**_TA, **_NEXT_OBS}),
         ),
         ("test_wide", "demo_wide", "cramped_up"),
         varies=("teammate_actions", "next_obs"),
     ),
-    **{
-        name: Experiment(
-            ablation.title,
-            ablation.entries,
-            ("demo_wide",),
-            varies=ablation.sets,
-            methods=(ablation.method,),
-            split="diverse",
-        )
-        for name, ablation in ABLATIONS.items()
-    },
-    "heldout-rl": Experiment(
-        "Held-out learned teammates", (ExperimentEntry("plain"),), tuple(TESTED_ON), held_out=True
-    ),
+    "heldout-rl": Experiment("Held-out learned teammates", _PLAIN, held_out=True),
 }
 """Command -> experiment; settings and layouts are the paper's."""
 
@@ -125,7 +125,7 @@ class ExperimentPlan:
     """Settings of an experiment's run; the defaults are the paper's.
 
     Attributes:
-        methods: to train; those of the experiment by default.
+        methods: to train; "ad" and "dpt" by default.
         layouts: to train on, one model each; by default those of the experiment that the release has. `ALL_LAYOUTS`
             alone for one model of all layouts that the release has, which is tested on the layouts of all of them.
         channels: channels of the models' observations, see `HistoryOptions`.
@@ -137,8 +137,8 @@ class ExperimentPlan:
         model: values of `ModelOptions` for all entries.
         filters: filters of the histories to train on, values of `HistoryOptions`, such as teammate_family.
         values: names of the entries to run; all by default.
-        split: which tasks to evaluate on, see `EVALUATION_SPLITS`: the experiment's by default; all but "test" are
-            on the training layouts.
+        split: which tasks to evaluate on, see `EVALUATION_SPLITS`: "test" by default; others are on the training
+            layouts.
         families: teammate families to evaluate with; all by default.
         tasks: tasks of each teammate kind and layout, at most.
         episodes: of a task; the protocol's by default.
@@ -217,7 +217,7 @@ def run_experiment(
     entries = _chosen_entries(name, plan)
     layouts, notes = _training_layouts(experiment, plan)
     tasks = {layout: _test_tasks(experiment, plan, layout) for layout in layouts}
-    models = list(product(plan.methods or experiment.methods, entries, layouts))
+    models = list(product(plan.methods or ("ad", "dpt"), entries, layouts))
     chosen = [_prepare_entry(*model, plan).about["histories"] for model in models]  # impossible ones fail early
     if any(histories["channels"] == "canonical" for histories in chosen):
         notes = [*notes, f"models take canonical channels, {chosen[0]['obs_shape'][-1]} on every layout"]
@@ -225,9 +225,8 @@ def run_experiment(
     results = []
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout
-        run = out / f"{method}-{entry.run_of or entry.name}" / layout / "run"
-        _train_entry(method, entry, layout, plan, run, progress)
-        _evaluate_entry(experiment, entry, tasks[layout], plan, run, folder / "results", progress)
+        _train_entry(method, entry, layout, plan, folder / "run", progress)
+        _evaluate_entry(experiment, entry, tasks[layout], plan, folder, progress)
         results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
     check_new_files(
@@ -246,8 +245,6 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
     experiment = EXPERIMENTS[name]
     for method in plan.methods:
         get_method(method)
-        if method not in EXPERIMENTS[name].methods and len(EXPERIMENTS[name].methods) == 1:
-            raise unknown(f"method of {name}", method, EXPERIMENTS[name].methods)
     names = [entry.name for entry in experiment.entries]
     for value in plan.values:
         if value not in names:
@@ -263,7 +260,7 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
 
 
 def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[list[str], list[str]]:
-    """Returns the layouts to train on, or `ALL_LAYOUTS` for one model of all, and a note on those left out."""
+    """Return the layouts to train on, or `ALL_LAYOUTS` for one model of all, and a note on those left out."""
     dataset = load_icrl4aht(plan.root, split="train")
     filters = HistoryOptions((), **plan.filters).filters
     if filters:
@@ -297,7 +294,7 @@ def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[lis
 
 
 def _pass_all(histories: Dataset, filters: dict[str, tuple[str, ...]]) -> bool:
-    """Returns whether every value of the filters has histories."""
+    """Return whether every value of the filters has histories."""
     try:
         return bool(filter_histories(histories, filters))
     except EmptySelectionError:
@@ -305,7 +302,7 @@ def _pass_all(histories: Dataset, filters: dict[str, tuple[str, ...]]) -> bool:
 
 
 def _all_layouts(plan: ExperimentPlan) -> list[str]:
-    """Returns the layouts of a model of all layouts, in the order of `TESTED_ON`."""
+    """Return the layouts of a model of all layouts, in the order of `TESTED_ON`."""
     filters = HistoryOptions((), **plan.filters).filters
     dataset = filter_histories(load_icrl4aht(plan.root, split="train"), filters)
     names = [name for name in TESTED_ON if name in {layout.name for layout in dataset.layouts}]
@@ -315,7 +312,7 @@ def _all_layouts(plan: ExperimentPlan) -> list[str]:
 
 
 def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
-    """Returns the tasks that a model trained on a layout, or on `ALL_LAYOUTS`, is evaluated on."""
+    """Return the tasks that a model trained on a layout, or on `ALL_LAYOUTS`, is evaluated on."""
     if layout == ALL_LAYOUTS:
         return [task for name in _all_layouts(plan) for task in _test_tasks(experiment, plan, name)]
     if experiment.held_out:
@@ -324,7 +321,7 @@ def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> li
                               f"held-out teammates; leave --split out")  # fmt: skip
         tasks = held_out_tasks(plan.suite, layout, plan.root)
     else:
-        split = plan.split or experiment.split
+        split = plan.split or "test"
         played_on = TESTED_ON.get(layout, layout) if split == "test" else layout
         tasks = [task for task in bundled_tasks(track_of(played_on), split) if task.layout.name == played_on]
         if not tasks:
@@ -339,7 +336,7 @@ def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> li
 
 
 def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> list[Task]:
-    """Returns the tasks of a suite's held-out manifest on a training layout (paper, App. F, "Held-Out RL Teammates").
+    """Return the tasks of a suite's held-out manifest on a training layout (paper, App. F, "Held-Out RL Teammates").
 
     Args:
         suite: folder that `icrl4aht-data teammates` made.
@@ -385,7 +382,7 @@ def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: Exper
     size = SIZES[plan.size]
     options = TrainOptions(**{**size.train, "batch_size": plan.batch_size, **entry.train, **plan.train})
     model = ModelOptions(**{**size.model, **entry.model, **plan.model})
-    histories = HistoryOptions((layout,), plan.root, channels=plan.channels, **plan.filters, **entry.histories)
+    histories = HistoryOptions((layout,), plan.root, channels=plan.channels, **plan.filters)
     try:
         return prepare(method, model, options, histories)
     except (EmptySelectionError, LabelsMissingError, OptionError) as error:
@@ -424,11 +421,10 @@ def _evaluate_entry(
     entry: ExperimentEntry,
     tasks: Sequence[Task],
     plan: ExperimentPlan,
-    run: Path,
     folder: Path,
     progress: ExperimentProgress,
 ) -> None:
-    agent = find_agent(run, acting=plan.acting or experiment.acting, greedy=not entry.sampled)
+    agent = find_agent(folder / "run", acting=plan.acting or experiment.acting)
     details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
     names = list(dict.fromkeys(task.layout.name for task in tasks))
     what = f"{agent.name} {entry.name} on {names[0] if len(names) == 1 else f'{len(names)} layouts'}: episodes"
@@ -440,9 +436,9 @@ def _evaluate_entry(
         protocol,
         seeds=range(plan.seeds),
         suite=plan.suite,
-        out=folder,
+        out=folder / "results",
         details=details,
         played=counted(progress, what, len(tasks) * plan.seeds * protocol.episodes),
     )
-    own = experiment.held_out or (plan.split or experiment.split) != "test"
-    note_results(folder, run, tasks if own else ())
+    own = experiment.held_out or (plan.split or "test") != "test"
+    note_results(folder / "results", folder / "run", tasks if own else ())

@@ -53,8 +53,7 @@ def sweep_command(what: str, **options: Any) -> None:
 def ablate_command(what: str, **options: Any) -> None:
     """Train and evaluate with and without parts.
 
-    WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both; or windows (of AD) or contexts (of DPT):
-    length, episodes, labels and inputs, one difference each. Writes runs, results and OUT/report.
+    WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both. Writes runs, results and OUT/report.
     """
     _run_experiment(f"ablate {what}", **options)
 
@@ -148,7 +147,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
 
     Writes their results into OUT, and OUT/headroom.json and OUT/headroom.md from them.
     """
-    from icrl4aht_baselines.report.headroom import HEADROOM_BEGINS, measure_headroom, write_headroom_cards
+    from icrl4aht_baselines.report.cards import HEADROOM_BEGINS, measure_headroom, write_headroom_cards
 
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:
@@ -232,15 +231,15 @@ def unseen_command(
     """
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks
     from icrl4aht_baselines.online.unseen import unseen_returns
-    from icrl4aht_baselines.report.comparison import unseen_table
-    from icrl4aht_baselines.report.stored_results import (
-        ENDS,
+    from icrl4aht_baselines.report.comparison import (
         StoredResults,
         add_unseen,
         read_stored,
         results_file,
+        unseen_table,
         write_stored,
     )
+    from icrl4aht_baselines.report.results import ENDS
 
     if store and episodes < 2 * ENDS:
         raise click.UsageError(f"--episodes {episodes}: expected at least {2 * ENDS} with --store")
@@ -265,6 +264,6 @@ def unseen_command(
             show("unseen layouts", done, total, what)
 
         found = unseen_returns({ego.name: ego.make for ego in egos}, tasks, versions, episodes, played)
-    click.echo(unseen_table(add_unseen(StoredResults({}, {}), found)))
+    click.echo(unseen_table(add_unseen(StoredResults(), found)))
     if store:
         write_stored(results_file(), add_unseen(read_stored(results_file()), found))

@@ -10,7 +10,6 @@ import click
 from rich.console import Console
 
 from icrl4aht_baselines.commands.options import (
-    ABLATION_NAME,
     EGO_NAME,
     HISTORIES_NAME,
     REFERENCE_NAME,
@@ -165,11 +164,8 @@ def reference_command(
 
     Rebuilds a release of noise histories, trains, records histories of trained agents where a model learns from them,
     and evaluates. One model for each track. The same command resumes a stopped one. rl2 learns by playing with training
-    teammates, rl2-tests with test teammates. The other names are a method
-    and its data. ad-noise, dpt-noise: noise histories. ad-ppo, dpt-ppo: PPO histories of the bundled release. ad-both,
-    dpt-both: both kinds. ad-learned: histories of the bundled release with learned teammates. ad-student, dpt-student:
-    histories of rl2, labelled with its choices. ad-rising: histories of rl2 that begin at random, imitated with their
-    noise.
+    teammates. ad-student, dpt-student: histories of rl2, labelled with its choices. ad-rising: histories of rl2 that
+    begin at random, imitated with their noise.
     """
     from icrl4aht_baselines.agents.bundled import bundle_run, bundled_models, check_bundle_name
     from icrl4aht_baselines.reference import RECIPES, check_taught, describe_times, make_reference, write_bundled_card
@@ -210,7 +206,7 @@ def reference_command(
             _console.print(f"  {kind}: {folder}", highlight=False)
     if bundle:
         for found in outcomes:
-            sampled = not RECIPES[found.name].mode.greedy
+            sampled = not RECIPES[found.name].greedy
             target = bundle_run(found.run, bundle, found.track, sampled=sampled)
             _console.print(f"bundled: {target}", highlight=False)
         in_order = sorted([*others, *outcomes], key=lambda found: list(TRACKS).index(found.track))
@@ -227,32 +223,22 @@ def reference_command(
     ),
 )
 @click.argument("runs", nargs=-1, type=Folder(), metavar="[RESULTS]...")
-@click.option(
-    "--ablation",
-    "ablations",
-    type=(ABLATION_NAME, Folder()),
-    metavar="NAME FOLDER",
-    multiple=True,
-    help="Also add the results of `ablate NAME`, windows or contexts, from FOLDER.",
-)
 @click.option("--about", default="", help="One sentence on how the agent of RESULTS was made.")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write results.md and results.png here.")
 @click.option("--store", is_flag=True, help="Also add RESULTS to the package's stored results.")
 @overwrite_option
-def results_command(
-    runs: tuple[Path, ...], ablations: tuple[tuple[str, Path], ...], about: str, out: Path, store: bool, overwrite: bool
-) -> None:
+def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, overwrite: bool) -> None:
     """Compare reference models with the paper's numbers.
 
     Writes a page with tables and a figure from the package's stored results, to which those of RESULTS, folders that
     `evaluate` made, are added.
     """
-    from icrl4aht_baselines.report.comparison import RESULTS_BEGINS, write_comparison
-    from icrl4aht_baselines.report.stored_results import (
-        add_ablation,
+    from icrl4aht_baselines.report.comparison import (
+        RESULTS_BEGINS,
         add_results,
         read_stored,
         results_file,
+        write_comparison,
         write_stored,
     )
 
@@ -260,8 +246,6 @@ def results_command(
     stored = read_stored(results_file())
     for folder in runs:
         stored = add_results(stored, folder, about)
-    for name, folder in ablations:
-        stored = add_ablation(stored, f"ablate {name}", folder)
     if store:
         write_stored(results_file(), stored)
     for path in write_comparison(stored, out):

@@ -12,7 +12,6 @@ import click
 from click.core import ParameterSource
 
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_OPTIONS, ModelOptions
-from icrl4aht_baselines.training.ablations import ABLATIONS
 from icrl4aht_baselines.training.options import (
     ALL_LAYOUTS,
     FILTERS,
@@ -78,7 +77,6 @@ _EVALUATION_SPLIT = Names("split", lazy_attribute("icrl4aht_baselines.evaluate.p
 METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())
 _HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
 _playing = lazy_attribute("icrl4aht_baselines.methods.registry", "PLAYING")
-ABLATION_NAME = Names("ablation", lambda: [name.removeprefix("ablate ") for name in ABLATIONS])
 REFERENCE_NAME = Names("reference model", lazy_attribute("icrl4aht_baselines.reference", "RECIPES"))
 HISTORIES_NAME = Names("kind of histories", lazy_attribute("icrl4aht_baselines.reference", "RL2_HISTORIES"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "PROTOCOLS"))
@@ -110,7 +108,7 @@ _experiment_split_option = click.option(
     "--split",
     type=_EVALUATION_SPLIT,
     help=_SPLIT_HELP,
-    show_default="test; diverse in `ablate windows` and `contexts`",
+    show_default="test",
 )
 tasks_option = click.option(
     "--tasks", type=COUNT, help="Most tasks of each cell, a layout with a teammate family: 2 are two a cell."
@@ -199,7 +197,7 @@ _experiment_size_option = click.option(
     "--size",
     type=_SIZE_NAME,
     help="tiny, for a CPU, or the paper's small, medium or large; not with `sweep size`, which varies it.",
-    show_default="small, as in the paper; `ablate windows` and `contexts` set tiny",
+    show_default="small, as in the paper",
 )
 _PAPER_OR_CPU = "1024 as in the paper; on a CPU 16 of tiny, 8 of others"
 _BY_SIZE = dict.fromkeys(SIZES["tiny"].model | SIZES["tiny"].train, "the size's")
@@ -391,7 +389,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
             type=_HISTORY_METHOD,
             multiple=True,
             help="ad, dpt, hybrid_ad or amago_offline; repeat for several.",
-            show_default="ad and dpt; ad for `ablate windows`, dpt for `ablate contexts`",
+            show_default="ad and dpt",
         ),
         click.option(
             "--layout",
@@ -435,7 +433,7 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
             default_text={
                 "steps": "the paper's",
                 "batch_size": _PAPER_OR_CPU,
-                "context": "500; varied by `sweep context`, set by `ablate windows` and `contexts`",
+                "context": "500; varied by `sweep context`",
             },
         ),
         dataclass_options(

@@ -127,8 +127,8 @@ def evaluate_command(
     """
     from icrl4aht_baselines.evaluate.evaluator import evaluate
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
+    from icrl4aht_baselines.report.page import summary_lines
     from icrl4aht_baselines.report.results import note_results, read_run
-    from icrl4aht_baselines.report.summary import summary_lines
 
     if manifest and split:
         raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
@@ -179,11 +179,15 @@ def report_command(
     training. Writes them as Markdown, CSV and curves, with a card for each trained model. Results of one agent on
     different layouts are merged.
     """
-    from icrl4aht_baselines.report.model_card import CARD_BEGINS, card_name, write_model_cards
-    from icrl4aht_baselines.report.page import write_page_with_episodes
-    from icrl4aht_baselines.report.rendering import check_can_render
+    from icrl4aht_baselines.report.cards import CARD_BEGINS, card_name, write_model_cards
+    from icrl4aht_baselines.report.page import (
+        check_can_render,
+        markdown,
+        report_begins,
+        write_page_with_episodes,
+        write_report,
+    )
     from icrl4aht_baselines.report.results import merge, read_run
-    from icrl4aht_baselines.report.summary import markdown, report_begins, write_report
 
     loaded, folder = merge([read_run(run) for run in runs]), out or runs[0] / "report"
     check_new_files(folder, overwrite, report_begins(loaded) | {card_name(run): CARD_BEGINS for run in loaded})
@@ -218,7 +222,7 @@ def report_command(
 def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int, out: Path, overwrite: bool) -> None:
     """Play an episode and draw it as a GIF."""
     from icrl4aht_baselines.evaluate.protocols import get_protocol
-    from icrl4aht_baselines.report.episode_gifs import save_episodes
+    from icrl4aht_baselines.report.gifs import save_episodes
 
     check_new_file(out, overwrite)
     task = published_task(layout, teammate)

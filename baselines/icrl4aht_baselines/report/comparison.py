@@ -65,7 +65,7 @@ class StoredResults:
         commits: agent or ablation -> commit of this repository whose code made it, if later code cannot.
     """
 
-    table: pd.DataFrame
+    table: pd.DataFrame = field(default_factory=lambda: results_table([]))
     about: dict[str, str] = field(default_factory=dict)
     ablations: dict[str, dict[str, str]] = field(default_factory=dict)
     commits: dict[str, str] = field(default_factory=dict)
@@ -102,7 +102,7 @@ def read_stored(path: Path) -> StoredResults:
         OptionError: if the file is damaged.
     """
     if not path.is_file():
-        return StoredResults(results_table([]))
+        return StoredResults()
     rows = []
     try:
         content = parse_json(read_text(path))
