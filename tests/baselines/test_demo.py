@@ -7,12 +7,13 @@ from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 
+import numpy as np
 import pytest
 from icrl4aht_baselines import demo
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.results import Result, write_result
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.report import episode_gifs
+from icrl4aht_baselines.report import gifs
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_generation.teammates.registry import sample_teammate
 from rich.console import Console
@@ -56,6 +57,22 @@ def evaluate_without_playing(agent, make, tasks, protocol, *, seeds, out, detail
     return results
 
 
+def test_an_agent_leads_if_it_earns_surely_more_than_both():
+    """Four pairs of a task and a seed, six episodes each, that differ by up to 1 from the agent's mean."""
+
+    def returns(**means: float) -> dict[str, np.ndarray]:
+        spread = np.linspace(-1, 1, 4)[:, None] * np.ones((4, 6))
+        return {agent: mean + spread * (agent == "AD") for agent, mean in means.items()}
+
+    lead = demo.find_lead(returns(stay=0.0, random=2.0, AD=12.0), "AD")
+    assert lead.better and lead.difference.mean == pytest.approx(10.0)
+    assert 9.0 <= lead.difference.low < 10.0 < lead.difference.high <= 11.0
+    between = demo.find_lead(returns(stay=0.0, random=12.0, AD=8.0), "AD")
+    assert between.difference.mean == pytest.approx(-4.0) and not between.better, "the better of both counts"
+    unsure = demo.find_lead(returns(stay=0.0, random=2.0, AD=2.5), "AD")
+    assert unsure.difference.mean > 0 and not unsure.better, "its interval reaches below 0"
+
+
 def run(out: Path, settings: demo.DemoSettings) -> tuple[str, Path]:
     """Text and report of a demo."""
     text = StringIO()
@@ -66,7 +83,7 @@ def run(out: Path, settings: demo.DemoSettings) -> tuple[str, Path]:
 def test_every_step_is_taken(release, tmp_path, monkeypatch):
     """All steps; the model is trained, and not played."""
     monkeypatch.setattr(demo, "evaluate", evaluate_without_playing)
-    monkeypatch.setattr(episode_gifs, "save_episodes", lambda *arguments, **named: ())
+    monkeypatch.setattr(gifs, "save_episodes", lambda *arguments, **named: ())
     text, page = run(tmp_path, replace(SETTINGS, root=release))
     for expected in ("1/6", "target_actions", "context_next_obs", "transitions replayed", "6/6", "done in", str(page)):
         assert expected in text, expected

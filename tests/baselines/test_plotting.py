@@ -42,8 +42,8 @@ def test_a_log_of_many_returns_has_few_panels(layouts, panels, tmp_path, drawn):
 
 def test_curves_of_cells_share_their_axes(tmp_path, drawn):
     runs = [evaluated_run("AD", value=38.0), evaluated_run("DPT")]
-    cells = list(runs[0].cells)
-    plotting.plot_return_curves([(run.name, run.cells) for run in runs], cells, tmp_path / "curves.png")
+    panels = {cell.title: {run.name: run.cells[cell] for run in runs} for cell in runs[0].cells}
+    plotting.plot_return_curves(panels, tmp_path / "curves.png")
     (figure,) = drawn
     assert [axes.get_title() for axes in shown(figure)] == [
         "demo_wide, H1",

@@ -6,13 +6,14 @@ import dataclasses
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines import reference
 from icrl4aht_baselines.agents import bundled
-from icrl4aht_baselines.agents.bundled import MODELS
+from icrl4aht_baselines.agents.bundled import MODELS, bundled_models
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
 from icrl4aht_baselines.reference import (
@@ -27,6 +28,7 @@ from icrl4aht_baselines.reference import (
 from icrl4aht_baselines.report.results import EvaluationRun
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from PIL import Image
 
@@ -52,53 +54,99 @@ def test_recipes_are_valid_settings(name):
         HistoryOptions(TRACKS[track]["train"], **recipe.histories, **view)
 
 
-def test_every_history_has_episodes_without_noise():
+def test_recipes_make_the_bundled_models():
+    """The settings of the bundled models' runs, except for paths and what came after them."""
+    names = {
+        "rl2": "rl2-reference",
+        "ad-student": "ad-reference",
+        "dpt-student": "dpt-reference",
+        "ad-rising": "ad-rising",
+    }
+    for name, recipe in RECIPES.items():
+        config = read_config(MODELS / names[name] / "layout")
+        rate = {"learning_rate": reference.OWN_SHARE * recipe.train["learning_rate"]} if recipe.own_round else {}
+        expected = {**recipe.model, **recipe.train, **rate, "method": recipe.method}
+        given = {**config["model"], **config["train"], "method": config["method"]}
+        assert {key: given[key] for key in expected} == {
+            key: list(value) if isinstance(value, tuple) else value for key, value in expected.items()
+        }
+        assert bundled_models()[names[name]].sampled is not recipe.greedy
+        assert recipe.histories.items() <= config["histories"].items()
     assert all(noise.end == (0.0, 0.0) and noise.finish[1] < 1 for noise in RL2_HISTORIES.values())
-    assert all(dict(r.protocols) == {"seeded": 3, "published": 1} for r in RECIPES.values() if not r.meets_tests)
 
 
 def test_unknown_names(tmp_path):
-    with pytest.raises(UnknownNameError, match=r"unknown reference model 'ad-nois'.*Did you mean 'ad-noise'"):
-        make_reference("ad-nois", "teammate", tmp_path, print)
+    with pytest.raises(UnknownNameError, match=r"unknown reference model 'ad-studen'.*Did you mean 'ad-student'"):
+        make_reference("ad-studen", "teammate", tmp_path, print)
     with pytest.raises(UnknownNameError, match="unknown track 'x'; valid: teammate, layout"):
-        make_reference("ad-noise", "x", tmp_path, print)
-    result = CliRunner().invoke(cli, ["research", "reference", "--name", "ad-nois"])
-    assert result.exit_code == 2 and "ad-noise" in result.output
-
-
-def test_a_teacher_takes_the_place_of_rl2(tmp_path, monkeypatch):
-    with pytest.raises(OptionError, match=r"ad-noise learns from no histories.*ad-student, dpt-student, ad-rising"):
-        make_reference("ad-noise", "teammate", tmp_path, print, teacher="rl2-reference")
-    command = [
-        "research",
-        "reference",
-        "--name",
-        "ad-student",
-        "--name",
-        "ad-noise",
-        "--out",
-        str(tmp_path / "out"),
-        "--teacher",
-    ]
-    for teacher, message in (
-        ("rl2-referenc", "--teacher: unknown agent"),
-        ("rl2-reference", "ad-noise learns from no"),
-    ):
+        make_reference("rl2", "x", tmp_path, print)
+    with pytest.raises(OptionError, match=r"rl2 learns from no histories.*ad-student, dpt-student, ad-rising"):
+        make_reference("rl2", "teammate", tmp_path, print, teacher="rl2-reference")
+    command = ["research", "reference", "--name", "rl2", "--out", str(tmp_path / "out"), "--teacher"]
+    for teacher, message in (("rl2-referenc", "unknown agent"), ("rl2-reference", "rl2 learns from no")):
         result = CliRunner().invoke(cli, [*command, teacher])
         assert message in f"{result.output} {result.exception}" and not (tmp_path / "out").exists()
-    monkeypatch.setattr(reference._Making, "play", lambda made: tmp_path / "rl2")
-    assert reference._Making(tmp_path, "teammate", print).rl2() == str(tmp_path / "rl2")
-    found = []
-    monkeypatch.setattr(reference, "find_agent", lambda name, **mode: found.append(name))
-    for name in ("load_icrl4aht", "release_teammates", "collect_release"):
+
+
+@pytest.fixture
+def steps(tmp_path, monkeypatch) -> list[tuple[str, ...]]:
+    """The steps that are taken: trainings, recordings and combinations, none of which does anything."""
+    taken: list[tuple[str, ...]] = []
+
+    def note(what: str, *names: Any) -> None:
+        taken.append((what, *(str(name).removeprefix(f"{tmp_path}/") for name in names)))
+
+    def train(method, data, options, folder, about, *, params=None, **rest):
+        note("train", folder, f"{options.learning_rate:g}", params)
+
+    def collect(agent, teammates, noise, out, *, labeller=None, **rest):
+        note("collect", agent, noise.episodes, out, labeller)
+
+    def combine(out, roots):
+        note("combine", out, *roots)
+
+    job = SimpleNamespace(method=None, data=None, about=None, trainer=None)
+    monkeypatch.setattr(
+        reference, "prepare", lambda method, model, options, histories: SimpleNamespace(**vars(job), options=options)
+    )
+    monkeypatch.setattr(reference, "prepare_play", lambda *given: job)
+    monkeypatch.setattr(reference, "start_from", lambda before, *given: before.name)
+    monkeypatch.setattr(reference, "find_agent", lambda name, **mode: Path(name).name)
+    for name in ("load_icrl4aht", "release_teammates"):
         monkeypatch.setattr(reference, name, lambda *given, **options: None)
-    monkeypatch.setattr(reference._Making, "noise_release", lambda made: tmp_path)
-    reference._Making(tmp_path, "teammate", print, "rl2-reference").histories("rising")
-    assert found == ["rl2-reference"]
+    monkeypatch.setattr(reference, "train", train)
+    monkeypatch.setattr(reference, "collect_release", collect)
+    monkeypatch.setattr(reference, "combine_releases", combine)
+    (tmp_path / "noise" / "lite").mkdir(parents=True)
+    return taken
+
+
+def test_the_steps_to_ad_reference(steps, tmp_path):
+    found = make_reference("ad-student", "layout", tmp_path, print, evaluates=False)
+    assert found == ReferenceOutcome("ad-student", "layout", tmp_path / "ad-student-layout", {})
+    rate = f"{RECIPES['rl2'].train.get('learning_rate', TrainOptions.learning_rate):g}"
+    play = ("train", "rl2-layout", rate, "None")
+    assert steps == [
+        play,
+        ("collect", "rl2-layout", "40", "student-layout", "None"),
+        ("train", "ad-student-layout-first", "0.002", "None"),
+        play,  # finished: this one only looks for the checkpoint
+        ("collect", "ad-student-layout-first", "20", "ad-student-layout-own", "rl2-layout"),
+        ("combine", "ad-student-layout-mixed", "student-layout", "ad-student-layout-own"),
+        ("train", "ad-student-layout", "0.001", "ad-student-layout-first"),
+    ]
+
+
+def test_a_teacher_saves_the_training_of_rl2(steps, tmp_path):
+    make_reference("ad-rising", "teammate", tmp_path, print, evaluates=False, teacher="rl2-reference")
+    assert steps == [
+        ("collect", "rl2-reference", "40", "rising-teammate", "None"),
+        ("train", "ad-rising-teammate", "0.002", "None"),
+    ]
 
 
 def test_times_of_parts(tmp_path):
-    made = reference._Making(tmp_path / "out", "teammate", print)
+    made = reference._Steps(tmp_path / "out", "teammate", print)
     assert describe_times(made.out) == ""
     with made.timed("one"):
         pass
@@ -168,36 +216,19 @@ def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):
 
 
 def test_a_finished_run_is_only_evaluated(tmp_path, monkeypatch):
-    monkeypatch.setattr(reference._Making, "evaluate", lambda made, name, run, recipe: {"test-seeded": run / "results"})
+    monkeypatch.setattr(reference._Steps, "evaluate", lambda made, name, run, recipe: {"test-seeded": run / "results"})
     run = MODELS / "rl2-reference" / "layout"
     found = make_reference("rl2", "layout", tmp_path, print, finished=run)
     assert found == ReferenceOutcome("rl2", "layout", run, {"test-seeded": run / "results"})
     assert not list(tmp_path.iterdir())
 
 
-def test_a_second_round_keeps_the_own_histories_of_the_first(tmp_path, monkeypatch):
-    combined = []
-    for name in ("load_icrl4aht", "release_teammates", "find_agent", "collect_release"):
-        monkeypatch.setattr(reference, name, lambda *given, **options: None)
-    monkeypatch.setattr(reference, "combine_releases", lambda target, roots: combined.append((target.name, roots)))
-    monkeypatch.setattr(reference._Making, "_train_once", lambda *given: None)
-    monkeypatch.setattr(reference._Making, "histories", lambda made, kind: tmp_path / kind)
-    monkeypatch.setattr(reference._Making, "play", lambda made: tmp_path)
-    monkeypatch.setattr(reference._Making, "noise_release", lambda made: tmp_path)
-    recipe = dataclasses.replace(RECIPES["ad-student"], rounds=2)
-    reference._Making(tmp_path, "layout", print).train("ad", recipe)
-    assert combined == [
-        ("ad-layout-1-mixed", [tmp_path / "student", tmp_path / "ad-layout-1-own"]),
-        ("ad-layout-mixed", [tmp_path / "ad-layout-1-mixed", tmp_path / "ad-layout-own"]),
-    ]
-
-
 @pytest.fixture
 def small(monkeypatch, tmp_path) -> Path:
     """Recipes that take seconds, and the bundled release in place of the rebuilt one."""
     for name, recipe in RECIPES.items():
-        sizes: dict[str, Any] = TINY if recipe.data != "tasks" else {"steps": 1, "batch_size": 8}
-        model = MODEL if recipe.data != "tasks" else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
+        sizes: dict[str, Any] = TINY if recipe.data else {"steps": 1, "batch_size": 8}
+        model = MODEL if recipe.data else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
         monkeypatch.setitem(RECIPES, name, dataclasses.replace(recipe, model=model, train=sizes))
     monkeypatch.setitem(RL2_HISTORIES, "student", NoiseConfig(2, 10, start=(0.5, 0.5)))
     monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))

@@ -26,6 +26,8 @@ def evaluated_run(
     trained_on=(),
     folder=None,
     acting=None,
+    details=None,
+    steps=100,
 ) -> EvaluationRun:
     """Every instance earns `value`, and 2 more in the second half.
 
@@ -33,12 +35,14 @@ def evaluated_run(
         tasks: by default the published test tasks of the layouts and families.
         trained_on: record of training data; None for results without one.
         acting: way of acting of a trained model; None for other agents.
+        details: further details of the agent.
+        steps: length of the episodes.
     """
     played = tasks or [task for task in TEST_TASKS if task.layout.name in layouts and task.teammate_family in families]
-    details = {} if trained_on is None else {"trained_on": list(trained_on)}
+    details = dict(details or {}) | ({} if trained_on is None else {"trained_on": list(trained_on)})
     details |= {"variant": dict([variant])} if variant else {}
     details |= {"acting": acting} if acting else {}
-    shortened = dataclasses.replace(PROTOCOLS[protocol], episodes=40)
+    shortened = dataclasses.replace(PROTOCOLS[protocol], episodes=40, steps=steps)
     settings = {"agent": agent, "seeds": [0], "protocol": dataclasses.asdict(shortened), "code_version": "0"}
     settings |= {"details": details} if details else {}
     returns = [[value] * 20 + [value + 2.0] * 20]

@@ -1,7 +1,20 @@
 """Reports of evaluation results: Markdown, CSV, figures, a page."""
 
+import sys
+from collections.abc import Sequence
+
+from icrl4aht_baselines import CallablePackage
+from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.report.page import markdown, write_report
 from icrl4aht_baselines.report.results import as_run, merge, read_run
 from icrl4aht_baselines.report.scores import rows
 
-__all__ = ["as_run", "markdown", "merge", "read_run", "rows", "write_report"]
+__all__ = ["as_run", "markdown", "merge", "read_run", "report", "rows", "write_report"]
+
+
+def report(*results: Sequence[Result]) -> str:
+    """Return a Markdown report of results that `evaluate` returned, each argument those of one agent."""
+    return markdown(merge([as_run(of_agent) for of_agent in results]))
+
+
+sys.modules[__name__].__class__ = CallablePackage

@@ -238,8 +238,11 @@ def summary_table(results: Mapping[str, AgentCells], protocol: str) -> str:
         played = [cell for cell in chosen if cell in cells]
         scores = {cell: normalise(cells[cell]["mean"], headroom[cell]) for cell in played}
         rising = [cell for cell in played if mean_interval(cells[cell]["gain"]).low > 0]
-        opening, last = (np.mean([cells[cell][block].mean() for cell in played]) for block in ("opening", "last"))
-        rise = _with_interval(*(cells[cell]["last"] - cells[cell]["opening"] for cell in played), sign="+")
+        rise = ""
+        if played:
+            ends = [np.mean([cells[cell][block].mean() for cell in played]) for block in ("opening", "last")]
+            rise = _with_interval(*(cells[cell]["last"] - cells[cell]["opening"] for cell in played), sign="+")
+            rise = f"{ends[0]:z.1f} to {ends[1]:z.1f}, {rise}"
         body.append(
             [
                 f"`{agent}`" + _marks(*cells.values()),
@@ -248,7 +251,7 @@ def summary_table(results: Mapping[str, AgentCells], protocol: str) -> str:
                     for of in groups.values()
                 ),
                 f"{len(rising)} of {len(played)}",
-                f"{opening:z.1f} to {last:z.1f}, {rise}" if played else "",
+                rise,
                 ", ".join(layouts_above_paper(cells)) or "none",
                 " or ".join(map(str, sorted({cells[cell]["mean"].shape[1] for cell in played}))),
             ]

@@ -151,7 +151,8 @@ def score_bars(runs: NumberedRuns, protocol: str) -> BarChart | None:
         cell: {name: at for run in runs.values() if cell in run.cells for name, at in paper_scores(run, cell).items()}
         for cell in cells
     }
-    values = [float(np.mean(score.normalised)) for of_run in scores.values() for score in of_run.values()]
+    drawn = [score.normalised for of_run in scores.values() for score in of_run.values()]
+    values = [float(found.mean()) for found in drawn if found is not None]
     values += [value for of_cell in stated.values() for value in of_cell.values()]
     scale = _Scale(max(_SCORE_LIMITS[0], min(-0.05, *values)), min(_SCORE_LIMITS[1], max(1.05, *values)))
     headroom = cell_headroom(protocol)

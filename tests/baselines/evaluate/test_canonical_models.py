@@ -19,7 +19,7 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.experiments import EXPERIMENTS, ExperimentPlan, run_experiment
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.report.model_card import model_card
+from icrl4aht_baselines.report.cards import model_card
 from icrl4aht_baselines.report.results import note_results, read_run
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions

@@ -17,10 +17,8 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
 from icrl4aht_baselines.evaluate.results import Result, read_result, write_result
 from icrl4aht_baselines.report import results as results_of_runs
-from icrl4aht_baselines.report.headroom import write_headroom_cards
-from icrl4aht_baselines.report.intervals import bootstrap_interval
-from icrl4aht_baselines.report.results import OWN_TASKS, EvaluationRun, as_run, normalized_return, read_run
-from icrl4aht_baselines.report.summary import csv_text, markdown
+from icrl4aht_baselines.report.page import csv_text, markdown
+from icrl4aht_baselines.report.results import OWN_TASKS, as_run, read_run
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_tasks
 
@@ -245,20 +243,13 @@ def test_unknown_names():
         get_protocol("publish")
 
 
-def test_bootstrap_interval_covers_the_mean():
-    means = np.array([1.0, 2.0, 3.0, 4.0, 10.0])
-    low, high = bootstrap_interval(means, np.random.default_rng(0))
-    assert 1.0 <= low < 4.0 < high <= 10.0
-    assert bootstrap_interval(np.full(5, 7.0), np.random.default_rng(0)) == (7.0, 7.0)
-
-
 def test_report_shows_the_published_numbers(together):
     run = as_run(evaluate("random", random, SIMPLE, PUBLISHED))
     text = markdown([run])
-    assert "published 35.2 ± 0.4" in text
+    assert "paper 35.2 ± 0.4" in text
     assert "<br>no headroom |" in text
     mean = np.mean([together[task.task_id] for task in SIMPLE])
-    assert f"| H4 | {mean:.1f} ± " in text
+    assert f"| H4 | random | {mean:.1f} ± " in text
     lines = csv_text([run]).splitlines()
     assert len(lines) == 2
     assert lines[1].startswith("random,published,coord_simple,H4,5,4,")
@@ -285,7 +276,7 @@ def test_commands(tmp_path):
     assert read_result(path).returns == [[40.0] * 4]
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])
     assert result.exit_code == 0, result.output
-    assert "| H4 | 40.0<br>1 of 5 instances<br>gain" in result.output
+    assert "| H4 | stay | 40.0<br>1 of 5 instances<br>gain" in result.output
     assert {path.name for path in (tmp_path / "run" / "report").iterdir()} == {"report.md", "report.csv", "curves.png"}
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])
     assert "report: exists" in str(result.exception)
@@ -334,7 +325,7 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
         assert result.exit_code == 0, result.output
     assert read_tasks(tmp_path / "run" / OWN_TASKS) == tasks
     sizes = {cell: len(returns) for cell, returns in read_run(tmp_path / "run").cells.items()}
-    assert sizes == {("coord_simple", "H4"): 5, ("coord_simple", "H4 (validation)"): 2}
+    assert sizes == {("coord_simple", "H4", "test"): 5, ("coord_simple", "H4", "validation"): 2}
 
 
 def test_a_manifest_has_its_own_splits(tmp_path):
@@ -346,28 +337,6 @@ def test_a_manifest_has_its_own_splits(tmp_path):
     result = CliRunner().invoke(cli, [*command[:-1], "train"])
     assert result.exit_code == 2
     assert "unknown split 'train'; valid: test, validation" in result.output
-
-
-def test_headroom_cards_name_cells_without_headroom(tmp_path):
-    def run(agent, values):
-        returns = {cell: np.full((5, 2), value) for cell, value in values.items()}
-        return EvaluationRun(agent, "seeded", returns)
-
-    flat, open_ = ("coord_simple", "H4"), ("demo_wide", "H1")
-    runs = [run("stay", {flat: 40.0, open_: 0.0}), run("random", {flat: 35.0, open_: 0.0})]
-    write_headroom_cards([*runs, run("oracle", {flat: 40.5, open_: 39.9})], tmp_path)
-    content = json.loads((tmp_path / "headroom.json").read_text())
-    assert content["seeded"]["demo_wide"]["H1"] == {"stay": 0.0, "random": 0.0, "oracle": 39.9}
-    text = (tmp_path / "headroom.md").read_text()
-    assert "**0.0 / 0.0 / 39.9**" in text
-    assert "No headroom: coord_simple/H4." in text
-
-
-def test_normalized_returns_need_headroom():
-    references = {"stay": 10.0, "random": 5.0, "oracle": 30.0}
-    assert normalized_return(20.0, references) == 0.5
-    assert normalized_return(10.0, {**references, "oracle": 10.5}) is None
-    assert normalized_return(10.0, None) is None
 
 
 def test_headroom_cards_cover_every_cell():

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from icrl4aht_baselines.report.episode_gifs import EpisodePair, ShownEpisode
+from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode
 from icrl4aht_baselines.report.page import write_page
-from icrl4aht_baselines.report.results import TEST_LAYOUTS
+from icrl4aht_baselines.report.results import TEST_LAYOUTS, ResultCell
 from PIL import Image
 
 from tests.helpers.chromium import CHROMIUM, NEEDS_CHROMIUM
@@ -27,14 +27,21 @@ TOO_WIDE = """(width) => [...document.body.querySelectorAll("*")]
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory) -> Path:
-    """A page with every section: all layouts, long names, sweeps and pictures of episodes."""
+    """A page with every section: all layouts, long names and pictures of episodes."""
     folder = tmp_path_factory.mktemp("report")
     Image.fromarray(np.zeros((400, 900), np.uint8)).save(folder / "a.gif")
     runs = [evaluated_run(name, TEST_LAYOUTS, protocol="published") for name in ("AD", "random")]
     runs += [evaluated_run("AD", variant=("K", k), protocol="published") for k in (250, 500)]
     runs.append(evaluated_run("AD+TA+next_obs-" + "x" * 60, protocol="published"))
     shown = tuple(ShownEpisode(number, 20.0 * number, folder / "a.gif") for number in (1, 100))
-    pairs = [EpisodePair("H1", "AD with H1/t0 on demo_wide", "Task 0123456789abcdef, protocol published", shown)]
+    pairs = [
+        EpisodePair(
+            ResultCell("demo_wide", "H1"),
+            "AD with H1/t0 on demo_wide",
+            "Task 0123456789abcdef, protocol published",
+            shown,
+        )
+    ]
     write_page(runs, folder / "report.html", pairs, ["left out: runs/" + "y" * 60])
     return folder / "report.html"
 
@@ -48,7 +55,7 @@ def test_a_phone_does_not_scroll_sideways(file, dark):
         page.set_default_timeout(60_000)
         page.goto(file.as_uri())
         page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true })")
-        assert page.locator("section").count() == 7
+        assert page.locator("section").count() == 6
         assert page.evaluate(TOO_WIDE, PHONE) == []
         assert page.evaluate("document.documentElement.scrollWidth") == PHONE
         shade = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
