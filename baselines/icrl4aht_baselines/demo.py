@@ -33,7 +33,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.plotting import check_can_draw, plot_layout_curves
 from icrl4aht_data.reading.history import Labels
-from icrl4aht_data.utils.new_file import check_new_file
+from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import counted, progress_bars
 
 FLOOR = ("stay", "random")
@@ -118,7 +118,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     settings = settings or DemoSettings()
     paths = [out / name for name in ("learning_curves.png", "episode.gif", "adaptation.png", "report.html")]
     for path in paths:
-        check_new_file(path, overwrite=(out / "ad").is_dir())  # of a stopped run
+        check_output(path, overwrite=(out / "ad").is_dir())  # of a stopped run
     out.mkdir(parents=True, exist_ok=True)
     curves, episode, picture, page = paths
 

@@ -23,8 +23,8 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
 from icrl4aht_baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
-from icrl4aht_baselines.report.cards import CARD_BEGINS, card_name, write_model_cards
-from icrl4aht_baselines.report.page import check_can_render, report_begins, write_page_with_episodes, write_report
+from icrl4aht_baselines.report.cards import write_model_cards
+from icrl4aht_baselines.report.page import check_can_render, report_files, write_page_with_episodes, write_report
 from icrl4aht_baselines.report.results import merge, note_results, read_run
 from icrl4aht_baselines.training.histories import TrainingTask, filter_histories, prepare
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
@@ -37,7 +37,7 @@ from icrl4aht_data.format.schema import TASKS
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import check_can_draw
-from icrl4aht_data.utils.new_file import check_new_files
+from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import counted
 
 CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
@@ -221,7 +221,7 @@ def run_experiment(
     chosen = [_prepare_entry(*model, plan).about["histories"] for model in models]  # impossible ones fail early
     if any(histories["channels"] == "canonical" for histories in chosen):
         notes = [*notes, f"models take canonical channels, {chosen[0]['obs_shape'][-1]} on every layout"]
-    check_new_files(out / "report", overwrite=True, begins={**report_begins(), "report.html": None})  # of a stopped run
+    check_output(out / "report", overwrite=True, names=[*report_files(), "report.html"])  # of a stopped run
     results = []
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout
@@ -229,9 +229,6 @@ def run_experiment(
         _evaluate_entry(experiment, entry, tasks[layout], plan, folder, progress)
         results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
-    check_new_files(
-        out / "report", overwrite=True, begins=report_begins(runs) | {card_name(run): CARD_BEGINS for run in runs}
-    )
     notes = [f"{experiment.title} (`{name}`)", *notes]
     report = write_report(runs, out / "report")
     page = out / "report" / "report.html"

@@ -68,33 +68,6 @@ def test_the_settings_are_the_papers():
     assert (TESTED_ON["asymm_both"], TESTED_ON["cramped_up"]) == ("asymm_right", "cramped_down")
 
 
-<<<<<<< HEAD
-@pytest.mark.slow
-def test_a_tiny_experiment_ends_in_a_report(release, tmp_path, monkeypatch):
-    """One task of five steps with a model of one layer."""
-    monkeypatch.setitem(PROTOCOLS, "seeded", dataclasses.replace(PROTOCOLS["seeded"], steps=5))
-    plan = dataclasses.replace(SMALL, root=str(release), layouts=("demo_wide",), train=TRAIN | {"context": 8})
-    plan = dataclasses.replace(plan, filters={"algorithm": ("utility_greedy",)})
-    done = run_experiment("tracks", plan, tmp_path)
-    (config,) = (json.loads(path.read_text()) for path in tmp_path.rglob("config.json"))
-    assert config["histories"]["algorithm"] == ["utility_greedy"]
-    assert [cell["algorithm"] for cell in config["trained_on"]] == ["utility_greedy"]
-    assert done.notes == ["Teammate and layout generalization (`tracks`)"]
-    assert all(path.is_file() for path in done.report)
-    lines = (tmp_path / "report" / "report.csv").read_text().splitlines()
-    assert [line.split(",")[:6] for line in lines[1:]] == [["AD", "seeded", "demo_wide", "H4", "1", "2"]]
-    card = tmp_path / "report" / "AD-seeded.md"
-    assert card in done.report
-    assert "2 episodes of 5 steps, cached acting, 1 instance in a cell" in card.read_text()
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("tasks/*.json")}
-    assert len(before) == 1
-    assert read_result(next(iter(before))).settings["details"]["trained_on"] == config["trained_on"]
-    run_experiment("tracks", plan, tmp_path)
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("tasks/*.json")} == before
-
-
-=======
->>>>>>> 863e604 (Tests of the report: values on small tables, escaping, the page in a browser)
 def test_models_are_evaluated_on_validation_tasks_of_their_own_layout(release, tmp_path, monkeypatch):
     """The layout track tests on other layouts; its validation tasks are on those of the training."""
     entry = {"kind": "heuristic", "family": "utility_greedy", "theta_id": 7, "base_seed": 1, "theta": {}}
@@ -191,9 +164,6 @@ def test_finished_work_is_kept(swept, monkeypatch):
     assert steps == [("training steps", 0, 2), ("training steps", 2, 2), ("episodes", 0, 2), ("episodes", 2, 2)]
     with pytest.raises(OptionError, match=r"train\.seed: the run has 0, expected 3"):
         run_experiment("sweep context", dataclasses.replace(plan, train=TRAIN | {"seed": 3}), out)
-    (out / "report" / "report.csv").write_text("My notes.")
-    with pytest.raises(OptionError, match=r"report\.csv: is not a file as this command writes it"):
-        run_experiment("sweep context", plan, out)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from icrl4aht_baselines.commands.options import (
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, examples
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.new_file import check_new_files
+from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
 
@@ -147,11 +147,11 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
 
     Writes their results into OUT, and OUT/headroom.json and OUT/headroom.md from them.
     """
-    from icrl4aht_baselines.report.cards import HEADROOM_BEGINS, measure_headroom, write_headroom_cards
+    from icrl4aht_baselines.report.cards import HEADROOM_FILES, measure_headroom, write_headroom_cards
 
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:
-        check_new_files(folder, overwrite=True, begins=HEADROOM_BEGINS)
+        check_output(folder, overwrite=True, names=HEADROOM_FILES)
     with progress_bars(unit="tasks") as show:
         runs = measure_headroom(out, protocol, show)
     for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):

@@ -35,7 +35,7 @@ from icrl4aht_data.commands.options import (
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.new_file import check_new_files
+from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.options import Share
 from icrl4aht_data.utils.progress import progress_bars
 
@@ -234,7 +234,7 @@ def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, 
     `evaluate` made, are added.
     """
     from icrl4aht_baselines.report.comparison import (
-        RESULTS_BEGINS,
+        RESULTS_FILES,
         add_results,
         read_stored,
         results_file,
@@ -242,7 +242,7 @@ def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, 
         write_stored,
     )
 
-    check_new_files(out, overwrite, RESULTS_BEGINS)
+    check_output(out, overwrite, RESULTS_FILES)
     stored = read_stored(results_file())
     for folder in runs:
         stored = add_results(stored, folder, about)

@@ -57,8 +57,8 @@ from icrl4aht_data.commands.options import (
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
+from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.install_hints import install_command
-from icrl4aht_data.utils.new_file import check_new_file, check_new_files
 from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars
 
@@ -179,21 +179,21 @@ def report_command(
     training. Writes them as Markdown, CSV and curves, with a card for each trained model. Results of one agent on
     different layouts are merged.
     """
-    from icrl4aht_baselines.report.cards import CARD_BEGINS, card_name, write_model_cards
+    from icrl4aht_baselines.report.cards import card_name, write_model_cards
     from icrl4aht_baselines.report.page import (
         check_can_render,
         markdown,
-        report_begins,
+        report_files,
         write_page_with_episodes,
         write_report,
     )
     from icrl4aht_baselines.report.results import merge, read_run
 
     loaded, folder = merge([read_run(run) for run in runs]), out or runs[0] / "report"
-    check_new_files(folder, overwrite, report_begins(loaded) | {card_name(run): CARD_BEGINS for run in loaded})
+    check_output(folder, overwrite, [*report_files(loaded), *map(card_name, loaded)])
     if html:
         check_can_render()
-        check_new_file(html, overwrite)
+        check_output(html, overwrite)
     paths = write_report(loaded, folder)
     if html:
         with progress_bars() as show:
@@ -224,7 +224,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     from icrl4aht_baselines.evaluate.protocols import get_protocol
     from icrl4aht_baselines.report.gifs import save_episodes
 
-    check_new_file(out, overwrite)
+    check_output(out, overwrite)
     task = published_task(layout, teammate)
     (shown,) = save_episodes({1: out}, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
     mate = f"{task.teammate_family}/t{task.teammate['theta_id']}"

@@ -16,7 +16,7 @@ import numpy as np
 
 from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.evaluate.evaluator import evaluate
-from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.methods.options import UNUSED_OPTIONS
 from icrl4aht_baselines.report.page import markdown_sections
 from icrl4aht_baselines.report.results import (
@@ -41,14 +41,7 @@ from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.templates import fill_template, markdown_table
 
-CARD_BEGINS = b"---\nlicense: mit\nlibrary_name: icrl4aht-data\n"
-"""First bytes of a model's card, by which it is recognised before it is replaced."""
-
-HEADROOM_BEGINS: dict[str, bytes | tuple[bytes, ...]] = {
-    "headroom.json": tuple(f'{{\n "{name}": {{\n  "'.encode() for name in PROTOCOLS),
-    "headroom.md": b"# Headroom: what an ego can change\n",
-}
-"""Files with the headroom -> their first bytes, by which they are recognised before they are replaced."""
+HEADROOM_FILES = ("headroom.json", "headroom.md")
 
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 _NOT_LISTED = ("layouts", "root", "split", "labels", "held_out", "obs", "channels", "hide_recipe", *FILTERS)
@@ -209,7 +202,7 @@ def write_headroom_cards(runs: Sequence[EvaluationRun], folder: Path) -> list[Pa
         for cell, score in cell_scores(run).items():
             egos = content.setdefault(run.protocol, {}).setdefault(cell.layout, {}).setdefault(cell.family, {})
             egos[run.agent] = round(float(score.means.mean()), 3)
-    paths = [folder / name for name in HEADROOM_BEGINS]
+    paths = [folder / name for name in HEADROOM_FILES]
     paths[0].write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     paths[1].write_text(headroom_markdown(content), encoding="utf-8")
     return paths

@@ -43,8 +43,7 @@ from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.utils.text import counted_noun
 
-RESULTS_BEGINS: dict[str, bytes | None] = {"results.md": b"# Results: reference models\n", "results.png": None}
-"""Files of the page -> their first bytes, by which they are recognised before they are replaced."""
+RESULTS_FILES = ("results.md", "results.png")
 
 AgentCells = dict[ResultCell, dict[str, Any]]
 """Cell -> "overlaps", block or "gain" (last minus first) -> names of overlaps, or returns, float64 (U, S)."""
@@ -189,7 +188,7 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
     if not len(stored.table):
         raise OptionError("no stored results: give folders that `icrl4aht-data evaluate` made")
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / name for name in RESULTS_BEGINS]
+    paths = [folder / name for name in RESULTS_FILES]
     paths[0].write_text(render_comparison(stored), encoding="utf-8")
     plot_comparison(stored, "seeded", paths[1])
     return paths

@@ -49,7 +49,7 @@ from icrl4aht_baselines.training.seen import describe_training, overlap_legend, 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import MOST_PANELS, check_can_draw
 from icrl4aht_data.utils.files import atomic_write, json_hash
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.templates import markdown_table
 
 if TYPE_CHECKING:
@@ -65,16 +65,9 @@ _SHOWN_SETTINGS = {
 _PAPER_CONDITIONS = f"Paper: protocol {PUBLISHED_PROTOCOL}, {INSTANCES} instances, 100 episodes of 100 steps."
 
 
-def report_begins(runs: Sequence[EvaluationRun] = ()) -> dict[str, bytes | None]:
-    """Return the files of a report with their first bytes, by which they are recognised before they are replaced.
-
-    The bytes are None for a picture, which carries this package's mark. Without runs the only picture is curves.png.
-    """
-    pictures = list(_curve_pictures(runs)) or ["curves.png"]
-    return {
-        "report.md": b"# Returns per layout and teammate family\n",
-        "report.csv": b"agent,protocol,layout,family,instances,episodes,mean,std,",
-    } | dict.fromkeys(pictures)
+def report_files(runs: Sequence[EvaluationRun] = ()) -> list[str]:
+    """Return the names of the files of a report; without runs the only picture is curves.png."""
+    return ["report.md", "report.csv", *(_curve_pictures(runs) or ["curves.png"])]
 
 
 def _curve_pictures(runs: Sequence[EvaluationRun]) -> dict[str, list[ResultCell]]:
@@ -91,7 +84,7 @@ def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
     """
     check_can_draw()
     out.mkdir(parents=True, exist_ok=True)
-    paths = [out / name for name in report_begins(runs)]
+    paths = [out / name for name in report_files(runs)]
     paths[0].write_text(markdown(runs), encoding="utf-8")
     paths[1].write_text(csv_text(runs), encoding="utf-8")
     for name, cells in _curve_pictures(runs).items():

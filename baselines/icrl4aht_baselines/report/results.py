@@ -6,7 +6,7 @@ A table of results is a data frame with a row for each task, seed and block of e
     task, seed                              id of the task, or its number in stored results; seed, or its number
     block                                   mean: all episodes; first, last: up to 20 at each end; opening: episode 1
     return                                  mean return of the team in an episode of the block
-    overlap                                 overlaps of training data and the cell's tasks, see `overlap.OVERLAPS`
+    overlap                                 overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
     stay, oracle                            mean returns of these egos in the cell; NaN where they were not measured
 
 Tasks of different kinds never share a cell, since the paper's numbers and the headroom are of published test tasks.
@@ -174,7 +174,7 @@ class EvaluationRun:
         return self.source(cell).tasks[cell]
 
     def overlaps(self, cells: Iterable[ResultCell]) -> tuple[str, ...]:
-        """Return the kinds of overlap between training data and the tasks of some cells, see `overlap.OVERLAPS`."""
+        """Return the kinds of overlap between training data and the tasks of some cells, see `seen.OVERLAPS`."""
         found = {name for cell in cells for name in find_overlaps(self.tasks(cell), self.source(cell).seen)}
         return tuple(name for name in OVERLAPS if name in found)
 

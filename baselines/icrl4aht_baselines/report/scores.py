@@ -123,7 +123,7 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
     A row has the agent, the conditions of the evaluation, mean return, std and 95 % interval over the instances (None
     for a single instance), the paper's numbers (None unless the protocol is `published`), the adaptation gain,
     headroom, the normalised score (None for cells without headroom and incomplete cells), and `overlap`: the ways in
-    which training data and tasks overlap, see `icrl4aht_baselines.report.overlap.OVERLAPS`.
+    which training data and tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
     """
     found = []
     for cell, score in cell_scores(run).items():
@@ -297,7 +297,7 @@ class GroupScore(NamedTuple):
         normalised: normalised score, mean over the complete cells with headroom.
         gain: mean gain over the cells played; None if nothing was played.
         shortfall: instances played, if they are not the published ones, such as "1 of 5 instances"; usually empty.
-        overlaps: the ways in which training data and tasks overlap, see `icrl4aht_baselines.report.overlap.OVERLAPS`.
+        overlaps: the ways in which training data and tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
         details: what the score is of, with the conditions of the evaluation and the training of the agent; sentences.
     """
 

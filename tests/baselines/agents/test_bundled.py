@@ -19,7 +19,7 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.report.results import as_run
+from icrl4aht_baselines.report.results import ResultCell, as_run
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.trainer import train
@@ -99,8 +99,8 @@ def test_marks_are_those_of_the_model_of_the_track():
     tasks = [published_task(layout, "H2/t0") for layout in ("demo_wide", "cramped_down")]
     run = as_run([Result(task.task_id, settings, [[0.0] * 100]) for task in tasks])
     assert [source.layouts for source in run.sources] == [("demo_wide",), ("cramped_down",)]
-    assert run.overlaps([("demo_wide", "H2")]) == ()
-    assert run.overlaps([("cramped_down", "H2")]) == ("family",)
+    assert run.overlaps([ResultCell("demo_wide", "H2")]) == ()
+    assert run.overlaps([ResultCell("cramped_down", "H2")]) == ("family",)
 
 
 def test_layouts_of_other_tracks(models):

@@ -15,8 +15,8 @@ from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
 from icrl4aht_baselines.online import unseen
 from icrl4aht_baselines.online.layouts import unseen_layouts
 from icrl4aht_baselines.online.unseen import unseen_returns
-from icrl4aht_baselines.report import stored_results
-from icrl4aht_baselines.report.stored_results import UNSEEN, read_stored
+from icrl4aht_baselines.report import comparison
+from icrl4aht_baselines.report.comparison import UNSEEN, read_stored
 from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_data.commands.cli import cli
@@ -68,13 +68,13 @@ class TestCommand:
         return calls
 
     def test_table_and_store(self, played, monkeypatch, tmp_path):
-        monkeypatch.setattr(stored_results, "results_file", lambda: tmp_path / "results.json")
+        monkeypatch.setattr(comparison, "results_file", lambda: tmp_path / "results.json")
         command = ["research", "unseen", "--agent", "rl2-reference", "--versions", "2", "--store"]
         result = CliRunner().invoke(cli, command, catch_exceptions=False)
         assert result.exit_code == 0, result.output
         assert played == [(["stay", "oracle", "rl2-reference"], {"asymm_both", "cramped_up"}, 2, 40)]
         assert "| `rl2-reference` | 5.0 (5.0 to 5.0) | 5.0 (5.0 to 5.0) | 0.25 (0.25 to 0.25) |" in result.output
-        assert read_stored(tmp_path / "results.json").agents(UNSEEN) == ["stay", "oracle", "rl2-reference"]
+        assert list(read_stored(tmp_path / "results.json").protocol(UNSEEN)) == ["stay", "oracle", "rl2-reference"]
 
     @pytest.mark.parametrize(
         ("options", "message"),

@@ -18,14 +18,14 @@ from icrl4aht_baselines.report import gifs, merge, page, write_report
 from icrl4aht_baselines.report.cards import model_card, write_headroom_cards, write_model_cards
 from icrl4aht_baselines.report.figures import curve_figure, return_bars, score_bars
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
-from icrl4aht_baselines.report.page import markdown, report_begins, write_page, write_page_with_episodes
+from icrl4aht_baselines.report.page import markdown, report_files, write_page, write_page_with_episodes
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultCell
 from icrl4aht_baselines.report.scores import cell_headroom
 
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.installation import install_command
+from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
 GIF = b"GIF89a"  # the page does not look inside
@@ -272,6 +272,6 @@ def test_a_page_needs_jinja2(monkeypatch):
 def test_a_report_is_written_with_all_its_pictures(tmp_path):
     run = evaluated_run("AD", ("coord_ring", "test_wide", "demo_simple", "demo_wide"))
     names = [path.name for path in write_report([run], tmp_path / "report")]
-    assert names == ["report.md", "report.csv", "curves.png", "curves-2.png"] == list(report_begins([run]))
+    assert names == ["report.md", "report.csv", "curves.png", "curves-2.png"] == report_files([run])
     assert np.all([(tmp_path / "report" / name).stat().st_size > 0 for name in names])
     assert callable(report)

@@ -41,7 +41,7 @@ def test_there_are_20_cells_with_headroom():
 
 def test_the_score_is_the_mean_over_complete_cells_with_headroom():
     run = evaluated_run("mine", ("coord_simple", "demo_wide"), protocol="published")
-    assert np.isclose(cell_scores(run)[DEMO_WIDE[0]].normalised, score(11.0, DEMO_WIDE[0])).all()
+    assert cell_scores(run)[DEMO_WIDE[0]].normalised == pytest.approx(score(11.0, DEMO_WIDE[0]))
     assert cell_scores(run)[ResultCell("coord_simple", "H1")].normalised is None
     (headline,) = find_headlines(run)
     expected = np.mean([score(11.0, cell) for cell in DEMO_WIDE])
