@@ -18,6 +18,7 @@ import shutil
 import statistics
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -27,11 +28,14 @@ import click
 import numpy as np
 
 from benchmarks.harness import compared, elapsed, print_line
-from benchmarks.histories import write_many
 from benchmarks.published import fair_reader, published_reader
-from icrl4aht_data import ADBatch, ADSampler, load_icrl4aht
+from icrl4aht_data import ADBatch, ADSampler, Dataset, load_icrl4aht
+from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.options import COUNT
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import TASKS, held_fields
 from icrl4aht_data.writing.published import to_published
+from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 _AIMS = {("ram", "state"): 8000, ("ram", "uint8"): 400, ("ram", "float32"): 200}
 """(cache, observations) -> least ratio to the published reader."""
@@ -49,10 +53,27 @@ def make_data(folder: Path, layout: str, histories: int) -> None:
         return
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    dataset = load_icrl4aht(write_many(folder / "lite", [layout], histories))
+    source = load_icrl4aht(split="train", source="ppo", layout=layout)
+    task = next(task for task in read_tasks(source.root / TASKS) if task.layout.name == layout)
+    new = NewTask(task, Provenance(), histories, partial(rotated_histories, source, histories))
+    write_release(folder / "lite", "lite", [new], data_version="0.0.0", card="# benchmark\n")
+    dataset = load_icrl4aht(folder / "lite")
     to_published(dataset, folder / "published", states=False)
     to_published(dataset, folder / "fair", chunk=500, states=False)
     (folder / "done").touch()
+
+
+def rotated_histories(source: Dataset, count: int) -> Iterator[NewHistory]:
+    """Yield histories of a selection again and again, each time rotated by one more episode."""
+    kept = source.info.environment.kept_steps
+    for number in range(count):
+        history, episodes = source[number % len(source)], number // len(source)
+        arrays = {
+            field.name: np.roll(history.read(field.name), episodes * (kept if field.axis == "T" else 1), axis=0)
+            for field in held_fields("lite")
+            if history.entry.has(field)
+        }
+        yield NewHistory(number, arrays)
 
 
 def batch_seconds(sampler: ADSampler, buffer: ADBatch | None, cache: str, first: int) -> float:
