@@ -15,7 +15,7 @@ from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import INTERACT, STAY
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
-from icrl4aht_data.overcooked.state import State, columns, faults, unpack
+from icrl4aht_data.overcooked.state import State, columns, unpack
 from tests.helpers.states import random_records, state_record
 
 CRAMPED, ASYMM = LAYOUTS["cramped_up"], LAYOUTS["asymm_both"]
@@ -146,17 +146,7 @@ def test_starts_are_uniform_over_the_rooms_and_facings_and_recipes(name):
     assert not records[:, columns(layout).delivered :].any()
 
 
-def test_one_key_gives_one_start_and_other_keys_other_ones(cramped, keys):
-    first, again, other = cramped.init(keys), cramped.init(keys), cramped.init(some_keys(1))
-    np.testing.assert_array_equal(first.record, again.record)
-    assert (np.asarray(first.record) != np.asarray(other.record)).any(axis=1).mean() > 0.99
-
-
 # Episodes
-
-
-def test_the_default_is_the_training_episode_of_400_steps():
-    assert Environment(CRAMPED).max_steps == 400
 
 
 def test_done_comes_exactly_after_max_steps(life):
@@ -178,20 +168,6 @@ def test_final_is_the_rules_outcome_and_is_never_reset(life):
         np.testing.assert_array_equal(step.shaped, expected.shaped)
         if not np.asarray(step.done).any():
             np.testing.assert_array_equal(step.state.record, step.final)
-
-
-def test_auto_reset_gives_a_new_start(life):
-    starts = [life.before[0].record, life.steps[4].state.record, life.steps[9].state.record]
-    for number, record in enumerate(starts):
-        state = fields(CRAMPED, record)
-        assert faults(CRAMPED, np.asarray(record)) == []
-        assert not np.asarray(record)[:, columns(CRAMPED).delivered :].any()
-        assert not state.hands.any()
-        assert_uniform(state.positions, 30)
-        assert_uniform(np.concatenate([state.facings, state.recipe[:, None]], axis=1), 32)
-        if number:  # independent of the start before
-            cell, cell_before = state.positions[:, 0], fields(CRAMPED, starts[number - 1]).positions[:, 0]
-            assert_uniform(np.stack([cell_before, cell], axis=1), 36)
 
 
 def test_only_finished_environments_restart(cramped, life):
@@ -267,11 +243,6 @@ def test_a_correct_delivery_draws_a_recipe_that_may_repeat(cramped):
     assert_uniform(by_environment, 16)  # nor does one draw follow from another
 
 
-def test_each_episode_draws_recipes_of_its_own(life):
-    delivered = [fields(CRAMPED, life.steps[number].final).recipe for number in (1, MAX_STEPS + 1, 2 * MAX_STEPS + 1)]
-    assert_uniform(np.stack(delivered, axis=1), 8)
-
-
 def test_without_a_correct_delivery_the_recipe_stays(life):
     for number, (state, step) in enumerate(zip(life.before, life.steps, strict=True)):
         before, after = (fields(CRAMPED, record) for record in (state.record, step.final))
@@ -294,36 +265,6 @@ def test_recipes_of_ones_own_are_drawn_at_the_start_and_after_deliveries():
 
 
 # Rewards and batches
-
-
-def test_shaped_rewards_are_each_agents_own_and_apart_from_the_teams(cramped, keys):
-    """Environments of three scenes in one batch: a placement, a dish, and a wrong delivery next to a placement."""
-    placements = state_record(CRAMPED, (2, 1, "up"), (2, 2, "up"), hands=[ZERO, 0])
-    dishes = state_record(CRAMPED, (2, 2, "up"), (2, 1, "up"), hands=[0, PLATE], pot_items=[COOKED + 3 * ZERO])
-    serves = state_record(
-        CRAMPED, (1, 2, "down"), (3, 2, "down"), hands=[0, PLATE + COOKED + 3 * ONE], pot_items=[ZERO]
-    )
-    kinds = np.arange(N) % 3
-    state = cramped.init(keys)._replace(record=jnp.asarray(np.concatenate([placements, dishes, serves])[kinds]))
-    step = cramped.step(state, jnp.asarray(np.full((N, 2), INTERACT, np.int32)))
-    np.testing.assert_array_equal(step.shaped, np.array([[3, 0], [0, 5], [3, 0]], np.float32)[kinds])
-    np.testing.assert_array_equal(step.reward, np.array([0, 0, -20], np.float32)[kinds])
-
-
-def test_vmap_over_a_leading_axis_equals_the_flat_batch(cramped, keys, life):
-    folded = (4, N // 4)
-    step = jax.jit(jax.vmap(cramped.env.step))
-    state = jax.vmap(cramped.init)(keys.reshape(folded))
-    np.testing.assert_array_equal(state.record.reshape(N, -1), life.before[0].record)
-    for number in range(MAX_STEPS + 1):  # into the second episode
-        state = state._replace(record=life.before[number].record.reshape(*folded, -1))
-        outcome = step(state, jnp.asarray(life.actions[number].reshape(*folded, 2)))
-        for name in ("reward", "shaped", "done", "final"):
-            flat = getattr(outcome, name).reshape(getattr(life.steps[number], name).shape)
-            np.testing.assert_array_equal(flat, getattr(life.steps[number], name), err_msg=name)
-        state = outcome.state
-        np.testing.assert_array_equal(state.record.reshape(N, -1), life.steps[number].state.record)
-        np.testing.assert_array_equal(state.episode.reshape(N), life.steps[number].state.episode)
 
 
 def test_the_environments_observations_are_those_of_its_records(cramped, life):

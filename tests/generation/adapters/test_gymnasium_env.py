@@ -46,11 +46,6 @@ def test_every_published_test_task_has_an_id():
     assert len(ids) == len(tasks) == 160
 
 
-def test_an_unregistered_id_is_an_error_with_the_nearest():
-    with pytest.raises(gymnasium.error.NameNotFound, match="Did you mean: `demo_wide-H4-t"):
-        gymnasium.make("icrl4aht/demo_wide-H4-t9-v0")
-
-
 @pytest.mark.parametrize("imports", ["gymnasium, icrl4aht_data", "gymnasium"], ids=["imported", "by its prefix"])
 def test_importing_the_package_registers_the_ids(imports):
     name = NAME if "icrl4aht_data" in imports else f"icrl4aht_data:{NAME}"
@@ -150,15 +145,6 @@ def test_episodes_of_other_code_have_no_known_keys(lite):
         recorded_draws(dataset, 0)
 
 
-def test_a_start_state_alone_keeps_the_draws_free():
-    dataset, history = bundled(layout="demo_wide", source="noise")
-    recovered = dataset.recover_environment(history.entry.history_id)
-    for seed in (1, 2):
-        observation, info = recovered.reset(seed=seed, options={"state": history.state[0]})
-        np.testing.assert_array_equal(observation, history.obs[0])
-        np.testing.assert_array_equal(info["state"], history.state[0])
-
-
 def test_recovered_environments_take_options():
     dataset, history = bundled(layout="demo_wide", source="noise", channels="canonical")
     recovered = dataset.recover_environment(history.entry.history_id, max_episode_steps=3, render_mode="rgb_array")
@@ -166,12 +152,6 @@ def test_recovered_environments_take_options():
     np.testing.assert_array_equal(recovered.reset(options={"state": history.state[0]})[0], history.obs[0])
     assert [recovered.step(4)[3] for _ in range(3)] == [False, False, True]
     assert recovered.render().ndim == 3
-
-
-def test_an_environment_without_its_checkpoint_is_an_error(tmp_path):
-    dataset, history = bundled(layout="demo_wide", teammate_family="rl")
-    with pytest.raises(OptionError):
-        dataset.recover_environment(history.entry.history_id, suite=str(tmp_path))
 
 
 def test_a_release_without_tasks_has_no_environments(converted_release):

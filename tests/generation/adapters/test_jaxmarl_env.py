@@ -73,10 +73,6 @@ def test_a_learners_loop_steps_it_as_our_environment_plays():
     np.testing.assert_array_equal(states.step[:, 0], np.arange(1, STEPS + 1) % LENGTH)
 
 
-def test_repr_names_the_layout():
-    assert repr(JaxMARLEnv("demo_wide")) == "JaxMARLEnv(demo_wide, episodes of 400 steps)"
-
-
 def test_wrong_arguments_are_errors():
     with pytest.raises(UnknownNameError, match="layout"):
         JaxMARLEnv("nowhere")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import time
@@ -10,8 +9,7 @@ import time
 import numpy as np
 import pytest
 from icrl4aht_generation.collection import task as collect
-from icrl4aht_generation.collection import task_folder as artefacts
-from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, partial_folder
+from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, METRICS, partial_folder
 from icrl4aht_generation.learners.resume import StateFile
 from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_generation.profiles.work import Work
@@ -79,16 +77,6 @@ def test_killed_at_three_random_moments_the_artefact_is_the_same(built, tmp_path
     assert firsts == sorted(set(firsts)), f"killed {killed}, began at {firsts}"
     assert not compare_rebuilds(folder, artefact(built / "a")).differences, killed
     assert not partial_folder(folder).exists()
-
-
-def test_resumed_from_the_last_saved_update(built, task, tmp_path):
-    folder = tmp_path / "task"
-    with pytest.raises(KeyboardInterrupt):
-        run_task(task, folder, stop_after(11), save_seconds=0)
-    seen = []
-    run_task(task, folder, lambda number, metrics: seen.append(number))
-    assert seen == list(range(11, 25))
-    assert not compare_rebuilds(folder, artefact(built / "a")).differences
 
 
 def test_what_came_after_the_last_save_is_done_again(built, task, tmp_path):
@@ -160,20 +148,3 @@ def test_a_finished_task_is_left_alone(built, task, tmp_path):
     before = (folder / METADATA).stat().st_mtime_ns
     assert not run_task(task, folder, stop_after(0))
     assert (folder / METADATA).stat().st_mtime_ns == before
-
-
-def test_wall_clock_figures_are_apart_from_what_is_hashed(built):
-    folder = artefact(built / "a")
-    metadata = json.loads((folder / METADATA).read_text())
-    assert TIMING not in metadata["files"]
-    for name in (METADATA, METRICS):
-        assert "seconds" not in (folder / name).read_text()
-        assert "steps_per_second" not in (folder / name).read_text()
-    timing = artefacts.last_timing(folder)
-    assert timing is not None
-    assert timing["update"] == 24
-    assert 0 < timing["recording"] < timing["seconds"]
-
-
-def test_no_timing_yet(tmp_path):
-    assert artefacts.last_timing(tmp_path / "task") is None

@@ -21,8 +21,7 @@ from icrl4aht_generation.learners.resume import RunLog, StateFile
 from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_generation.profiles.work import Work
 
-from tests.helpers.tiny import artefact, start
-from tests.robustness.limits import can_mount, file_size_limit
+from tests.robustness.limits import file_size_limit
 
 Given = tuple[Work, Profile]
 
@@ -104,46 +103,3 @@ def test_failures_wait_for_room(task, tmp_path, monkeypatch):
     log.forget(["another"])
     assert log.is_written
     assert json.loads((tmp_path / "failed.jsonl").read_text())["error"] == "DiskFullError: no room"
-
-
-COLLECT_ON_SMALL_DISKS = """
-import sys
-from pathlib import Path
-from rich.console import Console
-from icrl4aht_generation.collection.job import CollectionError
-from icrl4aht_generation.collection.options import CollectOptions
-from icrl4aht_generation.collection.run import collect_tasks
-from icrl4aht_generation.profiles import Profile, load_profile
-from icrl4aht_data.benchmark.tasks import Task
-from tests.robustness.limits import small_disk
-
-profile = load_profile(sys.argv[1])
-folder = Path(sys.argv[2])
-for size in map(int, sys.argv[3].split(",")):
-    with small_disk(folder, size) as enlarge:
-        try:
-            collect_tasks(profile.works(), profile, folder, Console(), CollectOptions())
-            print("size", size, "enough")
-        except CollectionError as error:
-            artefacts = folder / "artefacts"
-            left = sorted(path.name for path in artefacts.iterdir() if path.is_dir()) if artefacts.exists() else []
-            print("size", size, "full", left, error)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not can_mount(), reason="mounts disks")
-def test_disks_of_20_sizes(built, tmp_path):
-    """No signal and no traceback; what is left of a task that failed can be resumed."""
-    size = sum(path.stat().st_size for path in artefact(built / "a").rglob("*") if path.is_file())
-    sizes = [4096 * max(2, round(size * 2.2 * share / 19 / 4096)) for share in range(20)]
-    arguments = [str(built / "tiny.toml"), str(tmp_path / "disk"), ",".join(map(str, sizes))]
-    process = start("-c", COLLECT_ON_SMALL_DISKS, *arguments)
-    output, errors = process.communicate()
-    assert process.returncode == 0, output + errors
-    assert "Traceback" not in output + errors
-    lines = [line.split(maxsplit=3) for line in output.splitlines() if line.startswith("size ")]
-    print(output)
-    assert [int(line[1]) for line in lines] == sizes
-    assert [line[2] for line in lines[:8]] == ["full"] * 8
-    assert lines[-1][2] == "enough"

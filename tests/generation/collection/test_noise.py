@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
 from icrl4aht_data.benchmark.tasks import make_task
-from icrl4aht_data.errors import DiskFullError, OptionError
+from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.rules import step
 from tests.generation.teammates.test_learned import entry, save
@@ -39,20 +38,6 @@ LAYOUT = get_layout("demo_wide")
 MATE = heuristic_teammate("utility_greedy", "default", 0)
 WORK = Work(make_task("teammate", "train", "demo_wide", MATE, 7), "noise")
 
-COLLECT = """
-import sys, time
-from pathlib import Path
-from icrl4aht_generation.collection import noise
-from icrl4aht_generation.profiles import load_profile
-from tests.generation.collection.test_noise import PIECE, WORK
-
-def report(history, metrics):
-    print(history, flush=True)
-    time.sleep(0.1)
-
-noise.EPISODES_AT_ONCE = PIECE
-noise.run_noise(WORK, load_profile(sys.argv[1]), Path(sys.argv[2]), report, save_seconds=0)
-"""
 
 pytestmark = pytest.mark.usefixtures("short_pieces")
 
@@ -245,18 +230,6 @@ def test_a_full_disk(profile, tmp_path, monkeypatch):
     assert not partial_folder(tmp_path / "other").exists()
 
 
-def test_a_learned_teammate_needs_its_suite(profile, tmp_path):
-    mate = {
-        "kind": "rl",
-        "family": "rl",
-        "theta_id": 0,
-        "theta": {"checkpoint": "demo_wide/fcp/m0/c4", "sha256": "0" * 64},
-    }
-    task = make_task("teammate", "train", "demo_wide", mate, 0)
-    with pytest.raises(OptionError, match="give the folder of the suite of teammates"):
-        run_noise(Work(task, "noise"), profile, tmp_path / "task")
-
-
 @pytest.mark.slow
 def test_histories_with_a_learned_teammate(profile, tmp_path):
     """It acts greedily on its own observations, and a resumed task has the bits of an uninterrupted one."""
@@ -275,25 +248,6 @@ def test_histories_with_a_learned_teammate(profile, tmp_path):
     played = np.load(folder / "teammate_actions.npy").reshape(40, 100)[[0, 25]]
     np.testing.assert_array_equal(played, expected)
     assert len(np.unique(played)) > 1
-
-
-@pytest.mark.slow
-def test_killed_at_two_moments(made, tmp_path):
-    (tmp_path / "noise.toml").write_text(NOISE)
-    folder = tmp_path / WORK.name
-    command = ["-c", COLLECT, str(tmp_path / "noise.toml"), str(folder)]
-    for _ in range(2):
-        process = start(*command)
-        assert process.stdout is not None
-        printed = process.stdout.readline()
-        time.sleep(0.02)
-        process.kill()
-        _, errors = process.communicate()
-        assert printed, errors
-        assert not folder.exists()
-    output, errors = start(*command).communicate()
-    assert folder.exists(), output + errors
-    assert not compare_rebuilds(folder, made).differences
 
 
 @pytest.mark.slow

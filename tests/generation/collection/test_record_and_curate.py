@@ -103,18 +103,6 @@ def test_keeping_twice_changes_nothing_and_order_does_not_matter():
         np.testing.assert_array_equal(getattr(again, name), array, err_msg=name)
 
 
-def test_shapes():
-    config = PPOConfig(total_steps=64 * 100 * 25, environments=64, rollout=100, minibatches=1)
-    size = record_size(LAYOUT)
-    assert record.array_shapes(LAYOUT, config.environments, config.episodes) == {
-        "state": ((64, 600, size), "uint8"),
-        "actions": ((64, 600), "int8"),
-        "teammate_actions": ((64, 600), "int8"),
-        "rewards": ((64, 600), "int8"),
-        "episode_end_state": ((64, 6, size), "uint8"),
-    }
-
-
 # Choosing.
 
 
@@ -150,17 +138,6 @@ def test_best_streams_follow_the_formula(episodes):
     expected = sorted(range(30), key=lambda n: -scores[n])
     assert best(returns, 30) == expected
     assert best(returns, 7) == expected[:7]
-
-
-def test_best_streams_by_hand():
-    """w = 5 of 12 episodes: the middle two count nothing, and improvement counts as much as the end."""
-    flat = [60] * 12  # 60 + 0
-    risen = [0] * 5 + [0, 0] + [40] * 5  # 40 + 40
-    fallen = [100] * 5 + [0, 0] + [70] * 5  # 70 - 30
-    busy = [0] * 5 + [200, 200] + [10] * 5  # 10 + 10
-    late = [0] * 7 + [0, 0, 0, 0, 175]  # 35 + 35
-    assert [score_by_hand(curve) for curve in (flat, risen, fallen, busy, late)] == [60, 80, 40, 20, 70]
-    assert best([flat, risen, fallen, busy, late], 4) == [1, 4, 0, 2]
 
 
 def test_equal_streams_come_in_the_order_of_their_numbers():

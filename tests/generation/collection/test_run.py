@@ -21,7 +21,6 @@ from icrl4aht_generation.collection.run import collect_tasks
 from icrl4aht_generation.collection.task_folder import LEARNER, partial_folder
 from icrl4aht_generation.learners.resume import BusyError, run_lock
 from icrl4aht_generation.profiles import load_profile
-from icrl4aht_generation.releases import build
 from icrl4aht_generation.releases.check import compare_rebuilds
 from rich.console import Console
 
@@ -229,16 +228,3 @@ def test_the_board_counts_tasks_updates_and_speed():
         ("all tasks", 7, 20, "0/2 tasks, 1,500 steps/s"),
         ("all tasks", 12, 20, "1/2 tasks, 500 steps/s"),
     ]
-
-
-def test_statistics_are_printed_and_kept(built):
-    output = StringIO()
-    build.build_releases(load_profile(str(built / "tiny.toml")), built / "a", ["lite"], Console(file=output, width=100))
-    for row in ("Original transitions", "4,000", "Filtered transitions", "1,500", "(5, 5, 45)", "Disk size"):
-        assert row in output.getvalue()
-    info = json.loads((built / "a" / "lite" / "meta" / "info.json").read_text())
-    statistics = info["statistics"]["demo_wide"]
-    assert statistics["original_transitions"] == 8 * 500
-    assert statistics["filtered_transitions"] == 3 * 500
-    assert (statistics["history_length"], statistics["teammates"]) == ([500, 500], 1)
-    assert statistics["disk_bytes"] == sum(p.stat().st_size for p in (built / "a" / "lite" / "data").rglob("*.h5"))

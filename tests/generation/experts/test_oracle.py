@@ -17,7 +17,7 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_tasks, published_thetas
 from icrl4aht_generation.teammates.registry import build_teammate
 
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
+from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.overcooked.actions import EGO, STAY
 from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, Layout
 from icrl4aht_data.overcooked.rules import CORRECT, PRESSED, WRONG, step
@@ -110,5 +110,3 @@ def test_it_is_deterministic():
     assert act(jax.random.key(1)) == act(jax.random.key(3))
 
 
-def test_families_are_all_met():
-    assert set(FAMILY_ON.values()) == set(HEURISTIC_KINDS.values())

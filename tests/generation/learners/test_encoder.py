@@ -107,11 +107,6 @@ def test_an_input_of_another_encoder_is_refused(kind, other):
         encoder(kind, CompactView(kind, (LAYOUT,))).init(jax.random.key(0), seen)
 
 
-def test_a_compact_input_needs_its_view():
-    with pytest.raises(TypeError, match="view"):
-        encoder("words").init(jax.random.key(0), CompactView("words", (LAYOUT,))(jnp.asarray(RECORDS)))
-
-
 def test_widths_name_the_encoder():
     assert Widths() == Widths(encoder="paper")
     flat = replace(Widths(), encoder="mlp")

@@ -163,24 +163,6 @@ def test_a_sequence_with_a_reset_equals_two_sequences(small, apply):
     np.testing.assert_allclose(hidden, last, rtol=0, atol=1e-6)
 
 
-def test_a_reset_changes_one_environment_at_one_step(small, apply):
-    none = jnp.zeros_like(small.reset)
-    _, carried, _ = apply(small.params, small.hidden, small.obs, none)
-    _, cut, _ = apply(small.params, small.hidden, small.obs, none.at[2, 1].set(True))
-    changed = np.abs(np.asarray(cut - carried)).max(axis=-1) > 1e-4
-    expected = np.zeros((STEPS, ENVS), bool)
-    expected[2:, 1] = True
-    np.testing.assert_array_equal(changed, expected)
-
-
-def test_a_reset_at_the_first_step_drops_the_given_hidden_state(small, apply):
-    at_start = jnp.zeros_like(small.reset).at[0].set(True)
-    given = apply(small.params, small.hidden, small.obs, at_start)
-    zero = apply(small.params, small.network.initial_hidden(ENVS), small.obs, jnp.zeros_like(small.reset))
-    for found, expected in zip(given, zero, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
-
-
 def test_initial_weights(small):
     """Orthogonal, of the published code's scales; every bias zero."""
     init = jax.jit(small.network.init)
@@ -193,11 +175,3 @@ def test_initial_weights(small):
         values = np.linalg.svd(kernel.reshape(-1, kernel.shape[-1]), compute_uv=False)
         np.testing.assert_allclose(values, scale, rtol=1e-4, err_msg=name)
         np.testing.assert_array_equal(tree[name]["bias"], 0, err_msg=name)
-
-
-def test_widths_from_json():
-    content = {"pointwise": [4], "spatial": [5, 6], "dense": 7, "gru": 8, "head": 9}
-    assert Widths.from_json(content) == Widths((4,), (5, 6), 7, 8, 9)
-    assert Widths.from_json({"gru": 8}) == Widths(gru=8)
-    with pytest.raises(TypeError, match="grus"):
-        Widths.from_json({"grus": 8})

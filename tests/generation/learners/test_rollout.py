@@ -23,7 +23,6 @@ from icrl4aht_generation.learners.rollout import (
     init_rollout,
     network_player,
     policy_player,
-    random_player,
     roll_out,
     slot_records,
 )
@@ -176,12 +175,6 @@ def test_slots_of_agent_1_see_what_the_teammate_observes(batch):
     assert differ == len(slots)
 
 
-def test_ordered_slots_of_agent_0_share_the_records():
-    record = jnp.asarray(random_records(LAYOUT, ENVS, np.random.default_rng(1)))
-    assert slot_records(record, np.arange(ENVS)) is record
-    np.testing.assert_array_equal(slot_records(record, np.array([2, 0])), record[jnp.array([2, 0])])
-
-
 # Episodes.
 
 
@@ -205,13 +198,6 @@ def test_only_players_of_an_ended_episode_restart():
     np.testing.assert_array_equal(rollout.done, np.array([[0, 0, n == 2, 0] for n in range(4)], bool))
     for notes, slots in zip(carry.memories, SLOTS, strict=True):
         np.testing.assert_array_equal(notes.steps, np.where(slots % ENVS == 2, 1, 4))
-
-
-def test_reset_follows_done_across_roll_outs(played):
-    step = np.arange(2 * STEPS)[:, None]
-    np.testing.assert_array_equal(played.rollout.reset, np.broadcast_to(step % EPISODE == 0, (2 * STEPS, ENVS)))
-    np.testing.assert_array_equal(played.rollout.done, np.broadcast_to(step % EPISODE == 4, (2 * STEPS, ENVS)))
-    np.testing.assert_array_equal(played.carry.ended, False)
 
 
 def test_returns_are_sums_over_the_episode_across_roll_outs(played):
@@ -345,14 +331,3 @@ def test_a_policy_sees_its_own_agents_observation():
         sums.append(np.asarray(jax.jit(player.act)((), state, jax.random.key(0))[0].action))
         np.testing.assert_array_equal(sums[-1], observe(LAYOUT, record, agent).sum(axis=(1, 2, 3)))
     assert (sums[0] != sums[1]).any()
-
-
-def test_the_random_player_draws_every_action_equally_often():
-    envs = 6000
-    player = random_player(TEAMMATE, envs)
-    np.testing.assert_array_equal(player.agent_slots, np.arange(envs, 2 * envs))
-    state = in_state(random_records(LAYOUT, envs, np.random.default_rng(3)))
-    choice, _ = jax.jit(player.act)((), state, jax.random.key(2))
-    shares = np.bincount(choice.action, minlength=6) / envs
-    assert len(shares) == 6
-    np.testing.assert_allclose(shares, 1 / 6, rtol=0, atol=5 * (1 / 6 * 5 / 6 / envs) ** 0.5)

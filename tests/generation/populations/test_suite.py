@@ -9,28 +9,23 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 import pytest
-from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy, save_policy
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import BusyError, run_lock
-from icrl4aht_generation.learners.rollout import init_rollout, network_player, policy_player, random_player, roll_out
 from icrl4aht_generation.policy import stacked
 from icrl4aht_generation.populations import cross_play
 from icrl4aht_generation.populations.select import (
-    TeammateSelection,
     make_tasks,
     select_teammates,
     write_manifests,
@@ -39,25 +34,21 @@ from icrl4aht_generation.populations.train import (
     PopulationRun,
     SuiteCheckpoint,
     is_population_finished,
-    play_matrix,
     suite_checkpoints,
     train_population,
 )
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.check import compare_rebuilds
-from icrl4aht_generation.teammates import learned
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, layout_number
-from icrl4aht_data.benchmark.tasks import read_tasks, write_tasks
-from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
-from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.benchmark.tasks import read_tasks
+from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.paths import ROOT
 from tests.helpers.xla_flags import add_xla_flag
 
 LAYOUT = get_layout("cramped_up")
-SEED = 7
 """Seed of the moment at which a run is killed."""
 SMOKE = load_profile("smoke").teammates
 EACH_ALGORITHM = pytest.mark.parametrize(
@@ -67,18 +58,6 @@ FIRST_MEMBER = {"comedi": 1}
 """Number of the first policy that may become a teammate; CoMeDi's first one is trained by self-play alone."""
 CONFIG, WIDTHS = SMOKE.ppo, SMOKE.ppo.widths
 
-CHILD = """
-import sys, time
-from pathlib import Path
-from tests.generation.populations import test_suite
-from icrl4aht_generation.populations import train as suite
-
-def report(update, updates, metrics):
-    print(update, flush=True)
-    time.sleep(0.02)
-
-suite.train_population(test_suite.run_of(sys.argv[1]), Path(sys.argv[2]), report, save_seconds=0.0)
-"""
 
 TWO_DEVICES = """
 import sys
@@ -177,17 +156,6 @@ def test_a_cards_return_is_that_checkpoints_own(trained):
         assert [card[name] for _, _, card in loaded] == returns.tolist()
 
 
-@pytest.mark.slow
-def test_a_members_return_is_with_itself_without_best_responses(trained):
-    folder = population(trained("fcp"), "fcp")
-    for checkpoint in (0, 4):
-        loaded = [load_policy(folder / f"m{m}" / f"c{checkpoint}") for m in range(2)]
-        members = stacked([params for _, params, _ in loaded])
-        for name, greedy in (("return", False), ("teammate_return", True)):
-            returns = cross_play.paired_returns(LAYOUT, loaded[0][0], members, members, greedy=greedy)
-            assert [card[name] for _, _, card in loaded] == returns.tolist()
-
-
 @EACH_ALGORITHM
 def test_the_log_has_a_line_for_each_update(trained, algorithm):
     folder = population(trained(algorithm), algorithm)
@@ -207,78 +175,7 @@ def test_the_log_has_a_line_for_each_update(trained, algorithm):
     assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_only_the_teammate_is_greedy(monkeypatch):
-    network = ActorCritic(WIDTHS)
-    params = jax.eval_shape(lambda key: stacked([network.untrained(key, LAYOUT.channels)]), jax.random.key(0))
-    made = []
-
-    def player(env, network, params, agent_slots, partner, greedy):
-        made.append((bool((agent_slots >= agent_slots.size).all()), greedy))
-        return network_player(env, network, params, agent_slots, partner, greedy)
-
-    monkeypatch.setattr(cross_play, "network_player", player)
-    for greedy in (False, True):
-        play = cross_play._compiled.__wrapped__(LAYOUT, WIDTHS, 0, (0,), (0,), 2, greedy)
-        jax.eval_shape(play, params, params, jax.random.key(0))
-    assert made == [(False, False), (True, False), (False, False), (True, True)]
-
-
-@pytest.mark.slow
-def test_the_play_matrix_pairs_best_responses_with_members(trained):
-    folder = population(trained("lbrdiv"), "lbrdiv")
-    network, _, _ = load_policy(folder / "m0/c4")
-    members, responses = (
-        stacked([load_policy(folder / where.format(m))[1] for m in range(2)]) for where in ("m{}/c4", "responses/m{}")
-    )
-    expected = cross_play.cross_play_returns(LAYOUT, network, responses, members)
-    assert expected.shape == (2, 2)
-    assert len(np.unique(expected)) > 1
-    np.testing.assert_array_equal(play_matrix(trained("lbrdiv"), LAYOUT, "lbrdiv"), expected)
-
-
-@pytest.mark.slow
-def test_every_checkpoint_acts_as_either_agent(trained):
-    env, envs, root = Environment(LAYOUT), 3, trained(*ALGORITHMS)
-    for agent in (EGO, TEAMMATE):
-        first = learned.build_learned(LAYOUT, population(root, ALGORITHMS[0]) / "m0/c0")
-
-        def play(params, agent=agent, policy=first):
-            players = [policy_player(env, policy, params, agent, envs), random_player(1 - agent, envs)]
-            carry = init_rollout(env, players, jax.random.split(jax.random.key(0), envs))
-            return roll_out(env, players, carry, 30, jax.random.key(1))[1].actions[..., agent]
-
-        play, seen = jax.jit(play), set()
-        for algorithm in ALGORITHMS:
-            for point in suite_checkpoints(root, LAYOUT.name, algorithm):
-                policy = learned.build_learned(LAYOUT, root / point.path)
-                assert policy.act is first.act
-                seen.add(np.asarray(play(policy.params)).tobytes())
-        assert len(seen) > 4, "policies act differently"
-
-
 # Interrupted runs.
-
-
-@pytest.mark.slow
-def test_a_killed_run_resumes_to_the_same_policies(trained, tmp_path):
-    """Killed at a random moment; CoMeDi trains its members one after the other."""
-    folder = tmp_path / "comedi"
-    moment = int(np.random.default_rng(SEED).integers(1, 18))
-    process = child(CHILD, "comedi", str(folder))
-    assert process.stdout is not None
-    for line in process.stdout:
-        if int(line) == moment:
-            process.send_signal(signal.SIGKILL)
-            break
-    process.communicate(timeout=60)
-    assert process.returncode == -signal.SIGKILL, f"killed after update {moment}"
-    assert not is_population_finished(folder, run_of("comedi"))
-    done: list[int] = []
-    train_population(run_of("comedi"), folder, lambda update, updates, metrics: done.append(update))
-    assert done[-1] == 18
-    assert moment == 1 or len(done) < 18, f"killed after update {moment}, but began at {done[0]}"
-    assert weights(folder) == weights(population(trained("comedi"), "comedi")), f"killed after update {moment}"
-    assert is_population_finished(folder, run_of("comedi"))
 
 
 class Stopped(Exception):
@@ -415,24 +312,12 @@ def test_comedis_first_policy_is_no_candidate(candidates):
     assert not [path for path in paths(chosen.train) if "/m0/" in path]
 
 
-def test_sorted_by_number_with_more_than_ten_members(tmp_path):
-    made_up(tmp_path, {(m, 0): 0.0 for m in (10, 2, 0, 11)})
-    found = paths(list(suite_checkpoints(tmp_path, LAYOUT.name, "fcp")))
-    assert [path.split("/")[2] for path in found] == ["m0", "m2", "m10", "m11"]
-
-
 def test_only_teammate_returns_above_the_threshold_are_selected(candidates):
     chosen = select_teammates(candidates, LAYOUT.name, "fcp", train=1000, heldout=0)
     assert (chosen.candidates, chosen.good, len(chosen.train)) == (50, 40, 40)
     everyone = chosen.train + chosen.heldout
     assert len(set(paths(everyone))) == 40
     assert all(point.card["teammate_return"] > 20 for point in everyone)
-
-
-def test_train_and_heldout_are_disjoint_and_of_the_wanted_numbers(candidates):
-    chosen = select_teammates(candidates, LAYOUT.name, "brdiv", train=20, heldout=5)
-    assert (len(chosen.train), len(chosen.heldout)) == (20, 5)
-    assert len({*paths(chosen.train), *paths(chosen.heldout)}) == 25
 
 
 def test_the_draw_is_fixed_by_its_seed_and_differs_between_algorithms(candidates):
@@ -491,27 +376,3 @@ def test_manifests_read_back(candidates, tmp_path):
             hashed = file_hash(root / point.path / POLICY_WEIGHTS)
             assert task.teammate["theta"] == {"checkpoint": point.path, "sha256": hashed}
             assert task.teammate["base_seed"] == 7
-
-
-def test_tracks_without_teammates_have_no_manifest(tmp_path):
-    made_up(tmp_path, {(0, 0): 30.0})
-    written = write_manifests(tmp_path, [select_teammates(tmp_path, LAYOUT.name, "fcp", 20, 5)])
-    assert [path.name for path in written] == ["layout_train.jsonl"]
-
-
-def test_a_tasks_teammate_is_built_and_another_hash_refused(trained, tmp_path):
-    root = trained("lbrdiv")
-    points = list(suite_checkpoints(root, LAYOUT.name, "lbrdiv"))
-    tasks = make_tasks(root, [TeammateSelection(LAYOUT.name, "lbrdiv", 10, 10, points, [])], "train")
-    write_tasks(tmp_path / "tasks.jsonl", tasks)
-    for task, point in zip(read_tasks(tmp_path / "tasks.jsonl"), points, strict=True):
-        built: Any = learned.build_learned_entry(task.layout, task.teammate, root)
-        expected = load_policy(root / point.path)[1]["params"]["actor"]["kernel"]
-        np.testing.assert_array_equal(built.params["params"]["actor"]["kernel"], expected)
-
-    wrong = tasks[0].teammate | {"theta": tasks[0].teammate["theta"] | {"sha256": "0" * 64}}
-    with pytest.raises(TaskFormatError, match=f"expected {'0' * 64} as in the task"):
-        learned.build_learned_entry(LAYOUT, wrong, root)
-    write_tasks(tmp_path / "wrong.jsonl", [replace(tasks[0], teammate=wrong)])
-    with pytest.raises(TaskFormatError, match=r"line 1: task_id .* does not match the task's content"):
-        read_tasks(tmp_path / "wrong.jsonl")

@@ -64,18 +64,6 @@ def test_what_differs_is_said(built, tmp_path):
     assert "5 differ" in text.output
 
 
-def test_an_array_that_is_none(tmp_path):
-    for name, content in (("a", b"junk"), ("b", b"juno"), ("c", b"")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "x.npy").write_bytes(content)
-    assert compare_rebuilds(tmp_path / "a", tmp_path / "b").differences == {
-        "x.npy": "4 bytes, the first difference at byte 3"
-    }
-    assert compare_rebuilds(tmp_path / "a", tmp_path / "c").differences == {
-        "x.npy": "4 and 0 bytes, the first difference at byte 0"
-    }
-
-
 def test_nothing_to_compare(tmp_path):
     (tmp_path / ".hidden").touch()
     with pytest.raises(OptionError, match="no files to compare"):

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
-import subprocess
-import sys
-from collections.abc import Callable
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
@@ -17,32 +13,28 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from icrl4aht_generation.collection import job
-from icrl4aht_generation.collection import task as collect
 from icrl4aht_generation.collection import task_folder as artefacts
 from icrl4aht_generation.collection.job import CollectionError
 from icrl4aht_generation.collection.task_folder import METADATA
-from icrl4aht_generation.learners.checkpoint import checkpoint_updates, load_policy
-from icrl4aht_generation.learners.config import PPOConfig
+from icrl4aht_generation.learners.checkpoint import load_policy
 from icrl4aht_generation.populations import select
 from icrl4aht_generation.populations import train as suite
-from icrl4aht_generation.populations.build import build_suite
-from icrl4aht_generation.profiles import FOLDER, load_profile, profile_names
+from icrl4aht_generation.profiles import FOLDER, load_profile
 from icrl4aht_generation.releases import build, measures, package
 from icrl4aht_generation.releases.check import compare_rebuilds
-from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate
+from icrl4aht_generation.teammates.registry import recover_teammate
 from rich.console import Console
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import ALGORITHMS
-from icrl4aht_data.commands.cli import cli, main
+from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import NearestTest
 from icrl4aht_data.overcooked.actions import TEAMMATE
-from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.tiny import LEARNED, TINY, artefact
 
@@ -81,13 +73,6 @@ def test_entries_say_where_they_come_from(built):
     assert "## Limits" in (root / "README.md").read_text()
 
 
-def test_the_final_ego_is_kept(built):
-    network, params, card = load_policy(artefact(built / "a") / "checkpoints/c4")
-    assert network.widths.gru == 8
-    assert card["steps"] == 16_000
-    assert params["params"]["actor"]["kernel"].shape == (8, 6)
-
-
 def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
     folder = artefact(built / "a")
     metadata = json.loads((folder / METADATA).read_text())
@@ -103,15 +88,6 @@ def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
     shutil.copy(tmp_path / "copy/checkpoints/c1/policy.json", tmp_path / "copy/checkpoints/c0/policy.json")
     profile = load_profile(str(built / "tiny.toml"))
     assert not artefacts.is_task_finished(tmp_path / "copy", profile.works()[0], profile)
-
-
-def test_few_updates_have_as_many_checkpoints():
-    def updates(number: int) -> tuple[int, ...]:
-        return checkpoint_updates(PPOConfig(total_steps=number, environments=1, rollout=1, minibatches=1))
-
-    assert updates(1) == (1,)
-    assert updates(3) == (1, 2, 3)
-    assert updates(57) == (12, 23, 35, 46, 57)
 
 
 def test_an_artefact_of_an_earlier_version_is_made_again(built, tmp_path):
@@ -130,18 +106,6 @@ def test_an_artefact_of_an_earlier_version_is_made_again(built, tmp_path):
     assert not artefacts.is_task_finished(folder, profile.works()[0], profile)
 
 
-def test_a_finished_task_is_not_done_again(built, monkeypatch):
-    def never(*arguments):
-        raise AssertionError("the task was collected again")
-
-    monkeypatch.setattr(job, "run_task", never)
-    output = StringIO()
-    before = (built / "a" / "lite" / "MANIFEST.sha256").read_bytes()
-    build.build_releases(load_profile(str(built / "tiny.toml")), built / "a", ["lite"], Console(file=output))
-    assert "finished before" in output.getvalue()
-    assert (built / "a" / "lite" / "MANIFEST.sha256").read_bytes() == before
-
-
 def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
     (work,) = profile.works()
@@ -156,25 +120,6 @@ def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_pa
     assert not artefacts.is_task_finished(folder, work, profile)
     (folder / METADATA).unlink()
     assert not artefacts.is_task_finished(folder, work, profile)
-
-
-def test_an_interrupted_task_leaves_no_finished_folder_and_a_rebuild_is_bit_equal(built):
-    profile = load_profile(str(built / "tiny.toml"))
-    (work,) = profile.works()
-    folder = built / "b" / work.name
-
-    def stop(update, metrics):
-        if update == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        collect.run_task(work, profile, folder, stop)
-    assert not folder.exists()
-    collect.run_task(work, profile, folder)
-    for name in ("state", "actions", "teammate_actions", "rewards", "episode_end_state"):
-        assert (folder / f"{name}.npy").read_bytes() == (artefact(built / "a") / f"{name}.npy").read_bytes(), name
-    weights = "checkpoints/c4/policy.safetensors"
-    assert (folder / weights).read_bytes() == (artefact(built / "a") / weights).read_bytes()
 
 
 def test_a_folder_in_the_way_is_not_lost(built, tmp_path):
@@ -198,38 +143,11 @@ def test_a_release_of_another_profile_is_not_replaced(built, tmp_path, monkeypat
     assert verify_release(tmp_path / "lite").ok
 
 
-def test_nothing_but_lines_where_output_is_no_terminal(built):
-    output = StringIO()
-    build.build_releases(load_profile(str(built / "tiny.toml")), built / "a", ["lite"], Console(file=output))
-    assert not re.search(r"\x1b|━", output.getvalue())
-
-
-def test_two_collectors_never_do_one_task_together(built):
-    profile = load_profile(str(built / "tiny.toml"))
-    (work,) = profile.works()
-    folder = built / "c" / work.name
-
-    def meanwhile(update, metrics):
-        with pytest.raises(OptionError, match="another process works in this folder"):
-            collect.run_task(work, profile, folder)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        collect.run_task(work, profile, folder, meanwhile)
-
-
 def test_bundling_replaces_the_bundled_release(built, monkeypatch, tmp_path):
     monkeypatch.setattr(package, "MINI", tmp_path / "mini")
     for _ in range(2):
         package.bundle_release(built / "a" / "lite")
         assert verify_release(tmp_path / "mini").ok
-
-
-def test_the_teammate_can_be_rebuilt(built):
-
-    spec = load_icrl4aht(built / "a" / "lite").recover_teammate(0)
-    assert (spec["slot"], spec["noise"]) == (1, "seeded")
-    assert build_teammate(LAYOUTS["demo_wide"], spec, spec["slot"], spec["noise"]).sees == "state"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -305,36 +223,6 @@ def test_releases_with_teammates_verify_and_a_changed_one_is_named(learned, tmp_
 
 
 @pytest.mark.slow
-def test_teammates_go_along_where_a_release_goes(learned, tmp_path):
-    dataset = load_icrl4aht(learned / "lite")
-    half = to_release(dataset.filter(teammate_kind="brdiv"), tmp_path / "half", "full")
-    other = to_release(dataset.filter(teammate_kind="fcp"), tmp_path / "other", "full")
-    both = combine_releases(tmp_path / "both", [half, other])
-    for root, count in ((half, 1), (both, 2)):
-        assert len(list(root.glob("teammates/**/policy.safetensors"))) == count
-        assert verify_release(root, level="deep").ok
-        recover_teammate(load_icrl4aht(root), 0)
-
-
-@pytest.mark.slow
-def test_two_rebuilds_whose_teammates_have_the_same_path_in_their_suites(learned, tmp_path, monkeypatch):
-    """Another seed, another suite folder; together the releases hold all four teammates."""
-    monkeypatch.setattr(select, "THRESHOLD", -np.inf)
-    arguments = ["generate", "--profile", str(learned / "learned.toml"), "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(cli, [*arguments, "--suite", str(tmp_path / "other"), "--seed", "1"])
-    assert result.exit_code == 0, result.output
-    assert (tmp_path / "other/demo_wide/fcp/population.json").is_file()
-    assert not (tmp_path / "out/suite").exists()
-    combine_releases(tmp_path / "both", [learned / "lite", tmp_path / "out/lite"])
-    assert verify_release(tmp_path / "both", level="deep").ok
-    both = load_icrl4aht(tmp_path / "both")
-    weights = {
-        np.asarray(jax.tree.leaves(recover_teammate(both, number).params)[0]).tobytes() for number in range(0, 12, 3)
-    }
-    assert len(weights) == 4
-
-
-@pytest.mark.slow
 def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
     dataset = load_icrl4aht(learned / "lite")
     root = to_release(dataset, tmp_path / "lite", "lite")
@@ -349,68 +237,6 @@ def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
         recover_teammate(load_icrl4aht(root), 0)
 
 
-HOLD = """
-import filelock, select, sys
-with filelock.FileLock(sys.argv[1]):
-    print(flush=True)
-    select.select([sys.stdin], [], [], 60)
-"""
-"""Holds a lock until its standard input is closed, or for a minute."""
-
-
-class Heard(StringIO):
-    """Calls `then` at the first occurrence of `message`."""
-
-    def __init__(self, message: str, then: Callable[[], object]) -> None:
-        super().__init__()
-        self.message, self.then = message, then
-
-    def write(self, text: str) -> int:
-        count = super().write(text)
-        if self.message in self.getvalue():
-            self.then()
-        return count
-
-
-@pytest.mark.slow
-def test_a_population_that_another_process_trains_is_waited_for(learned, monkeypatch):
-    monkeypatch.setattr(select, "THRESHOLD", -np.inf)
-    lock = learned / "suite/demo_wide/.brdiv.lock"
-    profile = load_profile(str(learned / "learned.toml"))
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
-        assert other.stdin is not None
-        assert other.stdout is not None
-        assert other.stdout.readline() == b"\n"
-        output = Heard("another process is training it", other.stdin.close)
-        selections = build_suite(profile, learned / "suite", {"demo_wide": ["brdiv", "fcp"]}, 0, Console(file=output))
-    lines = [line for line in output.getvalue().splitlines() if " on demo_wide: " in line][:3]
-    assert [line.partition(": ")[2] for line in lines] == [
-        "another process is training it",
-        "finished before",
-        "finished before",
-    ]
-    assert {selection.algorithm for selection in selections} == {"brdiv", "fcp"}
-
-
-@pytest.mark.slow
-def test_the_card_says_who_the_teammates_are(learned):
-    card = (learned / "lite" / "README.md").read_text()
-    assert "Learned teammates: populations of 2, 4,000 steps per member, by fcp, brdiv on demo_wide." in card
-    assert "| demo_wide | ppo | 6 |" in card
-    tables = json.loads((learned / "lite" / "card.json").read_text())
-    assert "brdiv/t0" in [row["teammate"] for row in tables["labels"]]
-    assert "Here egos for 16,000, teammates for 4,000." in card
-    assert "policies learned by fcp, brdiv" in card
-    assert "fewer training teammates" not in card
-    assert "in place of the learned teammates" not in card
-
-
-@pytest.mark.slow
-def test_the_card_says_which_teammates_are_missing(learned, tmp_path):
-    part = to_release(load_icrl4aht(learned / "lite", teammate_kind="fcp"), tmp_path / "part", "lite")
-    assert "than its profile asks for: brdiv on demo_wide (0 of 1)." in (part / "README.md").read_text()
 
 
 @pytest.mark.slow
@@ -434,17 +260,6 @@ def test_teammates_that_are_all_too_bad(learned, tmp_path):
     ):
         build.build_releases(load_profile(str(learned / "learned.toml")), tmp_path, ["lite"], Console(file=StringIO()))
     assert not (tmp_path / "lite").exists()
-
-
-@pytest.mark.slow
-def test_a_card_of_an_earlier_version_is_named(learned, tmp_path):
-    shutil.copytree(learned / "suite", tmp_path / "suite")
-    path = tmp_path / "suite/demo_wide/fcp/m0/c3/policy.json"
-    card = json.loads(path.read_text())
-    del card["teammate_return"]
-    path.write_text(json.dumps(card))
-    with pytest.raises(OptionError, match=r"demo_wide/fcp/m0/c3: its card has no 'teammate_return'.*again"):
-        select.select_teammates(tmp_path / "suite", "demo_wide", "fcp", 1, 1)
 
 
 def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, monkeypatch):
@@ -473,10 +288,3 @@ def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, mo
     ]
     assert isinstance(teammates("--profile", str(path), "--algorithm", "comedi").exception, OptionError)
     assert len(requests) == 4
-
-
-def test_unknown_profile_is_one_line(tmp_path):
-
-    result = CliRunner().invoke(cli, ["generate", "--profile", "huge", "--out", str(tmp_path)])
-    assert f"unknown profile 'huge'; valid: {', '.join(profile_names())}" in str(result.exception)
-    assert callable(main)

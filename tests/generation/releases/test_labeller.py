@@ -26,8 +26,6 @@ from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LABEL_EPISODES
-from icrl4aht_data.download import fetch_planned, plan_download
-from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -36,7 +34,6 @@ from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.tiny import artefact
-from tests.servers.http import http_server
 
 # The choice.
 
@@ -246,14 +243,6 @@ def test_policies_are_in_the_release_if_the_profile_says_so(built, with_policies
     assert policy_files(combine_releases(tmp_path / "both", [full])) == files
 
 
-def test_downloads_bring_the_policies(with_policies, tmp_path):
-    copy = tmp_path / "copy"
-    with http_server(with_policies) as server:
-        fetch_planned(plan_download(server.url, to=copy))
-    assert policy_files(copy) == policy_files(with_policies)
-    assert verify_release(copy).files == verify_release(with_policies).files
-
-
 def test_verify_compares_policies_and_index_with_the_provenance(with_policies):
     root = with_policies
     weights = next(root.glob("experts/*/policy.safetensors"))
@@ -270,15 +259,3 @@ def test_verify_compares_policies_and_index_with_the_provenance(with_policies):
     assert f"expected {weights.parent.name}, the name of its folder" in problems[0][1]
     assert [file for file, _ in problems[1:]] == ["meta/histories.jsonl"] * 3
     assert "but meta/provenance.json has 99.0 of its task" in problems[1][1]
-
-
-@pytest.mark.parametrize("name", ["../../outside", "a" * 63, "A" * 64])
-def test_only_a_hash_names_the_folder_of_a_policy(with_policies, tmp_path, name):
-    provenance = json.loads((with_policies / "meta/provenance.json").read_text())
-    (of_task,) = provenance.values()
-    of_task["expert"]["policy_sha256"] = name
-    (with_policies / "meta/provenance.json").write_text(json.dumps(provenance))
-    write_manifest(with_policies)
-    assert any("policy_sha256" in finding.problem for finding in verify_release(with_policies).findings)
-    with pytest.raises(IndexFormatError, match="policy_sha256"):
-        to_release(load_icrl4aht(with_policies), tmp_path / "out", "full")

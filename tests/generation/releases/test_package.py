@@ -173,14 +173,6 @@ def test_tasks_whose_histories_hardly_rise_are_left_out(built, two_learners, pro
     assert read_info(exempt).left_out == []
 
 
-def test_noise_histories_that_hardly_rise_are_left_out_too(built, profile, tmp_path):
-    (task,) = make_tasks(profile, 1)
-    make_noise(built, Work(task, "noise"), tmp_path / "artefacts")
-    rising = replace(profile, sources=("noise",), least_rise=10.0)
-    with pytest.raises(OptionError, match="no task has histories to keep: its histories rise by "):
-        pack(tmp_path, rising, [Work(task, "noise")], {task.task_id: MATTERS})
-
-
 def test_noise_histories_are_labelled_by_their_script(built, profile, tmp_path):
     (task,) = make_tasks(profile, 1)
     work = Work(task, "noise")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -98,21 +97,6 @@ def test_the_greedy_action_is_the_likeliest_with_the_memory_of_the_episode(tmp_p
     assert len(np.unique(actions)) > 1
 
 
-def test_the_memory_is_carried_and_matters(suite):
-    """The hidden state after other states gives other logits in the same last state, and it starts from zero."""
-    policy = learned.build_learned(LAYOUT, suite / "b")
-    act = jax.jit(policy.act)
-    obs = observe(LAYOUT, states(STEPS, 5)[:, 0], TEAMMATE)
-    start = policy.init(policy.params, jax.random.key(0))
-    np.testing.assert_array_equal(start, np.zeros(8))
-    hidden = [start]
-    for now in obs:
-        hidden.append(act(policy.params, hidden[-1], now, jax.random.key(0))[1])
-    assert np.abs(hidden[-1] - hidden[1]).max() > 0.1
-    direct = act(policy.params, start, obs[-1], jax.random.key(0))[1]
-    assert np.abs(hidden[-1] - direct).max() > 1e-2
-
-
 def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite):
     """3,000 draws in one state; shares within five standard deviations."""
     greedy, sampled = (learned.build_learned(LAYOUT, suite / "b", action) for action in ("greedy", "sampled"))
@@ -145,11 +129,6 @@ def test_checkpoints_of_one_shape_share_their_functions(suite):
     assert learned.build_learned(LAYOUT, suite / "a", "sampled").act is not one.act
 
 
-def test_checkpoints_of_other_widths_have_functions_of_their_own(suite, tmp_path):
-    save(tmp_path / "wide", widths=replace(WIDTHS, dense=9))
-    assert learned.build_learned(LAYOUT, tmp_path / "wide").act is not learned.build_learned(LAYOUT, suite / "a").act
-
-
 # Refusals.
 
 
@@ -164,14 +143,6 @@ def test_a_checkpoint_of_other_channels_is_refused_with_both_shapes(suite):
     learned.build_learned(get_layout("cramped_down"), suite / "a")
 
 
-def test_a_checkpoint_without_the_actor_is_refused(suite, tmp_path):
-    params = save(tmp_path / "b")
-    del params["params"]["actor"]
-    save_policy(tmp_path / "b", ActorCritic(WIDTHS), params, {})
-    with pytest.raises(OptionError, match=r"expected .*actor/kernel"):
-        learned.build_learned(LAYOUT, tmp_path / "b")
-
-
 @pytest.mark.parametrize("missing", [POLICY_CARD, POLICY_WEIGHTS, "."])
 def test_a_missing_checkpoint_is_a_clear_error(tmp_path, missing):
     folder = tmp_path / "gone"
@@ -182,32 +153,12 @@ def test_a_missing_checkpoint_is_a_clear_error(tmp_path, missing):
         learned.build_learned(LAYOUT, folder)
 
 
-def test_a_missing_suite_is_a_clear_error(suite):
-    with pytest.raises(OptionError, match="teammate a is a checkpoint: give the folder of the suite of teammates"):
-        learned.build_learned_entry(LAYOUT, entry(suite, "a"), None)
-
-
-def test_a_suite_without_the_checkpoint_is_a_clear_error(suite, tmp_path):
-    with pytest.raises(OptionError, match=r"a: not a checkpoint"):
-        learned.build_learned_entry(LAYOUT, entry(suite, "a"), tmp_path)
-
-
 def test_other_weights_than_the_task_names_are_refused(suite):
     other = entry(suite, "a")
     other["theta"] = {"checkpoint": "b", "sha256": other["theta"]["sha256"]}
     with pytest.raises(TaskFormatError, match=f"sha256 {file_hash(suite / 'b' / POLICY_WEIGHTS)}, expected") as error:
         learned.build_learned_entry(LAYOUT, other, suite)
     assert other["theta"]["sha256"] in str(error.value)
-
-
-def test_an_entry_builds_the_checkpoint_it_names(suite):
-    built, direct = (
-        learned.build_learned_entry(LAYOUT, entry(suite, "b"), suite),
-        learned.build_learned(LAYOUT, suite / "b"),
-    )
-    for a, b in zip(jax.tree.leaves(built.params), jax.tree.leaves(direct.params), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert built.act is direct.act
 
 
 @pytest.mark.parametrize("slot", [EGO, TEAMMATE])

@@ -112,26 +112,3 @@ def test_presets_of_h4_are_the_published_ones():
         theta = dict(zip(NAMES, values, strict=True))
         rest = {"kind": "heuristic", "family": "utility_greedy", "theta_id": 3, "base_seed": 0}
         assert list(entry.items()) == [*rest.items(), ("theta", theta)], name
-
-
-def test_unknown_family():
-    with pytest.raises(UnknownNameError, match=r"teammate family 'utility_gredy'.*Did you mean 'utility_greedy'"):
-        heuristic_teammate("utility_gredy", "default", 0)
-    with pytest.raises(UnknownNameError, match=r"teammate family 'utility_gredy'.*Did you mean 'utility_greedy'"):
-        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_gredy", "theta": UTILITY_GREEDY.defaults})
-
-
-def test_unknown_preset_of_h4():
-    with pytest.raises(
-        UnknownNameError, match=r"preset of utility_greedy 'prep_focussed'.*Did you mean 'prep_focused'"
-    ):
-        heuristic_teammate("utility_greedy", "prep_focussed", 0)
-
-
-def test_missing_and_unknown_parameters_of_h4():
-    theta = {name: value for name, value in UTILITY_GREEDY.defaults.items() if name != "inertia"} | {"w_inertia": 0.3}
-    with pytest.raises(TaskFormatError, match=r"missing parameters \['inertia'\], unknown parameters \['w_inertia'\]"):
-        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": theta})
-    with pytest.raises(TaskFormatError, match=r"missing parameters \['w_deliver'\], unknown parameters \[\]"):
-        without = {name: value for name, value in UTILITY_GREEDY.defaults.items() if name != "w_deliver"}
-        build_teammate(LAYOUTS["demo_wide"], {"family": "utility_greedy", "theta": without})

@@ -1,0 +1,81 @@
+"""Lookup tables of shortest paths, compared with brute force."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from icrl4aht_generation.paths import UNREACHABLE, Paths
+
+from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, LEFT, RIGHT, STAY, UP
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
+
+SEARCH = (RIGHT, DOWN, LEFT, UP)
+DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
+
+OPEN = Layout(
+    "open",
+    "test_open",
+    ("WWWWWWWWWWWW", "WA    W    W", "W     W    W", "W     W    W", "W     W A  W", "W     0    1", "WWWWWWWWWWWW"),
+)
+"""Two rooms without counters inside."""
+
+
+def neighbour(layout: Layout, cell: int, action: int) -> int:
+    """Return the cell next to a cell, -1 outside the map."""
+    x, y = cell % layout.width + DELTA[action][0], cell // layout.width + DELTA[action][1]
+    return y * layout.width + x if 0 <= x < layout.width and 0 <= y < layout.height else -1
+
+
+def brute_move(layout: Layout, cell: int, action: int) -> int:
+    """Return the cell to which a move leads when no agent is in the way."""
+    target = neighbour(layout, cell, action)
+    return target if target >= 0 and "".join(layout.rows)[target] in " A" else cell
+
+
+@lru_cache
+def brute_distances(layout: Layout) -> np.ndarray:
+    """int (cells, cells): steps between floor cells, by relaxing all triples (Floyd and Warshall)."""
+    distance = np.full((layout.cells, layout.cells), UNREACHABLE)
+    for cell, letter in enumerate("".join(layout.rows)):
+        if letter in " A":
+            for action in DELTA:
+                distance[cell, brute_move(layout, cell, action)] = 1
+            distance[cell, cell] = 0
+    for via in range(layout.cells):
+        distance = np.minimum(distance, distance[:, via, None] + distance[via])
+    return np.minimum(distance, UNREACHABLE)
+
+
+def brute_first_step(layout: Layout, origin: int, target: int) -> int:
+    """The first action, right, down, left, up, that starts a shortest path."""
+    left = brute_distances(layout)[origin, target]
+    if left in (0, UNREACHABLE):
+        return STAY
+    return next(a for a in SEARCH if brute_distances(layout)[brute_move(layout, origin, a), target] == left - 1)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_paths_equal_brute_force_and_lead_one_step_nearer(name):
+    layout = LAYOUTS[name]
+    paths = Paths(layout)
+    np.testing.assert_array_equal(paths.distance, brute_distances(layout))
+    first = [[brute_first_step(layout, a, b) for b in range(layout.cells)] for a in range(layout.cells)]
+    np.testing.assert_array_equal(paths.first_step, first)
+    origin, target = ((paths.distance > 0) & (paths.distance < UNREACHABLE)).nonzero()
+    assert len(origin)
+    after = layout.moves[origin, paths.first_step[origin, target]]
+    np.testing.assert_array_equal(paths.distance[after, target], paths.distance[origin, target] - 1)
+    np.testing.assert_array_equal(paths.first_step[(paths.distance == 0) | (paths.distance == UNREACHABLE)], STAY)
+
+
+def test_ties_resolve_right_down_left_up_in_an_open_room():
+    paths = Paths(OPEN)
+    centre_x, centre_y = 3, 3
+    for x in range(1, 6):
+        for y in range(1, 6):
+            dx, dy = x - centre_x, y - centre_y
+            expected = RIGHT if dx > 0 else DOWN if dy > 0 else LEFT if dx < 0 else UP if dy < 0 else STAY
+            found = paths.first_step[centre_y * OPEN.width + centre_x, y * OPEN.width + x]
+            assert ACTIONS[found] == ACTIONS[expected], (x, y)
