@@ -51,6 +51,7 @@ class Paths:
     def neighbours(self) -> np.ndarray:
         """int32 (cells, 4): the cell above, below, left and right of each cell, -1 outside the map."""
         layout = self.layout
+        # Walls, too, have neighbours: a counter's are the cells that it can be used from.
         found = np.full((layout.cells, 4), -1, np.int32)
         for cell in range(layout.cells):
             for k, name in enumerate(_ACCESS_ORDER):
@@ -65,6 +66,7 @@ class Paths:
         cells = self.layout.cells
         distance = np.full((cells, cells), UNREACHABLE, np.int32)
         first = np.full((cells, cells), STAY, np.int32)
+        # Python loops are fast enough: layouts have fewer than 100 cells, and each is searched once.
         for origin in self.layout.walkable.nonzero()[0]:
             distance[origin, origin] = 0
             queue = deque([int(origin)])
@@ -72,6 +74,8 @@ class Paths:
                 cell = queue.popleft()
                 for action in _SEARCH_ORDER:
                     target = int(self.layout.moves[cell, action])
+                    # Only the first visit counts, so the order of the actions decides between equal paths. The
+                    # published teammates search in this order, and their actions depend on it.
                     if distance[origin, target] == UNREACHABLE:
                         distance[origin, target] = distance[origin, cell] + 1
                         first[origin, target] = action if cell == origin else first[origin, cell]
@@ -97,6 +101,7 @@ class Paths:
     @cached_property
     def access_distance(self) -> np.ndarray:
         """int32 (cells, cells, 4): distance from a floor cell to each access cell of a target."""
+        # An index of -1 reads the last cell, which `where` then replaces.
         return np.where(self.access >= 0, self.distance[:, self.access], UNREACHABLE)
 
     @cached_property
@@ -232,6 +237,7 @@ class Scene:
 
     def _at(self, cells: tuple[int, ...], values: Array) -> Bool[Array, " cells"]:
         """A mask with one value for each of some cells, False elsewhere."""
+        # A gather by a constant table, since a scatter by traced values is slow under vmap.
         number = np.zeros(self.paths.layout.cells, np.int32)
         number[list(cells)] = range(len(cells))
         listed = np.isin(np.arange(self.paths.layout.cells), cells)
@@ -239,6 +245,7 @@ class Scene:
 
     @cached_property
     def _raw_and_idle(self) -> Bool[Array, " P"]:
+        # A pot with three ingredients cooks by itself, so a full one is cooking or cooked.
         items = self.state.pot_items
         return (self.state.pot_timers == 0) & ((items & COOKED) == 0) & (ingredient_count(items) < 3)
 
@@ -272,6 +279,7 @@ class Scene:
     @cached_property
     def empty_counters(self) -> Bool[Array, " cells"]:
         """Walls without an item, also unreachable ones."""
+        # The published teammates also aim at walls that nobody reaches; `first` then skips the rule.
         taken = self._at(self.paths.layout.counters, self.state.counters > 0)
         return jnp.asarray(self.paths.static(WALL)) & ~taken
 
@@ -282,10 +290,12 @@ class Scene:
     @cached_property
     def needed(self) -> Int[Array, " types"]:
         """Missing pieces of each piled ingredient, over all pots together."""
+        # Over all pots together, as published: two half-filled pots count as one.
         return jnp.maximum(self.counts(self.state.recipe) - self.counts(self.state.pot_items).sum(axis=0), 0)
 
     def counts(self, item: UInt8[Array, "*B"]) -> Int[Array, "*B types"]:
         """Pieces of each piled ingredient in an item, by ascending id."""
+        # Two bits for each ingredient, above the bits of plate and cooked.
         shift = 2 + 2 * jnp.arange(len(self.paths.layout.ingredients), dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)
 
@@ -341,12 +351,14 @@ class Scene:
 
     def _turn_or(self, target: Int[Array, ""], when_facing: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
         """Returns whether the target is adjacent, and the action in that case: turn to it, or `when_facing`."""
+        # A move into a wall only turns the agent, which is how it comes to face an adjacent target.
         adjacent = jnp.asarray(self.paths.manhattan)[self.me, target] == 1
         direction = jnp.argmax(jnp.asarray(self.paths.neighbours)[self.me] == target)  # up, down, left, right
         return adjacent, jnp.where(self.facing_action == direction, when_facing, direction)
 
     def first(self, rules: Sequence[Rule]) -> Chosen:
         """The first rule that applies, with the nearest of its targets."""
+        # All rules are evaluated and one is selected: under vmap a branch would run both sides anyway.
         targets = jnp.stack([rule.targets for rule in rules])
         possible = jnp.stack([rule.when for rule in rules]) & jnp.any(self.reach(targets), axis=-1)
         number = jnp.argmax(possible)
@@ -359,6 +371,7 @@ class Scene:
         """The step towards the target's nearest access cell, and that cell's cost: its distance, plus 100 if the
         partner is on it, plus `extra` (cells,)."""
         access = jnp.asarray(self.paths.access)[target]
+        # 100 is more than any path: an occupied access cell is chosen only if there is no other.
         cost = jnp.asarray(self.paths.access_distance)[self.me, target] + 100 * (access == self.partner)
         if extra is not None:
             cost = cost + jnp.asarray(extra)[access]
@@ -407,6 +420,7 @@ class Scene:
     def wander(self, stay_score: int = 50) -> Int[Array, ""]:
         """A step onto a free neighbour, in search order; else stay, or (150) walk into the partner."""
         target = jnp.asarray(self.paths.layout.moves).astype(jnp.int32)[self.me]
+        # Costs as published; `stay_score` between them decides whether it is better to stay than to push.
         scores = [jnp.where(target[a] == self.me, 1000, 100 * (target[a] == self.partner)) for a in _SEARCH_ORDER]
         best = jnp.argmin(jnp.stack([*scores, jnp.asarray(stay_score)]))
         return jnp.asarray((*_SEARCH_ORDER, STAY))[best]

@@ -75,6 +75,7 @@ class LayoutFacts(NamedTuple):
 
 def _study_layout(layout: Layout) -> LayoutFacts:
     paths, kinds = Paths(layout), layout.kinds
+    # Reach is what the agents can face, not where they can stand: counters between two rooms belong to both.
     mine, theirs = (np.isin(np.arange(layout.cells), layout.ahead[room]) for room in layout.rooms)
     shared = mine & theirs
     pots = np.array([k for k, cell in enumerate(layout.pots) if mine[cell]], int)
@@ -82,10 +83,12 @@ def _study_layout(layout: Layout) -> LayoutFacts:
     serves, mate_serves = (all((here & (kinds == k)).any() for k in (PLATES, GOAL)) for here in (mine, theirs))
     serves, mate_serves = serves and len(pots) > 0, mate_serves and bool(theirs[pot_cells].any())
     piles = (layout.piles == np.array([layout.ingredient_item(i) for i in layout.ingredients])[:, None]) & mine
+    # A teammate that carries ingredients to its nearest pot leaves the others free for soups in advance.
     starts = paths.access[(kinds == PILE) & theirs].ravel()
     their_way = paths.target_distance[starts[starts >= 0]][:, pot_cells].sum(axis=0)
     passed = their_way > their_way.min(initial=NEVER)
 
+    # In a room of its own the ego never meets the teammate, so one table of ways without an obstacle is enough.
     obstacles = np.array([-1, *(layout.rooms[EGO] if np.array_equal(*layout.rooms) else [])], int)
     time, action = _shortest_ways(layout, obstacles)
     leg = np.full((layout.cells, layout.cells), FAR, np.int32)
@@ -100,11 +103,11 @@ def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> tuple[np.ndarray, n
     """Returns `LayoutFacts.time` and `LayoutFacts.action`, by relaxing all ways until none becomes shorter."""
     count, cells, room = len(obstacles), layout.cells, layout.rooms[EGO]
     time = np.full((count, cells, 4, cells), FAR, np.int32)
-    for facing in range(4):
+    for facing in range(4):  # ways end where a cell is faced, so turning counts as a step, like walking
         time[:, room, facing, layout.ahead[room, facing]] = 0
     ends = np.repeat(layout.moves[None, :, :4].astype(int), count, axis=0)  # (O, cells, actions)
     ends = np.where(ends == obstacles[:, None, None], np.arange(cells)[:, None], ends)
-    while True:
+    while True:  # the tables are small, and are computed once per layout
         after = time[np.arange(count)[:, None, None], ends, FACING_OF]  # (O, cells, actions, cells)
         shorter = np.minimum(time, after.min(axis=2, keepdims=True) + 1)
         if np.array_equal(shorter, time):
@@ -120,6 +123,7 @@ def _hindrance(paths: Paths) -> np.ndarray:
     counter is used 4.
     """
     layout = paths.layout
+    # The ego cannot know where the teammate goes: all cells where it can use what it carries count.
     used = np.isin(layout.kinds, [GOAL, POT, PILE, PLATES])[layout.ahead].any(axis=1) & layout.walkable
     hindrance = np.tile(4 * used, (3, layout.cells, 1)).astype(np.int32)
     for carries, kinds in enumerate([[GOAL], [POT], [PILE, PLATES]]):
@@ -165,7 +169,7 @@ def oracle(layout: Layout) -> Policy:
         return OracleMemory(jnp.zeros(record_size(layout), jnp.uint8), zero + STAY, zero, zero, zero, no, no, no)
 
     def act(params, memory: OracleMemory, record: UInt8[Array, " S"], key: Key[Array, ""]):
-        if not matters:
+        if not matters:  # a constant policy, which compiles in no time
             return jnp.int32(STAY), memory
         scene = Scene(facts.paths, record, EGO)
         memory = _remember(scene, memory)
@@ -182,6 +186,7 @@ def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
     same = jnp.all(new.pot_items == old.pot_items) & (new.recipe == old.recipe)
     ego_rests, mate_rests = new.positions[EGO] == old.positions[EGO], new.positions[TEAMMATE] == old.positions[TEAMMATE]
     bumped = ego_rests & mate_rests & (jnp.asarray(layout.moves)[scene.me, last.action] != scene.me)
+    # What left the teammate's hand went onto a counter, into a pot or out: the counters and pots tell which.
     had = old.hands[TEAMMATE]
     put = (had >> 2 > 0) & (new.hands[TEAMMATE] == 0)
     onto_counter = jnp.any((new.counters > 0) & (old.counters == 0))
@@ -271,11 +276,13 @@ class OracleView(NamedTuple):
         """Cost of cooking each recipe in each pot: the recipe least in stock first, then the least work."""
         trip = self.facts.trip[:, None]
         enough = jnp.all((self.missing >= 0) & ((self.missing == 0) | (trip < FAR)), axis=-1)
+        # A surplus ingredient makes a recipe impossible: nothing can be taken out of a pot.
         possible = enough & ~self.full[:, None]
         current, short = self.recipes == self.recipes[0], self.stock[0] == 0
         # With a cooking teammate: cook nothing ahead in a pot that it uses, unless nothing else is left to do.
         wanted = jnp.where(short, current, self.facts.passed[:, None]) | (short & ~jnp.any(possible[:, 0]))
         work = jnp.sum(self.missing * np.minimum(trip, FAR // 10), axis=-1)
+        # A soup in stock outweighs any walk, which is shorter than 200 steps.
         return jnp.where(possible & (wanted | ~self.careful), 200 * (self.stock - current + 1) + work, NEVER)
 
     @property
@@ -296,6 +303,7 @@ class OracleView(NamedTuple):
         elsewhere = (self.scene.partner_hand & COOKED > 0) | (
             self.scene.holds_plate & (self.scene.partner_hand != PLATE)
         )
+        # A teammate that lets a finished soup wait will not take it.
         idles = (self.memory.calm >= WAIT_LIMIT) & (self.timers == 0)
         return self.right & first & self.careful & ~self.memory.parks & ~elsewhere & ~idles
 
@@ -315,6 +323,7 @@ class OracleView(NamedTuple):
 
 def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> OracleView:
     state, layout = scene.state, scene.paths.layout
+    # The first obstacle, nowhere, is also the index if the teammate stands where it is in nobody's way.
     obstacle = jnp.argmax(jnp.asarray(facts.obstacles) == scene.partner)
     origin = (obstacle, scene.me, state.facings[EGO].astype(jnp.int32))
     items = jnp.zeros(layout.cells, jnp.uint8).at[np.array(layout.counters, int)].set(state.counters)
@@ -347,24 +356,31 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
 
 
 class Subgoal(NamedTuple):
-    """One thing to do: go to the cheapest cell and interact.
+    """A row of the ego's table of decisions: go to the cheapest cell and interact.
 
     Attributes:
         when: bool (), whether the subgoal applies.
         cost: int32 (cells,), cost of going to each cell in steps; NEVER for cells that do not serve it.
+        reason: what it is good for; only read by people.
     """
 
     when: Bool[Array, ""]
     cost: Int[Array, " cells"]
+    reason: str
+
+
+def _subgoals(view: OracleView) -> list[Subgoal]:
+    """Return the table of decisions; the first row that applies and has a cell that can be reached decides."""
+    if not len(view.facts.pots):
+        return _with_dish(view)
+    return _with_dish(view) + _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
 
 
 def _decide(view: OracleView) -> Int[Array, ""]:
-    """Returns the action of the first option that applies and is possible."""
-    facts, options = view.facts, _with_dish(view)
-    if len(facts.pots):
-        options += _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
-    possible = jnp.stack([option.when & (jnp.min(option.cost) < NEVER) for option in options])
-    target = jnp.argmin(jnp.stack([option.cost for option in options])[jnp.argmax(possible)])
+    """Return the action towards the first possible subgoal; it does not depend on rows below that one."""
+    facts, rows = view.facts, _subgoals(view)
+    possible = jnp.stack([row.when & (jnp.min(row.cost) < NEVER) for row in rows])
+    target = jnp.argmin(jnp.stack([row.cost for row in rows])[jnp.argmax(possible)])
     action = jnp.asarray(facts.action)[view.origin][target]
     waits = jnp.any((facts.pot_cells == target) & view.too_early) & (action == INTERACT)
     action = jnp.where(waits, STAY, action)
@@ -377,16 +393,17 @@ def _with_dish(view: OracleView) -> list[Subgoal]:
     scene, facts = view.scene, view.facts
     wanted = (view.items == view.dish) & facts.mine & bool((scene.paths.static(GOAL) & facts.mine).any())
     options = [
-        Subgoal(scene.hand == view.dish, view.cost(scene.goals)),
-        Subgoal(scene.holds_dish, view.parking),
-        Subgoal(scene.holds_nothing, view.cost(wanted)),
-        Subgoal(jnp.any(wanted), view.parking),
+        Subgoal(scene.hand == view.dish, view.cost(scene.goals), "deliver the current recipe"),
+        Subgoal(scene.holds_dish, view.parking, "a wrong delivery costs 20: keep the dish for its recipe"),
+        Subgoal(scene.holds_nothing, view.cost(wanted), "a dish that is ready earns most for its steps"),
+        Subgoal(jnp.any(wanted), view.parking, "a free hand for that dish"),
     ]
     if not len(facts.pots):  # wait where the teammate may put down a dish that only the ego will deliver
         near = view.cost(
             scene.empty_counters & facts.shared, jnp.asarray(scene.paths.manhattan)[scene.partner] - view.time
         )
-        options.append(Subgoal(scene.holds_nothing & (scene.partner_hand == view.dish), near))
+        comes = scene.holds_nothing & (scene.partner_hand == view.dish)
+        options.append(Subgoal(comes, near, "be there when the teammate puts the dish down"))
     return options
 
 
@@ -396,9 +413,13 @@ def _with_plate(view: OracleView) -> list[Subgoal]:
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
     rest = jnp.maximum(view.timers - view.time[view.facts.pot_cells], 0)
     return [
-        Subgoal(holds & (soon | ~building), view.at_pots(right, rest)),
-        Subgoal(holds & (view.clears | ~building), view.at_pots(view.full & ~view.right, rest)),
-        Subgoal(holds, view.parking),
+        Subgoal(holds & (soon | ~building), view.at_pots(right, rest), "plate the soup of the current recipe"),
+        Subgoal(
+            holds & (view.clears | ~building),
+            view.at_pots(view.full & ~view.right, rest),
+            "empty a pot of a wrong soup",
+        ),
+        Subgoal(holds, view.parking, "no soup for the plate, but ingredients to carry"),
     ]
 
 
@@ -410,10 +431,14 @@ def _with_ingredient(view: OracleView) -> list[Subgoal]:
     spare = (view.recipes == view.recipes[0]) | (view.stock[0] > 0) | (jnp.sum(fits) > fits)[:, None]
     plans = jnp.min(jnp.where(takes & (spare | ~jnp.any(fits)), view.plans, NEVER), axis=1)
     return [
-        Subgoal(holds, view.at_pots(plans < NEVER, plans)),
-        Subgoal(holds & ~jnp.any(fits), view.at_pots(view.spoiled)),
-        Subgoal(holds & (not view.facts.serves), view.at_pots(view.full | view.mate_delivers)),
-        Subgoal(holds, view.parking),
+        Subgoal(holds, view.at_pots(plans < NEVER, plans), "cook: the pot and recipe that cost least"),
+        Subgoal(holds & ~jnp.any(fits), view.at_pots(view.spoiled), "a spoiled pot must be full to be emptied"),
+        Subgoal(
+            holds & (not view.facts.serves),
+            view.at_pots(view.full | view.mate_delivers),
+            "wait at the pot for the teammate, who serves",
+        ),
+        Subgoal(holds, view.parking, "an ingredient that no recipe needs"),
     ]
 
 
@@ -425,12 +450,14 @@ def _with_nothing(view: OracleView) -> list[Subgoal]:
     def fetch(ingredients: Bool[Array, " types"], then: Array) -> Int[Array, " cells"]:
         return view.cost(jnp.any(view.sources & ingredients[:, None], axis=0), then)
 
-    def plate_for(which: Bool[Array, " P"]) -> Subgoal:
-        return Subgoal(empty & jnp.any(which), view.cost(view.plates, jnp.min(jnp.where(which, to_pot, FAR), axis=1)))
+    def plate_for(which: Bool[Array, " P"], reason: str) -> Subgoal:
+        then = jnp.min(jnp.where(which, to_pot, FAR), axis=1)
+        return Subgoal(empty & jnp.any(which), view.cost(view.plates, then), reason)
 
     pot, recipe = jnp.unravel_index(jnp.argmin(plans), plans.shape)
     builds = empty & (jnp.min(plans) < NEVER)
     missing = view.missing[pot, recipe]
+    # The piece in the teammate's hand counts as in the pot, unless the teammate has been carrying it in vain.
     delivering = (scene.partner_hand & PLATE == 0) & (view.memory.calm < WAIT_LIMIT)
     coming = scene.counts(scene.partner_hand) * delivering
     ingredients = fetch(missing > coming, to_pot[:, pot])
@@ -442,15 +469,18 @@ def _with_nothing(view: OracleView) -> list[Subgoal]:
     wrong = view.full & ~view.right & view.clears & facts.serves
     used = jnp.any(scene.counts(view.recipes) > 0, axis=0)
     return [
-        Subgoal(builds & quick & ~view.risky, ingredients),
-        plate_for(right & due),
-        plate_for(wrong & due & view.risky),
-        Subgoal(builds, ingredients),
-        plate_for(right),
-        plate_for(wrong),
-        Subgoal(empty & jnp.any(view.spoiled), fetch(used, to_pot[:, 0])),
-        # An ego that only fills pots holds a piece ready for the next soup.
-        Subgoal(empty & jnp.any(view.full | view.mate_delivers) & (not facts.serves), fetch(used, to_pot[:, 0])),
+        Subgoal(builds & quick & ~view.risky, ingredients, "finish a pot that needs few steps, then fetch a plate"),
+        plate_for(right & due, "the plate arrives when the soup is done"),
+        plate_for(wrong & due & view.risky, "take a wrong soup before the teammate serves it"),
+        Subgoal(builds, ingredients, "cook"),
+        plate_for(right, "wait with a plate, as there is nothing to cook"),
+        plate_for(wrong, "empty a pot that blocks the current recipe"),
+        Subgoal(empty & jnp.any(view.spoiled), fetch(used, to_pot[:, 0]), "fill up a spoiled pot"),
+        Subgoal(
+            empty & jnp.any(view.full | view.mate_delivers) & (not facts.serves),
+            fetch(used, to_pot[:, 0]),
+            "an ego that only fills pots holds a piece ready for the next soup",
+        ),
     ]
 
 
@@ -473,6 +503,8 @@ def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Ar
     hindrance = jnp.asarray(_hindrance(scene.paths))[carries, scene.partner, ends]
     aside = jnp.argmin(jnp.where(taken, NEVER, hindrance + away - stays))
 
-    works = reachable & ((action != STAY) | scene.holds_plate)
-    action = jnp.where(works, action, jnp.where(follows, through, aside))
+    # With a plate the ego waits in front of the pot; with anything else it had better step aside than stay.
+    proceeds = reachable & ((action != STAY) | scene.holds_plate)
+    action = jnp.where(proceeds, action, jnp.where(follows, through, aside))
+    # Two agents that step towards one cell block each other for ever, so the ego rests after a failed move.
     return jnp.where(view.memory.bumps % 2 == 1, STAY, action)

@@ -141,8 +141,9 @@ class StateFile:
     """One safetensors file with the state of a training, the settings it belongs to, and its progress.
 
     Arrays are named by their path in the state's pytree ("params/actor/kernel"); typed keys (of JAX's default kind) are
-    stored as their data. Metadata: `format`, `settings` (JSON), `progress` (number of updates). Equal states and
-    settings give equal bytes. The file is replaced atomically. With several processes, all call `save`, process 0 writes, and every process can `load`.
+    stored as their data. Metadata: `format`, `settings` (JSON), `progress` (number of updates). The file
+    is replaced atomically, and equal states and settings give equal bytes. With several processes, all call `save`,
+    process 0 writes, and every process can `load`.
 
     Args:
         path: the file, which need not exist.

@@ -1,4 +1,4 @@
-"""Measurement of the draws of `icrl4aht_generation.teammates.draws`: distances to the test instances, behaviours, returns."""
+"""Measurement of the draws of `teammates.draws`: distances to the test instances, behaviours, returns."""
 
 from __future__ import annotations
 

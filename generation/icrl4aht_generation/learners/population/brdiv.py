@@ -28,6 +28,7 @@ def pairs_assignment(members: int, environments: int) -> Assignment:
     """
     if environments // 4 < members - 1:
         raise ValueError(f"environments = {environments}: {members} members need at least {4 * members - 4}")
+    # By environment, not drawn: every pair then has a fixed number of samples, and shapes are static.
     env = np.tile(np.arange(environments), members)
     confederate = np.repeat(np.arange(members), environments)
     with_own = env < environments - environments // 4 if members > 1 else np.ones(env.size, bool)
@@ -64,6 +65,7 @@ class BRDiv:
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
         own = np.eye(self.members)
+        # A best response learns nothing from another confederate: it has to be the best one to its own.
         confederates = own * (1 + 2 * self.cross_play_weight) - (1 - own) * self.cross_play_weight
         return jnp.asarray(np.concatenate([confederates.ravel(), own.ravel()]), jnp.float32)
 

@@ -51,6 +51,7 @@ class CoMeDi:
         new, frozen = np.zeros(quarter, int), np.ones(quarter, int)
         first_half = np.arange(quarter) < quarter // 2
         cross = np.stack([np.where(first_half, frozen, new), np.where(first_half, new, frozen)])
+        # Alternating, so that both halves of `cross` have as many of each kind.
         with_self = np.arange(quarter) % 2 == 0
         mixed = np.where(with_self, 0, cross)
         play = np.stack([new, new])
@@ -68,6 +69,7 @@ class CoMeDi:
         return ()
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
+        # Two terms of half the weight each, though the frozen member's is sampled by half as many slots.
         half = self.mixed_play_weight / 2
         return jnp.array([1.0, -self.cross_play_weight, half, half])
 

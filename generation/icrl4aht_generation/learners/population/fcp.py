@@ -27,6 +27,7 @@ class FCP:
     def assignment(self, environments: int) -> Assignment:
         """One term per member: its own return."""
         member = np.repeat(np.arange(self.members), environments)
+        # The slots of both agents are samples of one return, and the policy learns from both.
         both = np.stack([member, member])
         return Assignment(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
 

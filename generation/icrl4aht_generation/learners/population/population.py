@@ -183,6 +183,7 @@ class Population:
     def network(self) -> ActorCritic:
         """The network of all policies."""
         policies = self.assignment.policies
+        # A policy that always meets the same partner learns nothing from its number.
         pairs = set(zip(self.assignment.policy.ravel(), self.assignment.partner, strict=True))
         partners = policies if len(pairs) > policies else 0
         partners = partners if self.partners is None else self.partners
@@ -201,6 +202,7 @@ class Population:
     @cached_property
     def groups(self) -> list[PolicyGroup]:
         """All policies, in groups that one vmap can serve."""
+        # Policies of equal shapes must be neighbours, so that a group is a slice of the stacked parameters.
         slots = [self.assignment.agent_slots(policy) for policy in range(self.assignment.policies)]
         shapes = [(p < self.assignment.learning, len(own), len(others)) for p, (own, others) in enumerate(slots)]
         groups = []
@@ -236,12 +238,14 @@ class Population:
         Returns:
             The next state, and scalar metrics.
         """
+        # Keys come from the number of the update, not from a chain: a resumed run needs no other state.
         play_key, learn_key, visit_key = jax.random.split(jax.random.fold_in(state.key, state.update), 3)
         players = self._players(state.params)
         restart = self._restart(state.visited)
         carry, rollout = roll_out(self.env, players, state.carry, self.config.rollout, play_key, restart)
         params, optimizer, losses = self._learn(state, players, carry, rollout, learn_key)
         returns, seen = self._returns(rollout)
+        # One random step of each environment: all the states that a later episode may start from.
         steps = jax.random.randint(visit_key, (self.assignment.envs,), 0, self.config.rollout)
         after = PopulationState(
             params=params,
@@ -284,7 +288,7 @@ class Population:
         shaping = shaping_weight(self.config, state.update)
         params, optimizer, losses = state.params, state.optimizer, []
         for number, (group, player) in enumerate(zip(self.groups, players, strict=True)):
-            if group.first >= self.assignment.learning:
+            if group.first >= self.assignment.learning:  # frozen policies only play
                 continue
             slots = player.agent_slots
             last, _ = player.act(carry.memories[number], carry.env, key)
@@ -299,6 +303,7 @@ class Population:
                 """(T, G * M, ...) -> (G, T, counting, ...)."""
                 return jnp.moveaxis(leaf.reshape(leaf.shape[0], *shape, *leaf.shape[2:]), 1, 0)[:, :, :counting]
 
+            # From the old parameters of all: no policy sees what another has learned in this update.
             keys = jax.random.split(jax.random.fold_in(key, number), len(group.agent_slots))
             own = (group.take(state.params), group.take(state.optimizer), jax.tree.map(by_policy, played), keys)
             new_params, new_optimizer, loss = self._learn_by_policy(group)(*own)
@@ -309,6 +314,7 @@ class Population:
     def _learn_by_policy(self, group: PolicyGroup) -> Callable[..., Any]:
         """`PPO.learn` with a leading axis of policies, sharded over as many devices as divide them evenly."""
         learn, devices = jax.vmap(self.ppo.learn), jax.devices()
+        # `shard_map` needs equal parts, so three policies on two devices stay on one.
         count = max(n for n in range(1, len(devices) + 1) if len(group.agent_slots) % n == 0)
         if count == 1:
             return learn
@@ -317,22 +323,26 @@ class Population:
         return jax.shard_map(learn, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)
 
     def _slot_weights(self, memory: Any) -> Float[Array, " 2N"]:
-        """The weight of each slot's advantage.
-
-        A term's weight is shared equally among its slots, then every policy's weights are scaled to 1 on average, so
-        that the learning rate means the same for all policies and algorithms.
-        """
-        term, policy = self.assignment.term.ravel(), self.assignment.policy.ravel()
-        counts = np.bincount(term[term >= 0])
-        raw = jnp.where(term >= 0, self.algorithm.weights(memory)[term] / np.maximum(counts, 1)[term], 0.0)
-        total = jnp.zeros(self.assignment.policies).at[policy].add(jnp.abs(raw))
-        samples = np.bincount(policy[term >= 0], minlength=self.assignment.policies)
-        return raw * (samples / jnp.maximum(total, 1e-8))[policy]
+        """Return the weight of each slot's advantage; 0 for slots that nothing is learned from."""
+        policies = self.assignment.policies
+        term, policy = self.assignment.term.ravel(), self.assignment.policy.ravel()  # int (2N,) each
+        learned = term >= 0  # bool (2N,)
+        # A term is an expected return and each of its slots a sample, so that the slots share the term's weight.
+        weights = self.algorithm.weights(memory)  # float32 (terms,)
+        samples = np.bincount(term[learned], minlength=len(weights))  # int (terms,)
+        shared = weights / np.maximum(samples, 1)  # float32 (terms,)
+        raw = jnp.where(learned, shared[term], 0.0)  # float32 (2N,)
+        # Scaled to 1 on average for each policy: the learning rate then means the same for all algorithms.
+        total = jnp.zeros(policies).at[policy].add(jnp.abs(raw))  # float32 (P,)
+        slots = np.bincount(policy[learned], minlength=policies)  # int (P,)
+        scale = slots / jnp.maximum(total, 1e-8)  # float32 (P,)
+        return raw * scale[policy]
 
     def _returns(self, rollout: Rollout) -> tuple[Float[Array, "P P"], Bool[Array, "P P"]]:
         """Mean return of the episodes that ended, by ego and teammate, and whether there was one."""
         size = (self.assignment.policies,) * 2
         pairs = tuple(self.assignment.policy)
+        # Several environments play one pair: `at[].add` sums over them, where an assignment would keep the last.
         ended = jnp.zeros(size).at[pairs].add(rollout.done.sum(axis=0))
         total = jnp.zeros(size).at[pairs].add(jnp.where(rollout.done, rollout.returns, 0.0).sum(axis=0))
         return total / jnp.maximum(ended, 1), ended > 0

@@ -39,6 +39,7 @@ def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int
     following, u = draw(memory.key)
     idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
     makes_room = _makes_room(scene)
+    # Deliveries and emergency moves are exempt from slips: no published teammate loses a dish by accident.
     final, action = _decide(scene, params, abandons=u[2] < params["task_abandon_prob"])
     slips = ~(idles | makes_room | final)
     action, following = _slip(scene, params, action, slips, u[1], following)
@@ -57,6 +58,7 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
     final = scene.holds_dish | (ingredient & soup)
+    # With a soup done, an ingredient in the hand is in the way: it is put down at once.
     ingredient &= ~soup
     plates_now = soup | (cooking & (params["plate_urgency"] > 0.5))
     plater = (params["role_mode"] == PLATER) | ((params["role_mode"] == FLEX) & plates_now)
@@ -65,6 +67,7 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
         [
             Rule(scene.holds_dish, scene.goals),
             Rule(scene.holds_ingredient & soup, scene.empty_counters),
+            # Agents drop what they carry when they give up or when it belongs to the other role.
             Rule((plate | ingredient) & abandons, scene.empty_counters),
             Rule((runner & plate) | (plater & ingredient), scene.empty_counters),
             Rule(runner & ingredient, scene.nonfull),
@@ -72,6 +75,7 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
             Rule(runner & empty, _needed_piles(scene)),
             Rule(plater & plate, scene.cooked),
             Rule(plater & empty, scene.plate_piles),
+            # From here on nothing can be done: agents wait where their next task will be.
             Rule(plater & (plate | empty), scene.pots_in_use, waits=True),
             Rule((runner & empty) | (plater & plate), scene.pots, waits=True),
             Rule(empty | (plater & plate), scene.buttons, waits=True),
@@ -93,6 +97,7 @@ def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
 
 def _needed_piles(scene: Scene) -> Bool[Array, " cells"]:
     """Piles of the recipe's missing ingredients over all pots; one in the partner's hand counts as if in the pot."""
+    # Otherwise both agents would fetch the last missing piece.
     carried = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
     return scene.piles_of(scene.needed - carried > 0)
 

@@ -90,6 +90,7 @@ class Heuristic:
         """Returns whether a parameter may have this value."""
         if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
             return False
+        # JSON has no integers of its own: 2.0 is a valid value of an integer parameter.
         integral = isinstance(self.defaults[name], float) or float(value).is_integer()
         return integral and 0 <= float(value) <= self._highest(name)
 
@@ -110,6 +111,7 @@ def _functions(heuristic: Heuristic, layout: Layout, slot: int, noise: Noise):
     """`init` and `act` of a policy."""
     paths = Paths(layout)
 
+    # Cached, so that policies of one family are the same functions, and JAX compiles them once.
     def init(params, key: Key[Array, ""]) -> Any:
         return heuristic.begin(jax.random.key(slot) if noise == "fixed" else key)
 
@@ -128,6 +130,7 @@ def next_key(key: Key[Array, ""]) -> Key[Array, ""]:
 
 def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
     """Returns the next key of the chain and the step's uniform draws u1..u4, float32 in [0, 1)."""
+    # The published chain: a split into five keys, of which the first continues it. Golden actions depend on it.
     keys = jax.random.split(key, 5)
     return keys[0], jax.vmap(jax.random.uniform)(keys[1:])
 

@@ -102,6 +102,7 @@ def _look(scene: Scene, memory: ButtonMemory) -> ButtonMemory:
 def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], noises: Noises):
     """The action of a step without idling; whether pressing the button was considered, whether it was chosen, and
     whether the branch of the wrong ingredient was entered: all three decide how the key chain proceeds."""
+    # One parameter makes specialists of both agents: agent 0 cooks and agent 1 delivers.
     specialist = params["task_specialization"] > 0.5
     role = Role(specialist & (scene.slot == 0), specialist & (scene.slot == 1))
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
@@ -134,6 +135,7 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
             Rule(empty, scene.pots, waits=True),
         ]
     )
+    # The rules from `errs` on fetch ingredients; only they can be replaced by blocking or by a wrong ingredient.
     settled = chosen.found & (chosen.number < len(first_rules))
     action = scene.go_to(chosen.target, chosen.waits, _step(scene, chosen.target, cramped))
     if cramped and scene.slot == 1:
@@ -152,6 +154,7 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
 
 def _wants_plate(scene: Scene, params, role: Role) -> Bool[Array, ""]:
     timers = scene.state.pot_timers
+    # A soup becomes urgent as it cooks, so that the plate arrives when it is done.
     cooking = jnp.max(jnp.where(timers > 0, jnp.asarray(_URGENCY)[timers.astype(jnp.int32)], 0))
     urgency = jnp.where(jnp.any(scene.cooked), 1, cooking)
     return ((urgency >= 1 - params["plate_timing"]) & ~role.cooks_only) | role.delivers_only
@@ -171,6 +174,7 @@ def _missing(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P types"]:
 
 def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
     """Pots in which the ingredient in the hand is missing; if there is none, every pot that takes an ingredient."""
+    # A pot with a wrong soup also takes ingredients: with no better pot, H1 fills it up.
     held = scene.counts(scene.hand)
     wanting = (
         jnp.zeros_like(scene.nonfull).at[np.array(scene.paths.layout.pots)].set(_missing(scene, recipe) @ held > 0)
@@ -184,6 +188,7 @@ def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], cramped: b
     ids = jnp.asarray(scene.paths.layout.ingredients)
     missing = _missing(scene, recipe).sum(axis=0) > 0
     second = cramped and scene.slot == 1
+    # Without the exchange of words that people have, fetching different ones is how two of them share the work.
     nth = jnp.cumsum(missing)
     wanted = jnp.where(jnp.sum(missing) > 1, nth == 2, nth == 1) if second else nth == 1
     known = jnp.where(jnp.any(missing), ids[jnp.argmax(wanted)], _NONE)
@@ -222,6 +227,7 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: bool) -> Int[Array, ""]
         return scene.approach(target)[0]
     layout = scene.paths.layout
     y, x = np.divmod(np.arange(layout.cells), layout.width)
+    # A tenth of a step for each cell: it decides between access cells at equal distance, and nothing else.
     corner = y + x if scene.slot == 0 else (layout.height - y) + (layout.width - x)
     step, _ = scene.approach(target, (np.float32(0.1) * corner).astype(np.float32))
     if scene.slot == 1:
@@ -258,11 +264,13 @@ def _clear_the_way(scene: Scene) -> Int[Array, ""]:
     walkable = jnp.asarray(paths.layout.walkable)
     if not len(exits):
         return jnp.int32(STAY)
+    # A cell is between two others if the way over it is no detour.
     detour = manhattan[scene.partner, :, None] + manhattan[:, exits]
     between = jnp.any(detour == manhattan[scene.partner, exits], axis=1)
     in_the_way = walkable & (between | (manhattan[scene.partner] == 1))
     from_exits = jnp.asarray(paths.manhattan[:, exits].min(axis=1))
     leaves = scene.free & ~in_the_way[scene.ways]
+    # Where no neighbour is out of the way, head for the cell that is farthest from the goals.
     refuge = jnp.argmax(jnp.where(walkable & ~in_the_way, from_exits, -1))
     to_refuge = manhattan[scene.ways, refuge]
     nearer = scene.free & (to_refuge < manhattan[scene.me, refuge]) & jnp.any(walkable & ~in_the_way)

@@ -61,6 +61,7 @@ def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Ar
     blocked = jnp.where(u[0] < 0.7, STAY, _to_the_middle(scene))
     action = jnp.where(mode == BLOCKER, blocked, action)
     action = jnp.where((mode == LAZY) & (u[0] > params["action_probability"]), STAY, action)
+    # A step without a move counts even if it was meant: agents that wait for each other have to separate.
     stuck = jnp.where(scene.me == memory.cell, memory.stuck + 1, 0)
     return action, TerritoryMemory(following, scene.me, stuck)
 
@@ -69,6 +70,7 @@ def _to_the_middle(scene: Scene) -> Int[Array, ""]:
     """The step towards the middle: across first, then along the middle column; stay in front of a wall."""
     layout = scene.paths.layout
     y, x = np.divmod(np.arange(layout.cells), layout.width)
+    # On most layouts nobody gets past a blocker in the middle column.
     across = np.where(x < layout.width // 2, RIGHT, LEFT)
     along = np.where(y < layout.height // 2, DOWN, np.where(y > layout.height // 2, UP, STAY))
     action = np.where(x == layout.width // 2, along, across)
@@ -86,6 +88,7 @@ def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> 
         Rule(keeps_dish | (ingredient & hoards & (u < 0.8)), scene.empty_counters),
         Rule(empty & counters & soup, scene.needed_piles),
     ]
+    # Only targets without which no soup is finished have a fallback outside the territory.
     goals, nonfull, put_down, cooked, heating, plates, staged, needed = _filter(
         scene,
         params,
@@ -115,6 +118,7 @@ def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> 
             Rule(empty, plates),
         ]
     )
+    # Sabotage is never interrupted; honest work is, by being stuck or, for hoarders, at random.
     sabotages = chosen.found & (chosen.number < len(sabotage))
     wanders = ~chosen.found | (stuck & ~sabotages) | (plate & hoards & (u < 0.7))
     worked = scene.go_to(chosen.target, chosen.waits, _step(scene, params, chosen.target))
@@ -141,6 +145,7 @@ def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
 def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array, "masks cells"]:
     """The reachable cells of each mask within the own territory; if there is none, within the shared one; if there is
     none either, all reachable ones of the masks with a fallback."""
+    # Two finished soups are as urgent as it gets: then even strict teammates help outside their territory.
     urgency = jnp.minimum(jnp.sum(scene.cooked) / 2, 1)
     anywhere = (urgency > params["rescue_threshold"]) | (params["strictness"] <= 0.5)
     mine = areas(scene, params)
@@ -157,13 +162,16 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
 
 def areas(scene: Scene, params) -> Areas:
     """The areas of the scene's agent, or of its partner for the mode INVADER."""
+    # The split by stations can leave one agent without floor, in small rooms; such layouts are split vertically.
     beyond, stations = _borders(scene.paths)
     kind = jnp.where((params["split_mode"] == STATIONS) & (not stations), VERTICAL, params["split_mode"])
     beyond = jnp.asarray(beyond)[kind]
     margin = params["shared_margin"] * jnp.where(kind == STATIONS, jnp.float32(1.5), jnp.float32(1))
+    # An invader works in its partner's territory, so it takes the other side of the border.
     second = (scene.slot == 1) ^ (params["behavior_mode"] == INVADER)
     strict = jnp.where(second, beyond >= 0, beyond < 0)
     near = beyond + margin
+    # As published: cells exactly at the margin are shared, but not in the split by stations.
     shared = jnp.where(kind == STATIONS, near > 0, near >= 0)
     return Areas(strict, jnp.where(second, shared, beyond < margin))
 

@@ -39,6 +39,7 @@ def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[
     """One step of an H4 teammate."""
     intent, action = _decide(scene, params, memory.intent)
     action, wait = _yield(scene, memory, action)
+    # A wait holds the intent but not the key, which moves on in every step as in the published code.
     waiting = memory.wait > 0
     after = GreedyMemory(
         next_key(memory.key),
@@ -51,6 +52,7 @@ def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[
 def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """The best intent (-1 if none is feasible) and its action."""
     cooked, cooking, nonfull = scene.reach(scene.cooked), scene.reach(scene.cooking), scene.reach(scene.nonfull)
+    # With a plate, a soup that still cooks is worth as much as a finished one, if no other is finished.
     waits = scene.holds_plate & ~jnp.any(cooked) & jnp.any(cooking)
     needed = scene.reach(scene.needed_piles)
     stageable = scene.empty_counters & jnp.asarray(scene.paths.near_pot)
@@ -63,7 +65,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
             nonfull,
             jnp.where(jnp.any(needed), needed, scene.recipe_piles),
             jnp.where(prefers_pots, stageable, scene.empty_counters),
-            jnp.zeros_like(scene.goals),
+            jnp.zeros_like(scene.goals),  # START has no targets
             scene.buttons,
         ]
     )
@@ -75,6 +77,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
     best = jnp.argmax(scores)
     target = scene.closest(targets[best])
     action = jnp.where(waits & (best == PICK_UP), scene.hover(target), scene.go_to(target))
+    # `argmax` over nothing but -inf returns 0, so whether anything is feasible decides separately.
     some = jnp.any(feasible)
     return jnp.where(some, best, -1), jnp.where(some, action, scene.wander())
 
@@ -90,6 +93,7 @@ def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array,
         jnp.where(can_add, 1 + 0.2 * nonfull, 0.8),
         jnp.where(can_add, 0.4 + 0.05 * nonfull, 0.15),
     )
+    # The bonus of adding is that of the fullest pot, whichever pot is nearest, as published.
     fullest = jnp.max(ingredient_count(scene.state.pot_items)).astype(jnp.int32)
     finished = 1 + 0.5 * cooked
     no_pot_in_use = cooking + cooked + nonfull == 0
