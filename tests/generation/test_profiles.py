@@ -287,7 +287,7 @@ def test_faults_are_named_with_the_file(changed, old, new, named):
 
 
 def test_unknown_profile_name():
-    with pytest.raises(UnknownNameError, match="unknown profile 'smoek'; valid: .*Did you mean 'smoke'"):
+    with pytest.raises(UnknownNameError, match=r"unknown profile 'smoek'; valid: .*Did you mean 'smoke'"):
         load_profile("smoek")
 
 

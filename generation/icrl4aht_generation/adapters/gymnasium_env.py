@@ -113,9 +113,9 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
             options: all optional. `state`: uint8 (S,), the state record to start from instead of a drawn one.
                 `key`: uint32 (2,), data of the JAX key that the episode is drawn from, and `episode`: its number with
                 this key, 0 by default; see `icrl4aht_generation.env.Environment`. `teammate_actions`: integers (n,),
-                actions that the teammate repeats in the first n steps, whatever the ego does. `recipes`: uint8 (n,), item of
-                the recipe after each of the first n steps, if it changes in this step. `Dataset.reset_options` returns
-                those of a recorded episode.
+                actions that the teammate repeats in the first n steps, whatever the ego does. `recipes`: uint8 (n,),
+                item of the recipe after each of the first n steps, if it changes in this step. `Dataset.reset_options`
+                returns those of a recorded episode.
 
         Returns:
             The first observation, and `info`.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal
 
 from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_generation.collection.noise import is_noise_finished, run_noise
@@ -19,30 +20,9 @@ class CollectionError(Icrl4ahtError):
     """Some tasks have no finished artefact."""
 
 
-class Run(Protocol):
-    """Makes an artefact, see `task.run_task`."""
-
-    def __call__(
-        self, work: Work, profile: Profile, folder: Path, on_update: UpdateCallback, *, suite: Path | None, wait: bool
-    ) -> bool: ...
-
-
-class IsFinished(Protocol):
-    """Returns whether a folder has the artefact, see `task_folder.is_task_finished`."""
-
-    def __call__(self, folder: Path, work: Work, profile: Profile) -> bool: ...
-
-
-class Collector(NamedTuple):
-    """Functions of one source: to record the histories of a task, and to check whether they are complete."""
-
-    run: Run
-    is_finished: IsFinished
-
-
-def collector(source: str) -> Collector:
-    """Returns the functions that record the histories of a source."""
-    return {"ppo": Collector(run_task, is_task_finished), "noise": Collector(run_noise, is_noise_finished)}[source]
+def _functions(source: str) -> tuple[Callable[..., bool], Callable[..., bool]]:
+    """Return the functions that record the histories of a source, and that check whether they are complete."""
+    return {"ppo": (run_task, is_task_finished), "noise": (run_noise, is_noise_finished)}[source]
 
 
 @dataclass(frozen=True)
@@ -86,11 +66,11 @@ class CollectionJob:
 
     def is_finished(self, work: Work) -> bool:
         """Whether the artefact is complete and unchanged."""
-        return collector(work.source).is_finished(self.folder(work), work, self.profile)
+        return _functions(work.source)[1](self.folder(work), work, self.profile)
 
     def __call__(self, work: Work, on_update: UpdateCallback = lambda update, metrics: None) -> Literal["done", "busy"]:
         try:
-            run = collector(work.source).run
+            run, _ = _functions(work.source)
             run(work, self.profile, self.folder(work), on_update, suite=self.suite, wait=self.wait)
         except BusyError:
             return "busy"

@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -41,7 +39,9 @@ from icrl4aht_generation.collection.task import (
     TEAMMATE_NOISE,
     UpdateCallback,
     make_artefact,
+    pipelined,
     readable_disk_errors,
+    saved_progress,
 )
 from icrl4aht_generation.collection.task_folder import (
     LEARNER,
@@ -52,7 +52,6 @@ from icrl4aht_generation.collection.task_folder import (
 )
 from icrl4aht_generation.learners.resume import (
     METRICS,
-    OtherSettingsError,
     RunLog,
     SaveInterval,
     StateFile,
@@ -141,74 +140,35 @@ def _record(
     teammate = build_teammate(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
     schedules = noise_schedules(config, task.seed)
     saved = StateFile(partial / LEARNER, noise_settings(work, profile) | software_versions())
-    first = _saved_pieces(saved)
+    first, pieces = saved_progress(saved), -(-schedules.size // EPISODES_AT_ONCE)
     needed = noise_bytes(task.layout, config)
 
     def play(number: int) -> NoisyEpisodes:
         # The last piece plays its last episode again and again, so that all pieces have one size.
-        episodes = np.minimum(_piece(number) + np.arange(EPISODES_AT_ONCE), schedules.size - 1)
+        episodes = np.minimum(number * EPISODES_AT_ONCE + np.arange(EPISODES_AT_ONCE), schedules.size - 1)
         history, episode = np.divmod(episodes, config.episodes)
-        return play_noisy_episodes(task.layout, teammate, task.seed, history, episode, schedules[history, episode])
+        played = play_noisy_episodes(task.layout, teammate, task.seed, history, episode, schedules[history, episode])
+        writer.start_clock()  # the first piece is compiled and started
+        return played
+
+    def save(number: int) -> None:
+        writer.sync()
+        saved.save({"pieces": np.int32(number)}, number)
 
     with readable_disk_errors(partial, needed):
         if not first:
             check_room(partial, needed)
-        writer = NoiseWriter(partial, task.layout, schedules, _piece(first))
+        writer = NoiseWriter(partial, task.layout, schedules, first * EPISODES_AT_ONCE)
         try:
-            _play_pieces(play, schedules.size, first, writer, saved, on_update, save_seconds)
+            for number, played in pipelined(
+                range(first, pieces), play, SaveInterval(pieces, seconds=save_seconds), save
+            ):
+                if (timing := writer.write(number * EPISODES_AT_ONCE, played)) is not None:
+                    on_update(int(timing["update"]), timing)
         finally:
             writer.close()
         settings = noise_settings(work, profile) | {"profile": profile.name}
         write_metadata(partial, settings, _hashed_files(work, profile))
-
-
-def _piece(number: int) -> int:
-    """The first episode of a piece, counted over all histories."""
-    return number * EPISODES_AT_ONCE
-
-
-def _saved_pieces(saved: StateFile) -> int:
-    """The number of pieces that were written under the same settings; 0 in a new, empty folder."""
-    try:
-        pieces = saved.progress
-    except OtherSettingsError:  # a changed profile or version: an unfinished artefact is no loss
-        pieces = None
-    if pieces is None:
-        shutil.rmtree(saved.path.parent, ignore_errors=True)
-        saved.path.parent.mkdir(parents=True)
-    return pieces or 0
-
-
-def _play_pieces(
-    play: Callable[[int], NoisyEpisodes],
-    episodes: int,
-    first: int,
-    writer: NoiseWriter,
-    saved: StateFile,
-    on_update: UpdateCallback,
-    save_seconds: float,
-) -> None:
-    """Play the pieces from number `first`, write them, and save the progress at intervals."""
-    pieces = -(-episodes // EPISODES_AT_ONCE)
-    interval = SaveInterval(pieces, seconds=save_seconds)
-    pending: Any = None  # the last piece: it is written while the device plays the next one
-
-    def write(number: int, played: NoisyEpisodes) -> None:
-        timing = writer.write(_piece(number), played)
-        if timing is not None:
-            on_update(int(timing["update"]), timing)
-
-    for number in range(first, pieces):
-        played = play(number)  # returns when the piece is compiled and started
-        writer.start_clock()
-        if pending is not None:
-            write(*pending)
-        pending = number, played
-        if interval.due(number + 1):
-            write(*pending)
-            pending = None
-            writer.sync()
-            saved.save({"pieces": np.int32(number + 1)}, number + 1)
 
 
 class NoiseWriter:

@@ -7,7 +7,6 @@ from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 from rich.console import Console
 
@@ -20,14 +19,6 @@ from icrl4aht_generation.collection.ray_executor import run_on_ray
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
-
-
-class Executor(Protocol):
-    """Runs tasks in any order; closing the generator cancels those that are not done."""
-
-    def __call__(
-        self, job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
-    ) -> Generator[TaskOutcome]: ...
 
 
 def run_in_process(
@@ -118,7 +109,7 @@ def _run_all(
     job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
     """Runs every task, then again, waiting, those that another collector worked on."""
-    execute = _executor(options)
+    execute = run_in_process if options.executor == "local" else run_on_ray
     for wait in (False, True):
         busy: list[Work] = []
         with closing(execute(replace(job, wait=wait), tasks, board, options)) as outcomes:
@@ -127,12 +118,6 @@ def _run_all(
                     busy.append(outcome.work)
                 yield outcome
         tasks = busy
-
-
-def _executor(options: CollectOptions) -> Executor:
-    if options.executor == "local":
-        return run_in_process
-    return run_on_ray
 
 
 def _label(work: Work, tasks: Sequence[Work]) -> str:

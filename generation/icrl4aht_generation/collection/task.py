@@ -121,49 +121,68 @@ def _learn(
 ) -> None:
     task, saved = work.task, StateFile(partial / LEARNER, resumable_settings(work, profile))
     learner = make_learner(task, profile, suite)
-    state, first = _resume(learner, work, saved)
-    needed = needed_bytes(task, learner.config, state)
+    first, init, key = saved_progress(saved), jax.jit(learner.init), learner_key(work)
+    state = saved.load(jax.eval_shape(init, key)) if first else init(key)
+    needed, update = needed_bytes(task, learner.config, state), compiled_update(learner)
+
+    def play(number: int) -> Any:
+        nonlocal state
+        state, rollout, metrics = update(state)
+        writer.write_checkpoint(number + 1, learner.network, state.params)
+        return rollout, metrics
+
+    def save(updates: int) -> None:
+        writer.sync()
+        began = time.perf_counter()
+        saved.save(state, updates)
+        writer.add_recording_time(time.perf_counter() - began)
+
     with readable_disk_errors(partial, needed):
         if not first:
             check_room(partial, needed)
         writer = ArtefactWriter(partial, task, learner.config, first)
         try:
-            _update(learner, state, first, writer, saved, on_update, save_seconds)
+            interval = SaveInterval(learner.config.updates, seconds=save_seconds)
+            for number, played in pipelined(range(first, learner.config.updates), play, interval, save):
+                on_update(number, writer.write(number, *played))
         finally:
             writer.close()
         finish_artefact(partial, work, profile)
 
 
-def _update(
-    learner: Learner,
-    state: Any,
-    first: int,
-    writer: ArtefactWriter,
-    saved: StateFile,
-    on_update: UpdateCallback,
-    save_seconds: float,
-) -> None:
-    """Apply the updates from number `first`, write what they give, and save the state at intervals."""
-    update, updates = compiled_update(learner), learner.config.updates
-    interval = SaveInterval(updates, seconds=save_seconds)
-    pending: Any = None  # the last roll-out: it is written while the device computes the next one
+def pipelined(
+    numbers: range, play: Callable[[int], Any], interval: SaveInterval, save: Callable[[int], None]
+) -> Iterator[tuple[int, Any]]:
+    """Yield each number and what was played, to be written while the device plays the next one.
 
-    def write(number: int, rollout: Any, metrics: Any) -> None:
-        on_update(number, writer.write(number, rollout, metrics))
-
-    for number in range(first, updates):
-        state, rollout, metrics = update(state)
+    Args:
+        numbers: numbers of the pieces.
+        play: starts a piece on the device.
+        interval: when to save.
+        save: called with the number of the pieces so far, when all of them were written.
+    """
+    pending: Any = None
+    for number in numbers:
+        played = play(number)
         if pending is not None:
-            write(*pending)
-        pending = number, rollout, metrics
-        writer.write_checkpoint(number + 1, learner.network, state.params)
+            yield pending
+        pending = number, played
         if interval.due(number + 1):
-            write(*pending)
+            yield pending
             pending = None
-            writer.sync()
-            began = time.perf_counter()
-            saved.save(state, number + 1)
-            writer.add_recording_time(time.perf_counter() - began)
+            save(number + 1)
+
+
+def saved_progress(saved: StateFile) -> int:
+    """Return the number of pieces that were saved under the same settings; 0 in a folder that is then empty."""
+    try:
+        done = saved.progress
+    except OtherSettingsError:  # a changed profile or version: an unfinished artefact is no loss
+        done = None
+    if done is None:
+        shutil.rmtree(saved.path.parent, ignore_errors=True)
+        saved.path.parent.mkdir(parents=True)
+    return done or 0
 
 
 @contextmanager
@@ -190,17 +209,3 @@ def learner_key(work: Work) -> Any:
     """The typed key of a learner: the task's seed decides the first one's, the others' are independent of it."""
     key = jax.random.key(work.task.seed)
     return jax.random.fold_in(key, work.learner) if work.learner else key
-
-
-def _resume(learner: Learner, work: Work, saved: StateFile) -> tuple[Any, int]:
-    """The learner's state and the number of updates it has had: as saved under the same settings, or new."""
-    init, key = jax.jit(learner.init), learner_key(work)
-    try:
-        updates = saved.progress
-    except OtherSettingsError:  # a changed profile or version: an unfinished artefact is no loss
-        updates = None
-    if updates is not None:
-        return saved.load(jax.eval_shape(init, key)), updates
-    shutil.rmtree(saved.path.parent, ignore_errors=True)
-    saved.path.parent.mkdir(parents=True)
-    return init(key), 0

@@ -14,18 +14,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
+from icrl4aht_data.utils.files import read_text
 from icrl4aht_generation.collection.task import TEAMMATE_NOISE
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA, checkpoint_path
 from icrl4aht_generation.env import Environment
@@ -35,6 +35,7 @@ from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.learners.rollout import init_rollout, network_player, policy_player, roll_out
 from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.releases.remembered import measured_once
 from icrl4aht_generation.teammates.registry import build_teammate
 
 _LEAST_GAIN = 2.0  # what an earlier checkpoint must earn more: a tenth of a delivery per episode
@@ -60,6 +61,21 @@ class Labeller:
     return_greedy: float
     return_sampled: float
     last_return_greedy: float
+
+
+_Returns = Annotated[list[float], msgspec.Meta(min_length=LABEL_EPISODES, max_length=LABEL_EPISODES)]
+
+
+class CheckpointReturns(msgspec.Struct):
+    """Returns of an ego's checkpoints with the task's teammate, one row for each.
+
+    Attributes:
+        greedy: with most probable actions.
+        sampled: with drawn actions, in the same episodes.
+    """
+
+    greedy: list[_Returns]
+    sampled: list[_Returns]
 
 
 def choose_labeller(folders: Sequence[Path], task: Task, suite: Path) -> Labeller:
@@ -92,14 +108,10 @@ def learner_labeller(folder: Path, task: Task, suite: Path) -> Labeller:
         "steps": KEPT_STEPS,
         "noise": TEAMMATE_NOISE,
     }
-    measured = _read(folder / LABELLER_RETURNS, settings)
-    if measured is None:
-        measured = _measure(checkpoints, task, suite)
-        with atomic_write(folder / LABELLER_RETURNS) as partial:
-            content = {way: returns.tolist() for way, returns in measured.items()}
-            partial.write_text(json.dumps({"settings": settings} | content) + "\n", encoding="utf-8")
-    greedy, sampled = (measured[way].mean(axis=1) for way in ("greedy", "sampled"))
-    chosen = choose_checkpoint(measured["greedy"])
+    path = folder / LABELLER_RETURNS
+    measured = measured_once(path, settings, CheckpointReturns, lambda: _measure(checkpoints, task, suite))
+    greedy, sampled = (np.mean(returns, axis=1) for returns in (measured.greedy, measured.sampled))
+    chosen = choose_checkpoint(np.array(measured.greedy))
     step = metadata["checkpoint_updates"][chosen] * metadata["ego"]["environments"] * metadata["ego"]["rollout"]
     return Labeller(
         folder=checkpoints[chosen],
@@ -130,31 +142,16 @@ def choose_checkpoint(returns: np.ndarray) -> int:
     return len(best) - 1 - int(np.argmax(best[::-1]))  # of equal ones the latest
 
 
-def _read(path: Path, settings: dict[str, Any]) -> dict[str, np.ndarray] | None:
-    """The measurements in a file, as `_measure` returns them; None if there are none, or others than these."""
-    try:
-        content = parse_json(read_text(path))
-        if content.pop("settings") != settings:
-            return None
-        measured = {way: np.array(content[way], np.float64) for way in ("greedy", "sampled")}
-    except (IndexFormatError, KeyError, TypeError, ValueError, AttributeError):
-        return None
-    shape = len(settings["checkpoints"]), LABEL_EPISODES
-    usable = all(returns.shape == shape and np.isfinite(returns).all() for returns in measured.values())
-    return measured if usable else None
-
-
-def _measure(checkpoints: list[Path], task: Task, suite: Path) -> dict[str, np.ndarray]:
-    """Way of acting -> float64 (C, LABEL_EPISODES), the returns of C checkpoints."""
+def _measure(checkpoints: list[Path], task: Task, suite: Path) -> CheckpointReturns:
     teammate = build_teammate(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
     key = jax.random.key(int(hashlib.sha256(task.task_id.encode()).hexdigest()[:8], 16))
-    measured: dict[str, list[np.ndarray]] = {"greedy": [], "sampled": []}
+    measured = CheckpointReturns([], [])
     for path in checkpoints:
         network, params, _ = load_policy(path)
         play = _compiled(task.layout, network.widths, teammate._replace(params=()))
-        for way, returns in measured.items():
-            returns.append(np.asarray(play(params, way == "greedy", teammate.params, key), np.float64))
-    return {way: np.stack(returns) for way, returns in measured.items()}
+        for greedy, returns in ((True, measured.greedy), (False, measured.sampled)):
+            returns.append(np.asarray(play(params, greedy, teammate.params, key), np.float64).tolist())
+    return measured
 
 
 @lru_cache(maxsize=8)

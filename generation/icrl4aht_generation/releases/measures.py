@@ -6,25 +6,22 @@ Others are measured once; the measurements are kept next to the artefacts, in hi
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
-
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.populations.headroom import learned_headroom
+from icrl4aht_generation.releases.remembered import measured_once
 from icrl4aht_generation.teammates.distances import nearest_test
 from icrl4aht_generation.teammates.draws import Draw, find_draw, hosted_families, read_draws
 from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_returns
@@ -81,12 +78,8 @@ def teammate_facts(
         keys = [key for key in unknown if key[0] == layout]
         chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
         kept, settings = artefacts / f".{layout}.teammates.json", _settings(layout, chosen)
-        measured = _read(kept, settings)
-        if measured is None:
-            by_task = _measure(get_layout(layout), chosen, suite, headroom)
-            measured = [by_task[task.task_id] for task in chosen]
-            with atomic_write(kept) as partial:
-                partial.write_bytes(msgspec.json.encode({"settings": settings, "facts": measured}))
+        measure = partial(_measure, get_layout(layout), chosen, suite, headroom)
+        measured = measured_once(kept, settings, list[TeammateFacts], measure)
         found |= dict(zip(keys, measured, strict=True))
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
 
@@ -103,17 +96,6 @@ def _settings(layout: str, tasks: Sequence[Task]) -> dict[str, Any]:
     return software_versions() | {"version": version("icrl4aht-data")} | known
 
 
-def _read(path: Path, settings: dict[str, Any]) -> list[TeammateFacts] | None:
-    """The measurements in a file; None if there are none, or others than these."""
-    try:
-        content = parse_json(read_text(path))
-        if content["settings"] != json.loads(json.dumps(settings)):
-            return None
-        return msgspec.convert(content["facts"], list[TeammateFacts])
-    except (IndexFormatError, KeyError, TypeError, msgspec.ValidationError):
-        return None
-
-
 def _facts_of_draw(draw: Draw) -> TeammateFacts:
     near = NearestTest(draw.nearest, draw.distance, draw.behaviour)
     if draw.other_distance < draw.distance:
@@ -123,7 +105,7 @@ def _facts_of_draw(draw: Draw) -> TeammateFacts:
 
 def _measure(
     layout: Layout, tasks: Sequence[Task], suite: Path, headroom: Mapping[str, ReferenceEgos]
-) -> dict[str, TeammateFacts]:
+) -> list[TeammateFacts]:
     """Measure teammates of one layout; how unlike the test they act, only of learned ones.
 
     For heuristics outside the table, such as presets, the card says that the test has their family. Measuring their
@@ -140,7 +122,7 @@ def _measure(
             stay, random, oracle = (float(egos[ego][k]) for ego in ("stay", "random", "oracle"))
             returns[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES)
     nearest = _nearest(layout, learned, suite)
-    return {task_id: TeammateFacts(earned, nearest.get(task_id)) for task_id, earned in returns.items()}
+    return [TeammateFacts(returns[task.task_id], nearest.get(task.task_id)) for task in tasks]
 
 
 def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path) -> dict[str, NearestTest]:

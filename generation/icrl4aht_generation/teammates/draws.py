@@ -88,21 +88,14 @@ class Draw(NamedTuple):
     @property
     def admissible(self) -> bool:
         """Whether it acts unlike every test instance of its family; if it is diverse, of all families, and more so."""
-        return self.counted_distance >= _least_distance(self.base_seed)
+        return self.nearest_counted[0] >= _least_distance(self.base_seed)
 
     @property
-    def counted_distance(self) -> float:
-        """Distance to the test instances that decides whether it is admissible."""
-        return self.other_distance if self._other_counts else self.distance
-
-    @property
-    def nearest_counted(self) -> str:
-        """Test instance at that distance."""
-        return self.other if self._other_counts else self.nearest
-
-    @property
-    def _other_counts(self) -> bool:
-        return self.base_seed in _DIVERSE_SEEDS.values() and self.other_distance < self.distance
+    def nearest_counted(self) -> tuple[float, str]:
+        """Distance to the test instance that decides whether it is admissible, and that instance."""
+        own, other = (self.distance, self.nearest), (self.other_distance, self.other)
+        diverse = self.base_seed in _DIVERSE_SEEDS.values()
+        return other if diverse and other[0] < own[0] else own
 
     @property
     def like_another_family(self) -> bool:
@@ -271,11 +264,10 @@ def _reason(layout: str, family: str, base_seed: int) -> str:
     if not draws:
         return "it has no draws there; `icrl4aht-data research draws` measures them"
     if not any(draw.admissible for draw in draws):
-        farthest = max(draws, key=lambda draw: draw.counted_distance)
+        distance, instance = max((draw.nearest_counted for draw in draws), key=lambda found: found[0])
         return (
-            f"all {len(draws)} draws act like a test instance (Hamming distance at most "
-            f"{farthest.counted_distance:.3f}, to {farthest.nearest_counted}; expected at least "
-            f"{_least_distance(base_seed)})"
+            f"all {len(draws)} draws act like a test instance (Hamming distance at most {distance:.3f}, to {instance}; "
+            f"expected at least {_least_distance(base_seed)})"
         )
     return f"the ego matters with none of its admissible draws (returns differ by less than {LEAST_HEADROOM:g})"
 

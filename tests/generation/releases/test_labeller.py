@@ -20,7 +20,7 @@ from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS,
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.releases import labeller
-from icrl4aht_generation.releases.labeller import choose_checkpoint, choose_labeller
+from icrl4aht_generation.releases.labeller import CheckpointReturns, choose_checkpoint, choose_labeller
 from icrl4aht_generation.releases.package import package_release
 from icrl4aht_generation.teammates.registry import build_teammate
 
@@ -77,12 +77,12 @@ def task(built, tmp_path):
 def with_returns(folder: Path, greedy: list[float]) -> None:
     """Replace the measurements in an artefact: every episode of a checkpoint has the same return."""
     content = json.loads((folder / LABELLER_RETURNS).read_text())
-    content["greedy"] = [[value] * LABEL_EPISODES for value in greedy]
+    content["measured"]["greedy"] = [[value] * LABEL_EPISODES for value in greedy]
     (folder / LABELLER_RETURNS).write_text(json.dumps(content))
 
 
 def measured(folder: Path) -> dict:
-    return json.loads((folder / LABELLER_RETURNS).read_text())
+    return json.loads((folder / LABELLER_RETURNS).read_text())["measured"]
 
 
 def never(*arguments):
@@ -106,10 +106,10 @@ def test_packing_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
     [
         lambda content: "",
         lambda content: content[:-9],
-        lambda content: content.replace('"checkpoints": ["', '"checkpoints": ["0'),
+        lambda content: content.replace('"checkpoints":["', '"checkpoints":["0'),
         lambda content: content.replace('"greedy"', '"gredy"'),
         lambda content: content.replace("0.0,", "NaN,", 1),
-        lambda content: content.replace("0.0, ", "", 1),
+        lambda content: content.replace("0.0,", "", 1),
         lambda content: "[]",
     ],
 )
@@ -118,7 +118,7 @@ def test_measurements_that_are_damaged_or_of_other_checkpoints_are_made_again(ta
     before = (folder / LABELLER_RETURNS).read_text()
     assert damage(before) != before
     (folder / LABELLER_RETURNS).write_text(damage(before))
-    again = {way: np.array(values) for way, values in json.loads(before).items() if way != "settings"}
+    again = CheckpointReturns(**json.loads(before)["measured"])
     monkeypatch.setattr(labeller, "_measure", lambda *arguments: again)
     choose_labeller([folder], chosen, tmp_path)
     assert (folder / LABELLER_RETURNS).read_text() == before

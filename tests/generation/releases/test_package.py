@@ -57,7 +57,7 @@ def make_learner(built: Path, work: Work, artefacts: Path, improvements: Sequenc
     rewards[: len(improvements), 5:, 0] = np.array(improvements)[:, None]
     np.save(folder / "rewards.npy", rewards.reshape(8, -1))
     measured = json.loads((folder / LABELLER_RETURNS).read_text())
-    measured["greedy"] = [[label] * LABEL_EPISODES] * 5
+    measured["measured"]["greedy"] = [[label] * LABEL_EPISODES] * 5
     (folder / LABELLER_RETURNS).write_text(json.dumps(measured))
 
 
@@ -225,7 +225,7 @@ def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkey
 
     def measure(layout, tasks, *arguments):
         calls.append([task.task_id for task in tasks])
-        return {task.task_id: DOES_NOT for task in tasks}
+        return [DOES_NOT for _ in tasks]
 
     monkeypatch.setattr(measures, "_measure", measure)
     for _ in range(2):  # the second time from the file

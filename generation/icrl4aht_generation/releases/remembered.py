@@ -1,0 +1,36 @@
+"""Measurements that are kept in a file with what they depend on, and are made again when that changes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
+
+T = TypeVar("T")
+
+
+def measured_once(path: Path, settings: dict[str, Any], kind: type[T], measure: Callable[[], T]) -> T:
+    """Return the measurements in a JSON file; where there are none of these settings, measure and write them.
+
+    Args:
+        path: the file.
+        settings: what the measurements depend on.
+        kind: their type, which msgspec checks.
+        measure: makes them.
+    """
+    try:
+        content = parse_json(read_text(path))
+        if content["settings"] == json.loads(json.dumps(settings)):
+            return msgspec.convert(content["measured"], kind)
+    except (IndexFormatError, KeyError, TypeError, msgspec.ValidationError):
+        pass  # damaged, or of another version
+    measured = measure()
+    with atomic_write(path) as partial:
+        partial.write_bytes(msgspec.json.encode({"settings": settings, "measured": measured}))
+    return measured
