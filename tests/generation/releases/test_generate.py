@@ -237,8 +237,6 @@ def test_a_release_without_the_checkpoints_says_so(learned, tmp_path):
         recover_teammate(load_icrl4aht(root), 0)
 
 
-
-
 @pytest.mark.slow
 def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
     def never(*arguments):
