@@ -14,7 +14,7 @@ from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import INTERACT, STAY
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
-from icrl4aht_data.overcooked.observe import observe, observe_both
+from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.state import State, columns, unpack
 from tests.helpers.states import random_records, state_record
 
@@ -264,21 +264,6 @@ def test_recipes_of_ones_own_are_drawn_at_the_start_and_after_deliveries():
     assert_uniform(pairs, 16)
 
 
-# Rewards and batches
-
-
-def test_the_environments_observations_are_those_of_its_records(cramped, life):
-    state = life.steps[6].state
-    records = np.asarray(state.record)
-    env = cramped.env
-    jitted = jax.jit(lambda state: (env.observe(state), env.observe_one(state, 0), env.observe_one(state, 1)))
-    both, *each = map(np.asarray, jitted(state))
-    assert (both.shape, both.dtype) == ((N, 2, 5, 5, 35), np.uint8)
-    np.testing.assert_array_equal(both, observe_both(CRAMPED, records))
-    for agent in (0, 1):
-        np.testing.assert_array_equal(each[agent], both[:, agent])
-
-
 # The rules and observations in JAX compared with NumPy
 
 
@@ -321,25 +306,3 @@ def test_numpy_and_jax_give_equal_bytes(in_jax):
     assert_same_bytes(jitted(*deep_inputs), [array.reshape(64, 48, *array.shape[1:]) for array in ours])
     everything = 255 if layout.buttons else 255 & ~rules.PRESSED
     assert np.bitwise_or.reduce(outcome.events, axis=None) == everything  # the states cover every event
-
-
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_batch_dimensions_of_any_rank_equal_the_flat_batch(layout):
-    inputs = random_inputs(layout, 15)
-    flat = (*rules.step(layout, *inputs), observe_both(layout, inputs[0]))
-    deep_inputs = [array.reshape(3, 5, *array.shape[1:]) for array in inputs]
-    expected = [array.reshape(3, 5, *array.shape[1:]) for array in flat]
-    assert_same_bytes((*rules.step(layout, *deep_inputs), observe_both(layout, deep_inputs[0])), expected)
-    for agent in (0, 1):
-        assert_same_bytes([observe(layout, deep_inputs[0], agent)], [expected[-1][:, :, agent]])
-    for number in range(15):
-        single = [array[number] for array in inputs]
-        found = (*rules.step(layout, *single), observe_both(layout, single[0]))
-        assert_same_bytes(found, [array[number] for array in flat])
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.int64])
-def test_actions_may_have_any_integer_type(dtype):
-    records, actions, recipes = random_inputs(ASYMM, 256)
-    expected = rules.step(ASYMM, records, actions, recipes)
-    assert_same_bytes(rules.step(ASYMM, records, actions.astype(dtype), recipes), expected)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from icrl4aht_generation import commands
 from icrl4aht_generation.collection.task_folder import artefact_settings
-from icrl4aht_generation.learners.config import PPOConfig, Widths
+from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.profiles import FOLDER, Profile, load_profile, profile_names
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
@@ -73,14 +72,6 @@ def test_shipped_profiles_load(name):
         assert work.task.split == "train" or (work.task.split, work.source) == ("validation", "noise")
 
 
-def test_every_task_has_a_seed_and_an_id_of_its_own(changed):
-    tasks = [work.task for work in load_profile(changed("keep = 8", "keep = 8")).works()]
-    assert len(tasks) == 4
-    assert len({task.seed for task in tasks}) == len(tasks)
-    assert len({task.task_id for task in tasks}) == len(tasks)
-    assert len({(task.layout_name, json.dumps(task.teammate["theta"])) for task in tasks}) == len(tasks)
-
-
 def test_paper_profile_has_the_papers_numbers():
     profile = load_profile("paper")
     ego = profile.ego
@@ -100,11 +91,6 @@ def test_paper_profile_keeps_146_episodes():
     episode has its first 100, and the state after them."""
     assert load_profile("paper").ego.updates == 228
     assert load_profile("paper").ego.episodes == 146
-
-
-@pytest.mark.parametrize("name", ["mini", "cpu"])
-def test_histories_of_full_length(name):
-    assert load_profile(name).ego.episodes == 146
 
 
 def test_settings_of_an_artefact_are_the_task_the_learner_and_its_ego(changed):
@@ -134,13 +120,6 @@ def test_given_hyper_parameters_replace_the_profiles_and_enter_its_hashes(change
     ):
         with pytest.raises(OptionError, match=rf"profile mine with the given options: .*{message}"):
             profile.with_ego(given)
-
-
-@pytest.mark.parametrize("command", ["generate", "plan", "speed"])
-def test_every_hyper_parameter_of_the_ego_is_an_option(command):
-    options = {option.name for option in getattr(commands, command).params}
-    known = {field.name for kind in (PPOConfig, Widths) for field in fields(kind)} - {"widths"}
-    assert known <= options
 
 
 # Profile files.
@@ -367,14 +346,6 @@ def test_faults_of_task_files_are_named_with_the_line(tmp_path, change, message)
     path.write_text(f"{first}\n{change(first, second)}\n", encoding="utf-8")
     with pytest.raises(TaskFormatError, match=rf"^{re.escape(str(path))}, line 2: {message}"):
         read_tasks(path)
-
-
-def test_policies_of_labellers_are_a_switch_of_the_profile(changed):
-    assert not load_profile("paper").policies
-    assert load_profile("mini").policies
-    assert load_profile(changed("keep = 8", "keep = 8\npolicies = true")).policies
-    with pytest.raises(OptionError, match=r"release\.policies = 1: expected true or false"):
-        load_profile(changed("keep = 8", "keep = 8\npolicies = 1"))
 
 
 def test_threads_are_chosen_before_teammates_are_drawn(monkeypatch):

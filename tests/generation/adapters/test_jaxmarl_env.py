@@ -13,7 +13,6 @@ from icrl4aht_generation.env import Environment
 from jaxmarl.environments.multi_agent_env import MultiAgentEnv
 from jaxmarl.wrappers.baselines import LogWrapper
 
-from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe_both
@@ -71,13 +70,3 @@ def test_a_learners_loop_steps_it_as_our_environment_plays():
     np.testing.assert_array_equal(dones["__all__"], expected)
     np.testing.assert_array_equal(info["returned_episode"][..., 0], expected)
     np.testing.assert_array_equal(states.step[:, 0], np.arange(1, STEPS + 1) % LENGTH)
-
-
-def test_wrong_arguments_are_errors():
-    with pytest.raises(UnknownNameError, match="layout"):
-        JaxMARLEnv("nowhere")
-    options: dict[str, Any] = {"channels": "all"}
-    with pytest.raises(UnknownNameError, match="unknown channels 'all'"):
-        JaxMARLEnv("demo_wide", **options)
-    with pytest.raises(OptionError, match="max_steps = 0"):
-        JaxMARLEnv("demo_wide", max_steps=0)

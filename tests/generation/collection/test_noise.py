@@ -16,7 +16,7 @@ from icrl4aht_generation.collection import noise
 from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.noise import noise_bytes, run_noise
 from icrl4aht_generation.collection.noise_rollout import noise_schedules, play_noisy_episodes
-from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, METRICS, TIMING, last_timing, partial_folder
+from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, TIMING, last_timing, partial_folder
 from icrl4aht_generation.learners.resume import StateFile
 from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
@@ -118,14 +118,6 @@ def test_labels_are_those_of_an_oracle_that_watches_the_episode(arrays):
     np.testing.assert_array_equal(np.stack(found), arrays["oracle_actions"])
 
 
-def test_returns_rise(arrays, made):
-    returns = arrays["rewards"].reshape(4, 10, 100).sum(axis=-1, dtype=int)
-    assert (returns[:, 5:].mean(axis=1) > returns[:, :5].mean(axis=1) + 5).all()
-    lines = [json.loads(line) for line in (made / METRICS).read_text().splitlines()]
-    assert [line["update"] for line in lines] == [0, 1, 2, 3]
-    assert [line["return_end"] for line in lines] == pytest.approx(returns[:, 5:].mean(axis=1).tolist(), abs=1e-3)
-
-
 def test_an_episode_is_a_function_of_its_numbers(arrays):
     """One with others in the batch is the one among those of its task."""
     mate = build_teammate(LAYOUT, MATE)
@@ -190,20 +182,6 @@ def test_what_came_after_the_last_save_is_made_again(made, profile, tmp_path):
     rewards.flush()
     run_noise(WORK, profile, folder)
     assert not compare_rebuilds(folder, made).differences
-
-
-def test_other_settings_start_again(made, profile, tmp_path):
-    folder = tmp_path / WORK.name
-    shutil.copytree(made, folder)
-    assert not run_noise(WORK, profile, folder, stop_after(0)), "a finished artefact is left alone"
-    (tmp_path / "other.toml").write_text(NOISE.replace("end = [0.0, 0.1]", "end = [0.0, 0.0]"))
-    other = load_profile(str(tmp_path / "other.toml"))
-    with pytest.raises(KeyboardInterrupt):
-        run_noise(WORK, profile, tmp_path / "half", stop_after(2), save_seconds=0)
-    for name in (folder, tmp_path / "half"):
-        assert run_noise(WORK, other, name)
-        assert np.load(name / "noise.npy")[:, -1].tolist() == [0] * 4
-    assert not compare_rebuilds(folder, tmp_path / "half").differences
 
 
 def test_wall_clock_figures_are_apart_from_what_is_hashed(made):

@@ -148,14 +148,6 @@ def test_equal_streams_come_in_the_order_of_their_numbers():
     assert best([low] * 100 + [high] * 100, 200) == [*range(100, 200), *range(100)]
 
 
-def test_streams_that_do_not_improve_are_left_out():
-    flat, fallen = [60] * 10, [60] * 5 + [40] * 5
-    five, four = [0] * 5 + [0, 0, 0, 0, 25], [0] * 5 + [0, 0, 0, 0, 20]  # 5 and 4 more at the end
-    assert best([flat, five, four, fallen], 4, 5.0) == [1]
-    assert best([flat, five, four, fallen], 4) == [0, 3, 1, 2]
-    assert best([flat, fallen], 4, 5.0) == []
-
-
 def learner(*improvements: int) -> np.ndarray:
     """Returns (N, 10) of streams that start at 0 and improve by this."""
     return np.array([[0.0] * 5 + [float(improvement)] * 5 for improvement in improvements])

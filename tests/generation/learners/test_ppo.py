@@ -269,30 +269,7 @@ def test_update_is_a_pure_function(update, played):
     assert not same_bytes(other_state.carry.memories[EGO], once[0].carry.memories[EGO])
 
 
-def test_learning_is_a_pure_function_too(update, learning, trained):
-    once = update(learning)[0]
-    assert same_bytes(once, update(learning)[0])
-    assert not same_bytes(once.params, learning.params)
-    assert not same_bytes(once.params, update(learning._replace(key=jax.random.key(5)))[0].params)
-    assert same_bytes(update(trained.before[60])[0], trained.before[61])
-
-
 # Episodes.
-
-
-def test_metrics_hold_the_sum_of_rewards_of_ended_episodes(played):
-    joint = joined(played.rollouts)
-    episodes = len(joint.reward) // EPISODE
-    sums = joint.reward[: episodes * EPISODE].reshape(episodes, EPISODE, -1).sum(axis=1)
-    assert len(np.unique(sums)) > 2
-    np.testing.assert_array_equal(joint.returns[EPISODE - 1 :: EPISODE], sums)
-    for number, metrics in enumerate(played.metrics):
-        ended = [e for e in range(episodes) if number * 8 <= (e + 1) * EPISODE - 1 < number * 8 + 8]
-        assert metrics["episodes"] == 4 * len(ended)
-        assert metrics["return"] == (sums[ended].mean() if ended else 0)
-        np.testing.assert_allclose(metrics["reward_per_step"], played.rollouts[number].reward.mean(), rtol=1e-6)
-        shaped = played.rollouts[number].shaped[..., EGO].mean()
-        np.testing.assert_allclose(metrics["shaped_per_step"], shaped, rtol=1e-6)
 
 
 def test_the_ego_is_scored_by_its_own_shaped_rewards(played):

@@ -261,23 +261,6 @@ def test_a_network_player_does_what_its_network_says(params, apply, greedy):
     np.testing.assert_allclose(after, expected, rtol=0, atol=1e-5)
 
 
-def test_sampled_actions_follow_the_networks_distribution(params):
-    """4,000 envs in one state: shares within five standard deviations."""
-    envs, own = 4000, one(params, 0)
-    record = random_records(LAYOUT, 1, np.random.default_rng(3))
-    state = in_state(np.repeat(record, envs, axis=0))
-    player = network_player(ENV, NETWORK, own, np.arange(envs), jnp.zeros(envs, int))
-    choice, _ = jax.jit(player.act)(player.init(state), state, jax.random.key(3))
-    action, log_prob = np.asarray(choice.action), np.asarray(choice.log_prob)
-    shares = np.bincount(action, minlength=6) / envs
-    seen = shares > 0
-    assert seen.sum() > 1
-    for number in seen.nonzero()[0]:
-        probability = np.exp(log_prob[action == number][0])
-        assert abs(shares[number] - probability) < 5 * (probability * (1 - probability) / envs) ** 0.5 + 1e-6
-    np.testing.assert_array_less(shares[~seen], 0.01)
-
-
 def test_several_policies_in_one_player_act_as_each_alone(params):
     slots = np.array([[6, 1], [3, 4], [0, 7]])
     partner = jnp.array([[2, 0], [1, 1], [0, 2]])

@@ -42,7 +42,7 @@ from icrl4aht_generation.releases.check import compare_rebuilds
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, layout_number
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.paths import ROOT
@@ -231,23 +231,6 @@ def test_a_changed_byte_or_a_missing_file_makes_a_population_unfinished(trained,
     assert not is_population_finished(folder, run)
 
 
-def test_a_population_of_other_settings_is_not_finished(trained):
-    folder, run = population(trained("lbrdiv"), "lbrdiv"), run_of("lbrdiv")
-    others = [
-        replace(run, seed=1),
-        replace(run, members=3),
-        replace(run, layout=get_layout("cramped_down")),
-        replace(run, config=replace(CONFIG, entropy=0.02)),
-        run_of("brdiv"),
-    ]
-    assert [is_population_finished(folder, other) for other in (run, *others)] == [True] + [False] * len(others)
-
-
-def test_an_unknown_algorithm_is_refused():
-    with pytest.raises(UnknownNameError, match=r"unknown algorithm 'fpc'.*Did you mean 'fcp'"):
-        PopulationRun(LAYOUT, "fpc", 2, CONFIG, 0)
-
-
 def test_checkpoints_of_an_unfinished_population_are_refused(tmp_path):
     with pytest.raises(OptionError, match=r"fcp: no finished population; run .*--layout cramped_up"):
         list(suite_checkpoints(tmp_path, "cramped_up", "fcp"))
@@ -295,12 +278,6 @@ def candidates(tmp_path_factory) -> Path:
 
 def paths(points: list[SuiteCheckpoint]) -> list[str]:
     return [point.path for point in points]
-
-
-def test_candidates_are_sorted_by_number(candidates):
-    """Not by name, where m10 comes before m2."""
-    found = paths(list(suite_checkpoints(candidates, LAYOUT.name, "fcp")))
-    assert found == [f"{LAYOUT.name}/fcp/m{m}/c{c}" for m in range(10) for c in range(5)]
 
 
 def test_comedis_first_policy_is_no_candidate(candidates):

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
 from icrl4aht_generation.collection import job
 from icrl4aht_generation.collection import task_folder as artefacts
 from icrl4aht_generation.collection.job import CollectionError
@@ -19,14 +19,13 @@ from icrl4aht_generation.collection.task_folder import METADATA
 from icrl4aht_generation.learners.checkpoint import load_policy
 from icrl4aht_generation.populations import select
 from icrl4aht_generation.populations import train as suite
-from icrl4aht_generation.profiles import FOLDER, load_profile
+from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases import build, measures, package
 from icrl4aht_generation.releases.check import compare_rebuilds
 from icrl4aht_generation.teammates.registry import recover_teammate
 from rich.console import Console
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.manifest import write_manifest
@@ -258,31 +257,3 @@ def test_teammates_that_are_all_too_bad(learned, tmp_path):
     ):
         build.build_releases(load_profile(str(learned / "learned.toml")), tmp_path, ["lite"], Console(file=StringIO()))
     assert not (tmp_path / "lite").exists()
-
-
-def test_teammates_are_those_of_the_profile_or_of_the_layouts_named(tmp_path, monkeypatch):
-    requests = []
-    monkeypatch.setattr(
-        "icrl4aht_generation.populations.build.build_suite", lambda *arguments: requests.append(dict(arguments[2]))
-    )
-    path = FOLDER / "mini.toml"  # has no task with CoMeDi
-
-    def teammates(*options: str) -> Result:
-        return CliRunner().invoke(cli, ["teammates", "--suite", str(tmp_path / "suite"), *options])
-
-    for options in (
-        ("--profile", str(path)),
-        ("--profile", str(path), "--algorithm", "fcp"),
-        ("--profile", "smoke"),
-        ("--layout", "cramped_room_up", "--layout", "cramped_up", "--algorithm", "comedi"),
-    ):
-        assert teammates(*options).exit_code == 0, options
-    everywhere = load_profile(str(path)).algorithms
-    assert requests == [
-        {layout: list(names) for layout, names in everywhere.items()},
-        {layout: ["fcp"] if "fcp" in names else [] for layout, names in everywhere.items()},
-        {layout: list(ALGORITHMS) for layout in load_profile("smoke").layouts},
-        {"cramped_up": ("comedi",)},
-    ]
-    assert isinstance(teammates("--profile", str(path), "--algorithm", "comedi").exception, OptionError)
-    assert len(requests) == 4

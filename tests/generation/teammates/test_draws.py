@@ -6,8 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
-from icrl4aht_generation.teammates import draws, measuring
+from icrl4aht_generation.teammates import draws
 from icrl4aht_generation.teammates.draws import (
     DRAWS_PER_SEED,
     DRAWS_TABLE,
@@ -23,7 +22,6 @@ from icrl4aht_generation.teammates.draws import (
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
 
 from icrl4aht_data.benchmark.facts import TESTED_ON, TRACKS
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 
 H1, H2, H3, H4 = HEURISTIC_FAMILIES
@@ -171,14 +169,6 @@ def test_draws_without_headroom_are_left_out_if_others_have_it(monkeypatch, tmp_
     assert chosen([H1, H3], 2) == [(H1, 0), (H3, 0)]
 
 
-def test_seeds_are_apart(monkeypatch, tmp_path):
-    with_table(monkeypatch, tmp_path, draw(H1, 0, oracle=2.0), draw(H3, 4, base_seed=1))
-    assert chosen([H1], 1) == [(H1, 0)]
-    assert chosen([H3], 1, base_seed=1) == [(H3, 4)]
-    with pytest.raises(OptionError, match="has no draws there"):
-        drawn_teammates("demo_wide", [H1], 1, base_seed=1)
-
-
 # Bad input.
 
 
@@ -203,28 +193,3 @@ def test_a_damaged_table_is_named_with_its_line(tmp_path):
 
 
 # The command.
-
-
-def test_a_stopped_measurement_resumes(monkeypatch, tmp_path):
-    measured: list[str] = []
-
-    def measure(layout):
-        if len(measured) == 1 and layout.name == "cramped_up":
-            measured.append("stopped")
-            raise KeyboardInterrupt
-        measured.append(layout.name)
-        return [found for found in reversed(read_draws_table(DRAWS_TABLE)) if found.layout == layout.name]
-
-    monkeypatch.setattr(measuring, "measure_draws", measure)
-    path = tmp_path / "draws.jsonl"
-    arguments = ["research", "draws", "--out", str(path), "--layout", "demo_wide", "--layout", "cramped_up"]
-    assert CliRunner().invoke(cli, arguments).exit_code != 0
-    assert {found.layout for found in read_draws_table(path)} == {"demo_wide"}
-    for _ in range(2):
-        result = CliRunner().invoke(cli, arguments)
-        assert result.exit_code == 0, result.output
-    assert measured == ["demo_wide", "stopped", "cramped_up"]
-    bundled = [line for line in DRAWS_TABLE.read_text().splitlines() if '"demo_wide"' in line or '"cramped_up"' in line]
-    assert path.read_text().splitlines() == bundled
-    assert CliRunner().invoke(cli, [*arguments, "--overwrite"]).exit_code == 0
-    assert measured[3:] == ["demo_wide", "cramped_up"]

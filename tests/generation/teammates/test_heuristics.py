@@ -13,10 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from icrl4aht_generation.env import Environment
-from icrl4aht_generation.paths import Paths, Scene
 from icrl4aht_generation.policy import Noise
 from icrl4aht_generation.teammates.heuristics import territory
-from icrl4aht_generation.teammates.heuristics.assembly_line import ASSEMBLY_LINE
 from icrl4aht_generation.teammates.heuristics.heuristic import draw
 from icrl4aht_generation.teammates.instances import published_thetas
 from icrl4aht_generation.teammates.registry import (
@@ -341,78 +339,6 @@ def test_h2_wanders_after_four_steps_at_one_cell(cell, stuck, expected, stuck_af
     mine, partner = (2, 1, "up", 0), (3, 2, "up", 0)
     action, after = one_step(LAYOUTS["cramped_down"], H2, 1, {}, mine, partner, memory, counters=counters)
     assert (action, int(after.cell), int(after.stuck)) == (expected, 7, stuck_after)
-
-
-@pytest.mark.parametrize("name", ["coord_simple", "demo_wide", "asymm_both"])
-def test_h2_territories_are_the_written_ones(name):
-    layout = LAYOUTS[name]
-    y, x = np.divmod(np.arange(layout.cells), layout.width)
-    letters = np.array(list("".join(layout.rows)))
-
-    def to_centroid(kinds: str) -> np.ndarray:
-        of = np.isin(letters, list(kinds))
-        return np.abs(x - x[of].mean()) + np.abs(y - y[of].mean())
-
-    to_prep, to_service = to_centroid("P0123"), to_centroid("XB")
-    floor = layout.walkable
-    stations = bool(np.any(to_prep[floor] < to_service[floor]) and np.any(to_service[floor] <= to_prep[floor]))
-    record = random_records(layout, 1, np.random.default_rng(0))[0]
-    for slot, split, m, mode in [(s, k, m, b) for s in (0, 1) for k in (0, 1, 2) for m in (0, 2) for b in (0, 5)]:
-        params = {"split_mode": jnp.int32(split), "shared_margin": jnp.int32(m), "behavior_mode": jnp.int32(mode)}
-        areas = territory.areas(Scene(Paths(layout), jnp.asarray(record), slot), params)
-        side = 1 - slot if mode == territory.INVADER else slot
-        if split == territory.STATIONS and stations:
-            strict = (to_prep < to_service, to_service <= to_prep)[side]
-            relaxed = (to_prep < to_service + 1.5 * m, to_service < to_prep + 1.5 * m)[side]
-        else:
-            along, middle = (y, layout.height // 2) if split == territory.HORIZONTAL else (x, layout.width // 2)
-            strict = (along < middle, along >= middle)[side]
-            relaxed = (along < middle + m, along >= middle - m)[side]
-        np.testing.assert_array_equal(areas.strict, strict)
-        np.testing.assert_array_equal(areas.relaxed, relaxed)
-
-
-def links(key: jax.Array, n: int) -> list[int]:
-    for _ in range(n):
-        key = jax.random.split(key)[0]
-    return jax.random.key_data(key).tolist()
-
-
-@pytest.mark.parametrize(
-    ("family", "theta", "hand", "expected"),
-    [
-        (H1, {}, 0, 1),
-        (H1, {"wrong_ingredient_prob": 1.0}, 0, 2),
-        (H1, {"wrong_ingredient_prob": 1.0}, ZERO, 1),
-        (H1, {"wrong_ingredient_prob": 1.0, "idle_prob": 1.0}, 0, 1),
-        (H1, {"wrong_ingredient_prob": 1.0, "path_blocking": 1.0}, 0, 1),
-        (H3, {"stubbornness": 0.1}, 0, 2),
-        (H3, {"stubbornness": 0.1}, ZERO, 1),
-        (H3, {"stubbornness": 0.1, "hesitation_prob": 1.0}, 0, 1),
-    ],
-)
-def test_links_of_the_key_chain(family, theta, hand, expected):
-    layout = LAYOUTS["demo_wide"]
-    _, after = one_step(layout, family, 1, theta, (4, 3, "up", hand), (5, 1, "up", 0))
-    assert jax.random.key_data(after.key).tolist() == links(first_memories(layout)[family, 1].key[0], expected)
-
-
-@pytest.mark.parametrize("stubbornness", [0.0, 0.1])
-def test_h3_wrong_moves_are_the_keys_own(stubbornness):
-    """The chain's next key is split once more, and the second half draws one of right, down, left, up."""
-    layout, slot = LAYOUTS["demo_wide"], (H3, 1)
-    records = np.repeat(state_record(layout, (5, 1, "up"), (4, 3, "up")), ROWS, axis=0)
-    memories = first_memories(layout)
-    params = many_params("demo_wide") | {
-        slot: stacked(H3, [ASSEMBLY_LINE.defaults | {"wrong_action_prob": 1.0, "stubbornness": stubbornness}] * ROWS)
-    }
-    actions, after = act_all(layout, ALL_SLOTS, params, memories, records)[slot]
-    for action, key, start in zip(actions, after.key, memories[slot].key, strict=True):
-        own = jax.random.split(jax.random.split(start)[0])[1]
-        drawn = PUBLISHED_ACTIONS[int(jax.random.randint(own, (), 0, 4))]
-        assert stubbornness or ACTIONS[action] == drawn
-        assert jax.random.key_data(key).tolist() == links(start, 3 if stubbornness else 2)
-    assert len(set(actions.tolist())) == 4
 
 
 UNSIGNED = Layout("unsigned", "test_unsigned", ("WWLWPWW", "0A   AX", "1     B", "WWWWWWW"))

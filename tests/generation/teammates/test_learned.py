@@ -14,7 +14,7 @@ from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS,
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.rollout import policy_player
-from icrl4aht_generation.teammates import learned, registry
+from icrl4aht_generation.teammates import learned
 
 from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
@@ -159,9 +159,3 @@ def test_other_weights_than_the_task_names_are_refused(suite):
     with pytest.raises(TaskFormatError, match=f"sha256 {file_hash(suite / 'b' / POLICY_WEIGHTS)}, expected") as error:
         learned.build_learned_entry(LAYOUT, other, suite)
     assert other["theta"]["sha256"] in str(error.value)
-
-
-@pytest.mark.parametrize("slot", [EGO, TEAMMATE])
-def test_the_registry_builds_checkpoints_for_both_slots(suite, slot):
-    policy = registry.build_teammate(LAYOUT, entry(suite, "b"), slot, suite=suite)
-    assert policy.act is learned.build_learned(LAYOUT, suite / "b").act

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from icrl4aht_generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY
 from icrl4aht_generation.teammates.registry import (
     HEURISTIC_FAMILIES,
     build_teammate,
@@ -13,7 +12,6 @@ from icrl4aht_generation.teammates.registry import (
 
 from icrl4aht_data.errors import TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
-from tests.generation.teammates.test_utility_greedy import NAMES
 
 H1, H2, H3, H4 = "recipe_aware_button", "territory", "assembly_line", "utility_greedy"
 
@@ -95,20 +93,3 @@ def in_range(value: float, text: str, bases: list[float]) -> bool:
         low, high = map(float, text.split("-"))
         return low - 1e-6 <= value <= high + 1e-6
     return str(value) in text.split(",")
-
-
-def test_presets_of_h4_are_the_published_ones():
-    published = {
-        "default": (10, 8, 5, 6, 4, 2, 7, 3, 0.5, 0.3, 0.5),
-        "delivery_focused": (15, 12, 8, 3, 2, 1, 4, 2, 0.3, 0.4, 0.3),
-        "prep_focused": (8, 5, 3, 10, 8, 4, 12, 5, 0.4, 0.5, 0.7),
-        "high_inertia": (10, 8, 5, 6, 4, 2, 7, 3, 0.5, 0.7, 0.5),
-        "distance_sensitive": (10, 8, 5, 6, 4, 2, 7, 3, 1.0, 0.3, 0.5),
-    }
-    assert tuple(UTILITY_GREEDY.defaults) == NAMES
-    assert set(UTILITY_GREEDY.presets) == set(published)
-    for name, values in published.items():
-        entry = heuristic_teammate("utility_greedy", name, 3)
-        theta = dict(zip(NAMES, values, strict=True))
-        rest = {"kind": "heuristic", "family": "utility_greedy", "theta_id": 3, "base_seed": 0}
-        assert list(entry.items()) == [*rest.items(), ("theta", theta)], name

@@ -19,12 +19,6 @@ from icrl4aht_data.overcooked.actions import STAY, TEAMMATE, UP
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from tests.helpers.states import state_record
 
-NAMES = (
-    *("w_deliver", "w_pickup_cooked", "w_get_plate", "w_add_ingredient", "w_fetch_ingredient", "w_stage_on_counter"),
-    *("w_start_cooking", "w_press_L", "dist_weight", "inertia", "counter_preference"),
-)
-
-
 ROLLS = [0, 1, 19, 20, 39, 40, 41, 99]
 
 
