@@ -11,13 +11,14 @@ from rich.console import Console
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask, read_info
 from icrl4aht_data.format.provenance import ReferenceEgos
-from icrl4aht_data.format.schema import Kind
+from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.plotting import check_can_draw
-from icrl4aht_data.utils.files import process_lock
+from icrl4aht_data.utils.files import check_own_folder, process_lock
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.writing.card import facts as release_facts
 from icrl4aht_data.writing.card import teammate_name
 from icrl4aht_data.writing.statistics import print_learning, print_statistics
+from icrl4aht_generation.collection.failures import FAILED
 from icrl4aht_generation.collection.job import CollectionError
 from icrl4aht_generation.collection.options import CollectOptions
 from icrl4aht_generation.collection.run import collect_tasks
@@ -31,6 +32,8 @@ from icrl4aht_generation.releases.package import check_release_folder, package_r
 
 SUITE = "suite"
 """Name of the suite's folder in a rebuild."""
+
+_PACKING_LOCK = ".packing.lock"
 
 
 def build_releases(
@@ -63,12 +66,15 @@ def build_releases(
 
     Raises:
         CollectionError: if a task could not be collected; nothing is packed then.
-        OptionError: if something but a release of this profile is at out/<kind>, or if matplotlib is not installed.
+        OptionError: if `out` has files that no rebuild makes, if something but a release of this profile is at
+            out/<kind>, or if matplotlib is not installed.
     """
     check_can_draw()  # before the long work, not after it
     for kind in kinds:
         check_release_folder(out / kind, profile)
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
+    names = {"artefacts", SUITE, FAILED, f".{FAILED}.lock", _PACKING_LOCK, *KINDS, *(f".{kind}.old" for kind in KINDS)}
+    check_own_folder(out, names | ({suite.name} if suite.parent == out else set()), "a rebuild")
     if tasks is None:
         works, headroom, left_out = train_teammates(profile, suite, seed, console)
     else:
@@ -76,7 +82,7 @@ def build_releases(
     collect_tasks(works, profile, out, console, options or CollectOptions(), suite)
     tasks = list({work.task.task_id: work.task for work in works}.values())
     artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
-    with process_lock(out / ".packing.lock"):  # another collector on this folder packs the same releases
+    with process_lock(out / _PACKING_LOCK):  # another collector on this folder packs the same releases
         facts = teammate_facts(tasks, artefacts, suite, headroom)
         for kind, release in zip(kinds, releases, strict=True):
             with progress_bars(unit="tasks") as show:

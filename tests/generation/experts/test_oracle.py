@@ -108,5 +108,3 @@ def test_it_is_deterministic():
     record = jnp.asarray(episodes("oracle", "asymm_right")[0][0, 0])
     act = jax.jit(lambda key: policy.act(policy.params, policy.init(policy.params, key), record, key)[0])
     assert act(jax.random.key(1)) == act(jax.random.key(3))
-
-

@@ -130,6 +130,13 @@ def test_a_folder_in_the_way_is_not_lost(built, tmp_path):
     assert (tmp_path / "lite" / "notes.txt").read_text() == "mine"
 
 
+def test_a_folder_with_other_files_is_refused(built, tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(OptionError, match=r"has other files \(thesis.txt\), expected a rebuild"):
+        build.build_releases(load_profile(str(built / "tiny.toml")), tmp_path, ["lite"], Console(file=StringIO()))
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
 def test_a_release_of_another_profile_is_not_replaced(built, tmp_path, monkeypatch):
     def never(*arguments):
         raise AssertionError("tasks were collected")
@@ -164,11 +171,12 @@ def no_distances():
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory) -> Path:
     """A rebuild with learned teammates, all of which pass the selection. Read only."""
-    out = tmp_path_factory.mktemp("learned")
-    (out / "learned.toml").write_text(LEARNED)
+    profile = tmp_path_factory.mktemp("learned") / "learned.toml"
+    out = profile.parent / "out"
+    profile.write_text(LEARNED)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(select, "THRESHOLD", -np.inf)
-        build.build_releases(load_profile(str(out / "learned.toml")), out, ["lite", "full"], Console(file=StringIO()))
+        build.build_releases(load_profile(str(profile)), out, ["lite", "full"], Console(file=StringIO()))
     return out
 
 
@@ -245,7 +253,7 @@ def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
     monkeypatch.setattr(suite._PopulationTraining, "train", never)
     monkeypatch.setattr(job, "run_task", never)
     output = StringIO()
-    build.build_releases(load_profile(str(learned / "learned.toml")), learned, ["lite"], Console(file=output))
+    build.build_releases(load_profile(str(learned.parent / "learned.toml")), learned, ["lite"], Console(file=output))
     assert output.getvalue().count("finished before") == 4
 
 
@@ -255,5 +263,7 @@ def test_teammates_that_are_all_too_bad(learned, tmp_path):
     with pytest.raises(
         CollectionError, match=r"no checkpoint of fcp, brdiv exceeds the return of 20 .*raise teammates"
     ):
-        build.build_releases(load_profile(str(learned / "learned.toml")), tmp_path, ["lite"], Console(file=StringIO()))
+        build.build_releases(
+            load_profile(str(learned.parent / "learned.toml")), tmp_path, ["lite"], Console(file=StringIO())
+        )
     assert not (tmp_path / "lite").exists()
