@@ -80,7 +80,7 @@ class Environment:
         return self.layout.recipe_items if self.recipes is None else self.recipes
 
     def init(self, keys: Key[Array, " N"]) -> EnvState:
-        """Returns the start of the first episode of each environment.
+        """Return the start of the first episode of each environment.
 
         Args:
             keys: typed JAX keys (N,), or raw ones, uint32 (N, 2).
@@ -91,12 +91,12 @@ class Environment:
         return EnvState(keys, zero, zero, self.first_record(keys, zero))
 
     def step(self, state: EnvState, actions: Int[Array, "N 2"]) -> EnvStep:
-        """Returns the result of one step of every environment; finished ones start their next episode."""
+        """Return the result of one step of every environment; finished ones start their next episode."""
         clock = state.clock + 1
         outcome = rules.step(self.layout, state.record, actions, self.next_recipe(state))
         done = clock >= self.max_steps
         episode = state.episode + done
-        # Environments that were initialised together finish together, so one condition for the batch avoids the cost of
+        # Environments that were initialized together finish together, so one condition for the batch avoids the cost of
         # the reset in all other steps.
         record = jax.lax.cond(
             jnp.any(done),
@@ -107,19 +107,19 @@ class Environment:
         return EnvStep(after, outcome.reward, outcome.shaped, done, outcome.state)
 
     def observe(self, state: EnvState) -> UInt8[Array, "N 2 5 5 C"]:
-        """Returns the observations of both agents, ego first."""
+        """Return the observations of both agents, ego first."""
         return observe_both(self.layout, state.record)
 
     def observe_one(self, state: EnvState, agent: int) -> UInt8[Array, "N 5 5 C"]:
-        """Returns the observations of one agent: 0 for the ego, 1 for the teammate."""
+        """Return the observations of one agent: 0 for the ego, 1 for the teammate."""
         return observe(self.layout, state.record, agent)
 
     def next_recipe(self, state: EnvState) -> UInt8[Array, " N"]:
-        """Returns the item of the recipe that becomes current if this step makes a correct delivery."""
+        """Return the item of the recipe that becomes current if this step makes a correct delivery."""
         return self._recipe(_fold(self.episode_key(state), state.clock + 1))
 
     def episode_key(self, state: EnvState) -> Key[Array, " N"]:
-        """Returns the key of each running episode: a function of the environment's key and the episode's number.
+        """Return the key of each running episode: a function of the environment's key and the episode's number.
 
         Policies may fold in 1..20. Those are the recipe draws of an episode's first steps, which are never used, since
         no soup is done before step 20.
@@ -127,7 +127,7 @@ class Environment:
         return _fold(state.key, state.episode)
 
     def first_record(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> UInt8[Array, "N S"]:
-        """Returns state records at the start of episodes.
+        """Return state records at the start of episodes.
 
         Recipe and facings are uniform; first the ego, then the teammate is put on a uniformly drawn free cell of its
         own room.
@@ -154,7 +154,7 @@ def _fold(keys: Key[Array, " N"], data: Int[Array, " N"]) -> Key[Array, " N"]:
 
 
 def _below(keys: Key[Array, " N"], n: int) -> Int[Array, " N"]:
-    """Returns an integer in 0..n-1 per key: the high half of 32 random bits times n (bias below n / 2**32)."""
+    """Return an integer in 0..n-1 per key: the high half of 32 random bits times n (bias below n / 2**32)."""
     bits = jax.vmap(lambda key: jax.random.bits(key, (), jnp.uint32))(keys)
     high = (bits >> 16) * n + ((bits & 0xFFFF) * n >> 16)
     return (high >> 16).astype(jnp.int32)

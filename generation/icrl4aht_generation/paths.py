@@ -132,12 +132,12 @@ class Paths:
 
 
 def is_dish(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
-    """Returns whether an item is a plate with a cooked soup."""
+    """Return whether an item is a plate with a cooked soup."""
     return (item & (PLATE | COOKED)) == (PLATE | COOKED)
 
 
 def is_ingredient(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
-    """Returns whether an item has ingredients and no plate."""
+    """Return whether an item has ingredients and no plate."""
     return (item >> 2 > 0) & ((item & PLATE) == 0)
 
 
@@ -350,7 +350,7 @@ class Scene:
         return jnp.argmin(jnp.where(mask, self._target_distance, UNREACHABLE))
 
     def _turn_or(self, target: Int[Array, ""], when_facing: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-        """Returns whether the target is adjacent, and the action in that case: turn to it, or `when_facing`."""
+        """Return whether the target is adjacent, and the action in that case: turn to it, or `when_facing`."""
         # A move into a wall only turns the agent, which is how it comes to face an adjacent target.
         adjacent = jnp.asarray(self.paths.manhattan)[self.me, target] == 1
         direction = jnp.argmax(jnp.asarray(self.paths.neighbours)[self.me] == target)  # up, down, left, right

@@ -36,12 +36,12 @@ class Policy(NamedTuple):
 
 
 def sometimes_random(key: Key[Array, ""], chance: Any, action: Int[Array, ""]) -> Int[Array, ""]:
-    """Returns an action, or with a chance one that is drawn uniformly from the six actions."""
+    """Return an action, or with a chance one that is drawn uniformly from the six actions."""
     whether, which = jax.random.split(key)
     drawn = jax.random.randint(which, (), 0, len(ACTIONS))
     return jnp.where(jax.random.uniform(whether) < chance, drawn, action)
 
 
 def stacked(trees: Iterable[Any]) -> Any:
-    """Returns one pytree whose leaves are those of all trees, stacked on a new first axis."""
+    """Return one pytree whose leaves are those of all trees, stacked on a new first axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

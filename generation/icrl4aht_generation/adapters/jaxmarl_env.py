@@ -95,7 +95,7 @@ class JaxMARLEnv(MultiAgentEnv):
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: Key[Array, ""] | UInt32[Array, " 2"]) -> tuple[dict[str, UInt8[Array, "5 5 C"]], JaxMARLState]:
-        """Returns the first observations and the state of an episode, a function of the key."""
+        """Return the first observations and the state of an episode, a function of the key."""
         data = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
         record = self._environment.init(data[None]).record[0]
         state = JaxMARLState(data, jnp.int32(0), jnp.bool_(False), record, self._recipe_code(record))
@@ -110,7 +110,7 @@ class JaxMARLEnv(MultiAgentEnv):
         dict[str, Bool[Array, ""]],
         dict[str, Any],
     ]:
-        """Returns observations, state, rewards, dones and infos after a step, without a reset.
+        """Return observations, state, rewards, dones and infos after a step, without a reset.
 
         Args:
             key: not used: the key of the episode decides everything random.
@@ -132,27 +132,27 @@ class JaxMARLEnv(MultiAgentEnv):
         return self.get_obs(after), after, rewards, dones, {"shaped_reward": shaped}
 
     def _recipe_code(self, record: UInt8[Array, " S"]) -> Int[Array, ""]:
-        """Returns JaxMARL's encoding of a record's recipe."""
+        """Return JaxMARL's encoding of a record's recipe."""
         return self._recipe_codes[jnp.argmax(self._recipe_items == unpack(self.layout, record).recipe)]
 
     def get_obs(  # type: ignore[override]
         self, state: JaxMARLState
     ) -> dict[str, UInt8[Array, "5 5 C"]]:
-        """Returns the observation of each agent."""
+        """Return the observation of each agent."""
         return dict(zip(self.agents, observe_both(self.layout, state.record, self._canonical), strict=True))
 
     def get_avail_actions(  # type: ignore[override]
         self, state: JaxMARLState
     ) -> dict[str, Bool[Array, " 6"]]:
-        """Returns for each agent that every action is available."""
+        """Return for each agent that every action is available."""
         return dict.fromkeys(self.agents, jnp.ones(len(ACTIONS), bool))
 
     def observation_space(self, agent: str = "") -> spaces.Box:
-        """Returns the space of observations, the same for both agents; JaxMARL's learners ask without an agent."""
+        """Return the space of observations, the same for both agents; JaxMARL's learners ask without an agent."""
         return self._observed
 
     def action_space(self, agent: str = "") -> spaces.Discrete:
-        """Returns the space of actions, the same for both agents."""
+        """Return the space of actions, the same for both agents."""
         return self._played
 
     @property

@@ -95,7 +95,7 @@ def plot_filter(path: Path, title: str, before: np.ndarray, after: np.ndarray) -
 
 
 def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yields a policy's most probable action at every step of each stream.
+    """Yield a policy's most probable action at every step of each stream.
 
     The recurrent state is zero at the start of each episode, as in training.
 
@@ -114,7 +114,7 @@ def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[
 
 
 def oracle_labels(layout: Layout, states: Iterable[np.ndarray], actions: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yields the scripted oracle's action at every step of each stream.
+    """Yield the scripted oracle's action at every step of each stream.
 
     The oracle follows every episode from its first step: it remembers the recorded states and the actions that the ego
     took, and says at each state what it would do now.
@@ -164,7 +164,7 @@ def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Arr
 
 
 def follow_oracle(layout: Layout, records: jax.Array, taken: jax.Array) -> jax.Array:
-    """Returns what the scripted oracle would do in each state of episodes in which another ego acted.
+    """Return what the scripted oracle would do in each state of episodes in which another ego acted.
 
     Args:
         layout: the layout.

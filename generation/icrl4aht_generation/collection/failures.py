@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from icrl4aht_data.utils.files import NO_ROOM, atomic_write, process_lock, read_text
 from icrl4aht_generation.collection.job import TaskOutcome
@@ -20,7 +21,7 @@ class FailureLog:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._waiting: list[Callable[[list[dict]], list[dict]]] = []
+        self._waiting: dict[str, dict[str, Any] | None] = {}  # name -> its new line, or None to remove it
 
     @property
     def is_written(self) -> bool:
@@ -29,21 +30,15 @@ class FailureLog:
 
     def add(self, outcome: TaskOutcome) -> None:
         """Add a task's line, or replace the one of an earlier attempt."""
-        line = {
-            "task_id": outcome.work.name,
-            "attempts": outcome.attempts,
-            "error": outcome.error,
-            "traceback": outcome.trace,
-        }
-        self._change(lambda lines: [*(old for old in lines if old["task_id"] != line["task_id"]), line])
+        name, details = outcome.work.name, {"attempts": outcome.attempts, "error": outcome.error}
+        self._change({name: {"task_id": name, **details, "traceback": outcome.trace}})
 
     def forget(self, names: Iterable[str]) -> None:
         """Remove the lines of tasks that are finished."""
-        finished = set(names)
-        self._change(lambda lines: [line for line in lines if line["task_id"] not in finished])
+        self._change(dict.fromkeys(names))
 
-    def _change(self, change: Callable[[list[dict]], list[dict]]) -> None:
-        self._waiting.append(change)
+    def _change(self, changes: dict[str, dict[str, Any] | None]) -> None:
+        self._waiting |= changes
         try:
             self._write()
         except OSError as error:
@@ -52,13 +47,12 @@ class FailureLog:
 
     def _write(self) -> None:
         with process_lock(self.path.with_name(f".{self.path.name}.lock")):
-            before = [json.loads(x) for x in read_text(self.path).splitlines()] if self.path.exists() else []
-            after = before
-            for change in self._waiting:
-                after = change(after)
+            found = [json.loads(x) for x in read_text(self.path).splitlines()] if self.path.exists() else []
+            before = {line["task_id"]: line for line in found}
+            after = {name: line for name, line in (before | self._waiting).items() if line}
             if not after:
                 self.path.unlink(missing_ok=True)
             elif after != before:
                 with atomic_write(self.path) as partial:
-                    partial.write_text("".join(json.dumps(line) + "\n" for line in after), encoding="utf-8")
+                    partial.write_text("".join(json.dumps(line) + "\n" for line in after.values()), encoding="utf-8")
         self._waiting.clear()

@@ -83,12 +83,12 @@ def noise_bytes(layout: Layout, config: NoiseConfig) -> int:
 
 
 def noise_settings(work: Work, profile: Profile) -> dict[str, Any]:
-    """Returns the settings that an artefact depends on; if any of them changes, it is made again."""
+    """Return the settings that an artefact depends on; if any of them changes, it is made again."""
     return common_settings(work) | {"noise": json.loads(json.dumps(asdict(profile.noise)))}
 
 
 def is_noise_finished(folder: Path, work: Work, profile: Profile) -> bool:
-    """Returns whether a folder has this task's artefact under these settings, with all its files unchanged."""
+    """Return whether a folder has this task's artefact under these settings, with all its files unchanged."""
     return is_artefact_finished(folder, noise_settings(work, profile), _hashed_files(work, profile))
 
 
@@ -234,7 +234,7 @@ class NoiseWriter:
         return timing
 
     def _metrics(self, history: int) -> dict[str, float]:
-        """Returns the log line of a complete history: its mean returns at the start and at the end."""
+        """Return the log line of a complete history: its mean returns at the start and at the end."""
         returns = self._arrays["rewards"][history].reshape(1, -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
         start, end = (round(float(values.mean()), 3) for values in curve_ends(returns))
         return {"update": history, "return_start": start, "return_end": end}

@@ -36,7 +36,7 @@ _NOISE = 2
 
 
 def noise_schedules(config: NoiseConfig, seed: int) -> np.ndarray:
-    """Returns the chance of a random action in every episode, float32 (N, E); see `NoiseConfig`.
+    """Return the chance of a random action in every episode, float32 (N, E); see `NoiseConfig`.
 
     Args:
         config: ranges that each history's schedule is drawn from.
@@ -88,7 +88,7 @@ class NoisyChoice(NamedTuple):
 def play_noisy_episodes(
     layout: Layout, teammate: Policy, seed: int, history: np.ndarray, episode: np.ndarray, chance: np.ndarray
 ) -> NoisyEpisodes:
-    """Plays some episodes of a task; compiled once for all teammates of one family on one layout.
+    """Play some episodes of a task; compiled once for all teammates of one family on one layout.
 
     Args:
         layout: the layout.
@@ -103,7 +103,7 @@ def play_noisy_episodes(
 
 
 def noisy_episode_keys(seed: int, history: np.ndarray, episode: np.ndarray) -> Key[Array, " M"]:
-    """Returns the keys of the environments in which some episodes of a task are played, each its first episode.
+    """Return the keys of the environments in which some episodes of a task are played, each its first episode.
 
     Args:
         seed: the task's seed.

@@ -30,7 +30,7 @@ _OBJECT_STORE_BYTES = 100 * 2**20  # tasks go to the workers, artefacts to the d
 def run_on_ray(
     job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
-    """Runs tasks as workers are free. The artefacts' folder must be shared by all machines.
+    """Run tasks as workers are free. The artefacts' folder must be shared by all machines.
 
     Raises:
         OptionError: if Ray is not installed, or cannot be reached.

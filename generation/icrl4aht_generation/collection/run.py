@@ -24,7 +24,7 @@ from icrl4aht_generation.profiles.work import Work
 def run_in_process(
     job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
-    """Runs one task after the other."""
+    """Run one task after the other."""
     for work in tasks:
         yield _attempt(job, work, board, options.retries + 1)
 
@@ -108,7 +108,7 @@ def collect_tasks(
 def _run_all(
     job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
-    """Runs every task, then again, waiting, those that another collector worked on."""
+    """Run every task, then again, waiting, those that another collector worked on."""
     execute = run_in_process if options.executor == "local" else run_on_ray
     for wait in (False, True):
         busy: list[Work] = []

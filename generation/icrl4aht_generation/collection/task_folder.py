@@ -63,7 +63,7 @@ def _hashed_files(config: PPOConfig) -> list[str]:
 
 
 def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
-    """Returns the settings that an artefact depends on; if any of them changes, it is made again."""
+    """Return the settings that an artefact depends on; if any of them changes, it is made again."""
     ego = profile.ego_on(work.task.layout.name)
     return common_settings(work) | {
         "ego_hash": json_hash(asdict(ego)),
@@ -72,7 +72,7 @@ def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
 
 
 def common_settings(work: Work) -> dict[str, Any]:
-    """Returns the settings that artefacts of every source depend on."""
+    """Return the settings that artefacts of every source depend on."""
     return {
         "task": asdict(work.task),
         "source": work.source,
@@ -82,19 +82,19 @@ def common_settings(work: Work) -> dict[str, Any]:
 
 
 def resumable_settings(work: Work, profile: Profile) -> dict[str, Any]:
-    """Returns the settings that must not change for a resumed task to give the bits of an uninterrupted one."""
+    """Return the settings that must not change for a resumed task to give the bits of an uninterrupted one."""
     return artefact_settings(work, profile) | software_versions()
 
 
 def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
-    """Returns whether a folder has this learner's artefact under these settings, with all its files unchanged."""
+    """Return whether a folder has this learner's artefact under these settings, with all its files unchanged."""
     return is_artefact_finished(
         folder, artefact_settings(work, profile), _hashed_files(profile.ego_on(work.task.layout.name))
     )
 
 
 def is_artefact_finished(folder: Path, settings: dict[str, Any], files: list[str]) -> bool:
-    """Returns whether a folder has an artefact of these settings and files, all of them unchanged.
+    """Return whether a folder has an artefact of these settings and files, all of them unchanged.
 
     Args:
         folder: the folder.
@@ -136,7 +136,7 @@ def check_room(partial: Path, needed: int) -> None:
 
 
 def disk_full(partial: Path, needed: int) -> DiskFullError:
-    """Returns the error for an unfinished artefact whose disk has not the space it needs."""
+    """Return the error for an unfinished artefact whose disk has not the space it needs."""
     free = shutil.disk_usage(partial if partial.exists() else partial.parent).free
     folder = partial.with_name(partial.name.removesuffix(".partial"))
     return DiskFullError(

@@ -100,7 +100,7 @@ def _study_layout(layout: Layout) -> LayoutFacts:
 
 
 def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns `LayoutFacts.time` and `LayoutFacts.action`, by relaxing all ways until none becomes shorter."""
+    """Return `LayoutFacts.time` and `LayoutFacts.action`, by relaxing all ways until none becomes shorter."""
     count, cells, room = len(obstacles), layout.cells, layout.rooms[EGO]
     time = np.full((count, cells, 4, cells), FAR, np.int32)
     for facing in range(4):  # ways end where a cell is faced, so turning counts as a step, like walking
@@ -116,7 +116,7 @@ def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _hindrance(paths: Paths) -> np.ndarray:
-    """Returns how much the ego would hinder the teammate by waiting on a cell, int32 (3, teammate's cell, ego's cell).
+    """Return how much the ego would hinder the teammate by waiting on a cell, int32 (3, teammate's cell, ego's cell).
 
     The first axis is what the teammate carries: a dish, a plate or an ingredient, or nothing. The next cell of each way
     that the teammate may be taking counts 16, cells next to that one 8, and cells from which something other than a
@@ -160,7 +160,7 @@ class OracleMemory(NamedTuple):
 
 
 def oracle(layout: Layout) -> Policy:
-    """Returns the scripted ego for a layout, a policy without parameters that sees the state record, uint8 (S,)."""
+    """Return the scripted ego for a layout, a policy without parameters that sees the state record, uint8 (S,)."""
     facts = _study_layout(layout)
     matters = facts.serves or bool(np.isin(layout.kinds[facts.shared], [POT, WALL]).any())
 
@@ -180,7 +180,7 @@ def oracle(layout: Layout) -> Policy:
 
 
 def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
-    """Returns the memory with what this state shows; its `action` is still the last one."""
+    """Return the memory with what this state shows; its `action` is still the last one."""
     layout, new = scene.paths.layout, scene.state
     old = unpack(layout, last.record)
     same = jnp.all(new.pot_items == old.pot_items) & (new.recipe == old.recipe)
@@ -250,11 +250,11 @@ class OracleView(NamedTuple):
         return self.recipes[0] | _DISH
 
     def cost(self, mask: Bool[Array, " cells"] | np.ndarray, then: Array | int = 0) -> Int[Array, " cells"]:
-        """Returns the time to the cells of a mask plus the time that follows; NEVER for other cells."""
+        """Return the time to the cells of a mask plus the time that follows; NEVER for other cells."""
         return jnp.where(mask & self.facts.mine, self.time + then, NEVER)
 
     def at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
-        """Returns the time to some of the pots plus the time that follows; NEVER for other cells."""
+        """Return the time to some of the pots plus the time that follows; NEVER for other cells."""
         cells = self.facts.pot_cells
         there = jnp.where(which, self.time[cells] + then, NEVER)
         return jnp.full(self.time.shape, NEVER).at[cells].set(there)
@@ -485,7 +485,7 @@ def _with_nothing(view: OracleView) -> list[Subgoal]:
 
 
 def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Array, ""], action: Int[Array, ""]):
-    """Returns the action in a room that both agents share: wait out of the teammate's way, without blocking forever."""
+    """Return the action in a room that both agents share: wait out of the teammate's way, without blocking forever."""
     scene, facts, still = view.scene, view.facts, view.memory.still
     layout, origin = scene.paths.layout, view.origin[1:]
     ahead = jnp.asarray(layout.ahead)[scene.partner, scene.state.facings[TEAMMATE].astype(jnp.int32)]

@@ -63,7 +63,7 @@ def write_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str
 
 
 def load_card(folder: Path) -> dict[str, Any]:
-    """Returns a policy's card.
+    """Return a policy's card.
 
     Raises:
         OptionError: if it is missing or not a JSON object.
@@ -78,7 +78,7 @@ def load_card(folder: Path) -> dict[str, Any]:
 
 
 def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
-    """Returns a policy's network, its parameters, and its card.
+    """Return a policy's network, its parameters, and its card.
 
     Raises:
         OptionError: if the files are missing or unreadable, or the weights' shapes are not those of the card.

@@ -36,7 +36,7 @@ class LearnerState(NamedTuple):
 
     Attributes:
         params: the ego's parameters, a pytree of float32.
-        optimizer: state of the optimiser.
+        optimizer: state of the optimizer.
         carry: environments and memories before the next roll-out.
         teammate: the teammate's parameters. In the state, not in the compiled update, so that all teammates of one
             family share one compilation.
@@ -87,7 +87,7 @@ class Learner:
         return PPO(self.network, self.config)
 
     def init(self, key: Key[Array, ""]) -> LearnerState:
-        """Returns the state of an untrained ego before the first step."""
+        """Return the state of an untrained ego before the first step."""
         params_key, _, running_key = jax.random.split(key, 3)
         params = self.network.untrained(params_key, self.env.layout.channels)
         env_keys = stream_keys(key, self.config.environments)
@@ -96,7 +96,7 @@ class Learner:
         return LearnerState(params, optimizer, carry, self.teammate.params, running_key, jnp.int32(0))
 
     def update(self, state: LearnerState) -> tuple[LearnerState, Rollout, dict[str, Array]]:
-        """Plays one roll-out and learns from it; a pure function of the state.
+        """Play one roll-out and learn from it; a pure function of the state.
 
         Returns:
             The next state, the roll-out, and scalar metrics.
@@ -119,19 +119,19 @@ class Learner:
         )
 
     def players(self, params: Any, teammate_params: Any) -> tuple[Player, Player]:
-        """Returns the ego and the teammate as players of all environments."""
+        """Return the ego and the teammate as players of all environments."""
         n = self.config.environments
         ego = network_player(self.env, self.network, params, np.arange(n), jnp.zeros(n, jnp.int32))
         return ego, policy_player(self.env, self.teammate, teammate_params, TEAMMATE, n)
 
 
 def stream_keys(key: Key[Array, ""], environments: int) -> Key[Array, " N"]:
-    """Returns the keys of a learner's N environments, given the key of its `Learner.init`."""
+    """Return the keys of a learner's N environments, given the key of its `Learner.init`."""
     return jax.random.split(jax.random.split(key, 3)[1], environments)
 
 
 def compiled_update(learner: Learner) -> Callable[[LearnerState], tuple[LearnerState, Rollout, dict[str, Array]]]:
-    """Returns the learner's compiled update, which reuses the memory of its argument.
+    """Return the learner's compiled update, which reuses the memory of its argument.
 
     It is compiled once for all teammates of one family on one layout.
     """

@@ -106,7 +106,7 @@ class CompactView:
         return self.words.entries(self.agents)
 
     def __call__(self, record: UInt8[Array, "*B S"], layout_number: Array | None = None) -> Seen:
-        """Returns the encoder's input; `layout_number` is needed for several layouts, see `CellWords.ids`."""
+        """Return the encoder's input; `layout_number` is needed for several layouts, see `CellWords.ids`."""
         batch = record.shape[:-1]
         if self.kind == "words":
             return WindowWords(self.words.ids(record, layout_number))
@@ -118,7 +118,7 @@ class CompactView:
         return obs if self.kind == "paper" else WindowEntries(obs.reshape(*batch, -1)[..., self.entries])
 
     def observations(self, seen: Seen) -> Num[Array, "*B 5 5 C"]:
-        """Returns the observations that an encoder's input was made of."""
+        """Return the observations that an encoder's input was made of."""
         if isinstance(seen, (WindowWords, GroupedWords)):
             flat = jnp.asarray(self.words.channels)[seen.ids]
         elif isinstance(seen, WindowEntries):
@@ -130,7 +130,7 @@ class CompactView:
 
 
 def group_equal(seen: Seen) -> Seen:
-    """Returns words of cells with equal observations in groups, and any other input unchanged.
+    """Return words of cells with equal observations in groups, and any other input unchanged.
 
     Observations are sorted by a hash, and then compared exactly: if two that differ have one hash, every observation
     becomes a group of its own. Sorting needs all observations on one device, so with several nothing is grouped.
@@ -151,14 +151,14 @@ def group_equal(seen: Seen) -> Seen:
 
 
 def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
-    """Returns two uint32 (N,) that equal rows have in common: sums of the words times random odd numbers."""
+    """Return two uint32 (N,) that equal rows have in common: sums of the words times random odd numbers."""
     factors = np.random.default_rng(0).integers(2**31, size=(2, VISIBLE), dtype=np.uint32) * 2 + 1
     one, two = ((ids.astype(jnp.uint32) * row).sum(axis=-1, dtype=jnp.uint32) for row in factors)
     return one, two
 
 
 def encoding_log(seen: Seen) -> dict[str, Array]:
-    """Returns what a training log says of an encoder's input: the share of observations that differ, if known."""
+    """Return what a training log says of an encoder's input: the share of observations that differ, if known."""
     return {"distinct_observations": seen.groups / seen.group.size} if isinstance(seen, GroupedWords) else {}
 
 
@@ -200,7 +200,7 @@ class WindowEncoder(nn.Module):
         return nn.LayerNorm()(nn.relu(x)) if self.normalize else x
 
     def _encode_groups(self, seen: GroupedWords) -> Float[Array, "*B F"]:
-        """Encodes one observation of each group."""
+        """Encode one observation of each group."""
         encoder, variables = self.clone(parent=None), self.variables
         size = -(-len(seen.first) // _BLOCKS)
         rows = jnp.pad(seen.first, (0, _BLOCKS * size - len(seen.first))).reshape(_BLOCKS, size)
@@ -221,7 +221,7 @@ class WindowEncoder(nn.Module):
         return features.reshape(-1, self.features)[seen.group]
 
     def _encode_cells(self, seen: Num[Array, "*B 5 5 C"] | WindowWords | WindowEntries) -> Float[Array, "*B 25 F"]:
-        """Applies the 1 x 1 convolutions. What the rules cannot produce becomes NaN: it has no word."""
+        """Apply the 1 x 1 convolutions. What the rules cannot produce becomes NaN: it has no word."""
         if isinstance(seen, WindowWords):
             x = jnp.asarray(_required(self.view).words.channels, self.dtype)
         elif isinstance(seen, WindowEntries):
@@ -293,7 +293,7 @@ def _tap_of_cells() -> np.ndarray:
 
 
 def orthogonal_dense(width: int, scale: float = 2**0.5, name: str | None = None) -> nn.Dense:
-    """Returns a dense layer with orthogonal initial weights of this scale."""
+    """Return a dense layer with orthogonal initial weights of this scale."""
     return nn.Dense(width, kernel_init=nn.initializers.orthogonal(scale), name=name)
 
 

@@ -44,7 +44,7 @@ def recurrent_states(
     recurrent: Float[Array, "H 3*H"],
     bias: Float[Array, " H"],
 ) -> Float[Array, "T N H"]:
-    """Returns the states of a GRU after every step.
+    """Return the states of a GRU after every step.
 
     Args:
         hidden: state before the first step.
@@ -128,7 +128,7 @@ class ActorCritic(nn.Module):
         reset: Bool[Array, "T N"],
         partner: Integer[Array, " N"] | None = None,
     ) -> tuple[Float[Array, "N H"], Float[Array, "T N 6"], Float[Array, "T N"]]:
-        """Applies the network to T steps of N sequences.
+        """Apply the network to T steps of N sequences.
 
         Args:
             hidden: recurrent state before the first step.
@@ -163,12 +163,12 @@ class ActorCritic(nn.Module):
         return hidden, logits, value[..., 0]
 
     def untrained(self, key: Array, channels: int) -> Any:
-        """Returns initial parameters for observations 5 x 5 x channels."""
+        """Return initial parameters for observations 5 x 5 x channels."""
         obs = jnp.zeros((1, 1, WINDOW, WINDOW, channels), jnp.uint8)
         return self.init(key, self.initial_hidden(1), obs, jnp.ones((1, 1), bool))
 
     def initial_hidden(self, batch: int) -> Float[Array, "N H"]:
-        """Returns the recurrent state at the start of an episode: zeros."""
+        """Return the recurrent state at the start of an episode: zeros."""
         return jnp.zeros((batch, self.widths.gru), jnp.float32)
 
 

@@ -25,7 +25,7 @@ from icrl4aht_generation.learners.rollout import Rollout, slot_records
 
 
 def ppo_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Returns Adam with linear warm-up, cosine decay (paper, App. C.2.3) and gradients clipped by global norm."""
+    """Return Adam with linear warm-up, cosine decay (paper, App. C.2.3) and gradients clipped by global norm."""
     steps = config.updates * config.epochs * config.minibatches
     warmup = max(1, round(config.warmup * steps))
     schedule = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, max(steps, warmup + 1))
@@ -33,7 +33,7 @@ def ppo_optimizer(config: PPOConfig) -> optax.GradientTransformation:
 
 
 def shaping_weight(config: PPOConfig, update: Int[Array, ""]) -> Float[Array, ""]:
-    """Returns the weight of shaped rewards in an update, which decreases linearly from 1 to 0 (paper, App. B.1)."""
+    """Return the weight of shaped rewards in an update, which decreases linearly from 1 to 0 (paper, App. B.1)."""
     return jnp.maximum(0.0, 1.0 - update * config.steps_per_update / config.shaping_horizon)
 
 
@@ -50,7 +50,7 @@ class Sequences(NamedTuple):
         done: bool (T, M), whether the step ended an episode.
         hidden: float32 (1, M, H), recurrent state before the first step.
         partner: int32 (1, M), number of the other agent's policy, an input of the critic.
-        weight: float32 (1, M), factor of the advantage; negative to minimise the return.
+        weight: float32 (1, M), factor of the advantage; negative to minimize the return.
         last_value: float32 (1, M), the critic's estimate for the observation after the last step.
         expert: int32 (T, M), an expert's actions in the same states, to be imitated as well; None for none.
         imitation: float32 (1, M), weight of the cross-entropy of these actions; None for none.
@@ -81,7 +81,7 @@ def sequences(
     shaping: Array,
     forgiveness: float = 0.0,
 ) -> Sequences:
-    """Returns the sequences in one player's agent slots, all with partner 0 and weight 1.
+    """Return the sequences in one player's agent slots, all with partner 0 and weight 1.
 
     Args:
         view: makes the network's input of state records.
@@ -116,7 +116,7 @@ class RecurrentNetwork(Protocol):
     """Interface of the actor-critics that PPO trains, such as `ActorCritic`."""
 
     def apply(self, variables: Any, /, *inputs: Any) -> Any:
-        """Returns the recurrent state after T steps of M sequences, logits (T, M, A), and values (T, M).
+        """Return the recurrent state after T steps of M sequences, logits (T, M, A), and values (T, M).
 
         Args:
             variables: the parameters.
@@ -127,7 +127,7 @@ class RecurrentNetwork(Protocol):
 
 @dataclass(frozen=True)
 class PPO:
-    """Proximal policy optimisation (Schulman et al. 2017) of a recurrent actor-critic.
+    """Proximal policy optimization (Schulman et al. 2017) of a recurrent actor-critic.
 
     Attributes:
         network: the actor-critic.
@@ -151,9 +151,9 @@ class PPO:
             key: shuffles the sequences.
 
         Returns:
-            New parameters and optimiser state, and loss -> mean over all minibatches, float32 ().
+            New parameters and optimizer state, and loss -> mean over all minibatches, float32 ().
         """
-        config, optimiser = self.config, ppo_optimizer(self.config)
+        config, adam = self.config, ppo_optimizer(self.config)
         count = played.done.shape[1] - played.done.shape[1] % config.minibatches
         # From the values at playing time: advantages and targets stay fixed over the epochs.
         advantage = generalised_advantage(played.reward, played.value, played.done, played.last_value[0], config)
@@ -166,7 +166,7 @@ class PPO:
                 params, optimizer = carry
                 part = jax.tree.map(lambda x: x[:, chosen], batch)
                 losses, gradient = jax.value_and_grad(self.loss, has_aux=True)(params, part)
-                change, optimizer = optimiser.update(gradient, optimizer, params)
+                change, optimizer = adam.update(gradient, optimizer, params)
                 return (optax.apply_updates(params, change), optimizer), losses[1]
 
             return jax.lax.scan(minibatch, carry, order.reshape(config.minibatches, -1))
@@ -175,7 +175,7 @@ class PPO:
         return params, optimizer, jax.tree.map(jnp.mean, losses)
 
     def loss(self, params: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
-        """Returns the loss of a minibatch, and its parts by name: clipped surrogate, clipped value error, entropy.
+        """Return the loss of a minibatch, and its parts by name: clipped surrogate, clipped value error, entropy.
 
         If an expert's actions are given, their cross-entropy is a part, too (kickstarting, Schmitt et al. 2018).
         Source: paper, App. B.1, table of PPO hyper-parameters; Schulman et al. 2017, eq. 7.
@@ -186,7 +186,7 @@ class PPO:
         log_probs = jax.nn.log_softmax(logits)
         log_prob = jnp.take_along_axis(log_probs, played.action[..., None], axis=-1)[..., 0]
         ratio = jnp.exp(log_prob - played.log_prob)
-        # Weights multiply after the normalisation, which would otherwise undo them.
+        # Weights multiply after the normalization, which would otherwise undo them.
         advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8) * played.weight
         clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
         policy = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
@@ -225,7 +225,7 @@ def generalised_advantage(
     last_value: Float[Array, " M"],
     config: PPOConfig,
 ) -> Float[Array, "T M"]:
-    """Returns generalised advantage estimates (Schulman et al. 2016, eq. 16).
+    """Return generalised advantage estimates (Schulman et al. 2016, eq. 16).
 
     The end of an episode cuts both the bootstrap and the trace.
     """
@@ -242,7 +242,7 @@ def generalised_advantage(
 
 
 def episode_metrics(rollout: Rollout) -> dict[str, Array]:
-    """Returns scalar metrics of a roll-out by name; `return` is the mean over ended episodes, 0 if there are none."""
+    """Return scalar metrics of a roll-out by name; `return` is the mean over ended episodes, 0 if there are none."""
     ended = jnp.sum(rollout.done)
     return {
         "episodes": ended,

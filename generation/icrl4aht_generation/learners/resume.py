@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from filelock import Timeout
-from jax._src.xla_bridge import backends_are_initialized  # JAX has no public way to ask without initialising
+from jax._src.xla_bridge import backends_are_initialized  # JAX has no public way to ask without initializing
 from jax.experimental import multihost_utils
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as to_bytes
@@ -126,7 +126,7 @@ class SaveInterval:
         self._saved = time.monotonic()
 
     def due(self, update: int) -> bool:
-        """Returns whether to save after this many updates; a positive answer starts the next interval."""
+        """Return whether to save after this many updates; a positive answer starts the next interval."""
         now = time.monotonic()
         due = (
             update == self._last
@@ -383,7 +383,7 @@ def _host_array(leaf: Any) -> np.ndarray:
 
 
 def _with_sharding(array: np.ndarray, like: Any) -> Any:
-    """Returns a loaded array on the devices of `like`, if `like` has a sharding."""
+    """Return a loaded array on the devices of `like`, if `like` has a sharding."""
     sharding = getattr(like, "sharding", None)
     if _is_key(like):
         wrap: Any = jax.random.wrap_key_data

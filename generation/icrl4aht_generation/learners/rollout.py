@@ -92,7 +92,7 @@ class Rollout(NamedTuple):
 
 
 def init_rollout(env: Environment, players: Sequence[Player], keys: Key[Array, " N"]) -> RolloutCarry:
-    """Returns the carry before the first step; one key per environment."""
+    """Return the carry before the first step; one key per environment."""
     state = env.init(keys)
     n = state.clock.shape[0]
     memories = tuple(player.init(state) for player in players)
@@ -107,7 +107,7 @@ def roll_out(
     key: Key[Array, ""],
     restart: Callable[[EnvState, Bool[Array, " N"]], EnvState] = lambda state, done: state,
 ) -> tuple[RolloutCarry, Rollout]:
-    """Steps every environment `steps` times.
+    """Step every environment `steps` times.
 
     Args:
         env: the environment.
@@ -245,7 +245,7 @@ def random_player(agent: int, envs: int) -> Player:
 
 
 def slot_records(record: UInt8[Array, "*B N S"], agent_slots: np.ndarray) -> UInt8[Array, "*B M S"]:
-    """Returns the state record of each slot's environment, with the slot's agent as the first agent.
+    """Return the state record of each slot's environment, with the slot's agent as the first agent.
 
     The network always observes as the first agent; the columns of the two agents are swapped for slots of agent 1.
     """

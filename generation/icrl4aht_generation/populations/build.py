@@ -110,7 +110,7 @@ def training_layouts() -> list[str]:
 
 
 def _train(run: PopulationRun, folder: Path, wait: bool, console: Console) -> bool:
-    """Returns whether the population is finished now; False if another process trains it."""
+    """Return whether the population is finished now; False if another process trains it."""
     label = f"{run.algorithm} on {run.layout.name}"
     last: dict[str, float] = {}
     with progress_bars(unit="updates") as show:

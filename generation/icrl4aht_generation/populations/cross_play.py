@@ -1,4 +1,4 @@
-"""Returns of learned policies with each other, over complete training episodes, by one compiled roll-out."""
+"""Return of learned policies with each other, over complete training episodes, by one compiled roll-out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures whether an ego matters with learned teammates: what the reference egos and the policy that a teammate was
+"""Measure whether an ego matters with learned teammates: what the reference egos and the policy that a teammate was
 trained with earn with it."""
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS
 from icrl4aht_generation.populations.train import SuiteCheckpoint, suite_checkpoints
 
 THRESHOLD = 20.0
-"""Returns of 400 steps that a teammate must exceed (paper, App. B.1)."""
+"""Return of 400 steps that a teammate must exceed (paper, App. B.1)."""
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,7 @@ class PopulationRun:
 
 
 def is_population_finished(folder: Path, run: PopulationRun) -> bool:
-    """Returns whether a folder has this population under these settings, with all its files unchanged."""
+    """Return whether a folder has this population under these settings, with all its files unchanged."""
     try:
         content = json.loads((folder / POPULATION).read_text(encoding="utf-8"))
         same = content["settings_hash"] == run.settings_hash
@@ -227,7 +227,7 @@ class _PopulationTraining:
         return done, self.saved.load(jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
 
     def _difference(self) -> str:
-        """Returns a text that names the settings in which a finished population differs from this run."""
+        """Return a text that names the settings in which a finished population differs from this run."""
         try:
             found = json.loads((self.folder / POPULATION).read_text(encoding="utf-8"))["settings"]
             other = {name: was for name, (was, _) in differing_settings(found, self.run.settings).items()}
@@ -354,7 +354,7 @@ class SuiteCheckpoint:
 
 
 def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
-    """Returns whether a suite has this population and it is finished."""
+    """Return whether a suite has this population and it is finished."""
     return (suite / layout / algorithm / POPULATION).is_file()
 
 
@@ -368,7 +368,7 @@ def population_threads(suite: Path, layout: str, algorithm: str) -> int | None:
 
 
 def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:
-    """Yields the checkpoints of a population's members, by member and checkpoint.
+    """Yield the checkpoints of a population's members, by member and checkpoint.
 
     Without those of CoMeDi's first policy, which is trained as FCP's are (see `SuiteCheckpoint.is_member`).
 

@@ -49,7 +49,7 @@ class TaskHistories(NamedTuple):
         return np.concatenate([own[streams] for own, streams in zip(self.returns, self.streams, strict=True)])
 
     def left_out(self, reason: str) -> LeftOutTask:
-        """Returns the note about the task if the release is without it."""
+        """Return the note about the task if the release is without it."""
         start, end = (round(float(ends.mean()), 3) for ends in curve_ends(self.recorded))
         learners = len(self.folders) if self.source == "ppo" else 0
         layout, name = self.task.layout.name, teammate_name(self.task)

@@ -67,7 +67,7 @@ _Returns = Annotated[list[float], msgspec.Meta(min_length=LABEL_EPISODES, max_le
 
 
 class CheckpointReturns(msgspec.Struct):
-    """Returns of an ego's checkpoints with the task's teammate, one row for each.
+    """Return of an ego's checkpoints with the task's teammate, one row for each.
 
     Attributes:
         greedy: with most probable actions.

@@ -85,7 +85,7 @@ def teammate_facts(
 
 
 def recorded_provenance(suite: Path) -> dict[str, Provenance]:
-    """Returns the provenance of the release whose teammates a suite is, by task id; empty for a profile's suite."""
+    """Return the provenance of the release whose teammates a suite is, by task id; empty for a profile's suite."""
     path = suite.parent / PROVENANCE
     return read_provenance(path) if suite.name == TEAMMATES and path.is_file() else {}
 
@@ -141,7 +141,7 @@ def _build(task: Task, suite: Path) -> Any:
 
 
 def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
-    """Returns the heuristic families of which no draw may be a training teammate, by layout, with the reasons."""
+    """Return the heuristic families of which no draw may be a training teammate, by layout, with the reasons."""
     found = []
     for layout in (layout for layout in layouts if layout in TESTED_ON):
         hosted = hosted_families(layout)

@@ -233,7 +233,7 @@ def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: P
 
 
 def _recorded_histories(found: TaskHistories) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
-    """Yields learner, stream, and recorded arrays of the kept histories, which are read when they are used."""
+    """Yield learner, stream, and recorded arrays of the kept histories, which are read when they are used."""
     for learner, (folder, streams) in enumerate(zip(found.folders, found.streams, strict=True)):
         arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HistoryArrays._fields}
         dones = episode_ends(arrays["actions"].shape[1], KEPT_STEPS)

@@ -51,13 +51,13 @@ class CommonStates(NamedTuple):
     actions: np.ndarray
 
     def family_states(self, actions: np.ndarray, instance: int) -> np.ndarray:
-        """Returns the part (..., T, episodes) of actions (..., T, N) on the states of an instance's family."""
+        """Return the part (..., T, episodes) of actions (..., T, N) on the states of an instance's family."""
         episodes, family = self.actions.shape[-1], instance // INSTANCES
         return actions[..., family * episodes : (family + 1) * episodes]
 
 
 def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest]:
-    """Returns the nearest test instance of each policy that plays the teammate on a training layout.
+    """Return the nearest test instance of each policy that plays the teammate on a training layout.
 
     Policies that share their functions share one compilation. Behaviours are numbered in the order of the policies.
 
@@ -76,7 +76,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
 
 @lru_cache(maxsize=2)
 def common_states(layout: Layout) -> CommonStates:
-    """Returns the states of a training layout on which teammates are compared.
+    """Return the states of a training layout on which teammates are compared.
 
     Raises:
         UnknownNameError: if the layout is not a training layout.
@@ -166,7 +166,7 @@ def distances_to_tests(common: CommonStates, actions: np.ndarray) -> np.ndarray:
 
 
 def group_behaviours(actions: np.ndarray) -> list[int]:
-    """Numbers the behaviours of policies, int8 (policies, ...).
+    """Number the behaviours of policies, int8 (policies, ...).
 
     A policy has the behaviour of the first one before it that opened a behaviour and acts like it, that is, whose
     distance is below `SAME_BEHAVIOUR`; else it opens the next one.

@@ -45,7 +45,7 @@ _DIVERSE_DISTANCE = 0.1  # least distance of a diverse draw to every test instan
 
 
 def ranges_of(base_seed: int) -> str:
-    """Returns which ranges the draws of a seed come from: "train" or "diverse", see `sample_teammate`."""
+    """Return which ranges the draws of a seed come from: "train" or "diverse", see `sample_teammate`."""
     return "diverse" if base_seed in _DIVERSE_SEEDS.values() else "train"
 
 
@@ -115,7 +115,7 @@ class Draw(NamedTuple):
 
 
 def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
-    """Returns the draws of a family on a training layout, by theta_id.
+    """Return the draws of a family on a training layout, by theta_id.
 
     Raises:
         UnknownNameError: for an unknown layout, family or seed, and for a layout without training tasks.
@@ -133,7 +133,7 @@ def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
 def drawn_teammates(
     layout: str, families: Sequence[str], count: int, base_seed: int = 0
 ) -> list[tuple[dict[str, Any], Draw]]:
-    """Chooses drawn teammates of a layout, without any simulation.
+    """Choose drawn teammates of a layout, without any simulation.
 
     The families take turns. Only admissible draws are chosen; those without headroom only if no admissible draw of the
     layout, of any family, has headroom. Each family first gives the draws that act unlike all test instances, of these
@@ -203,7 +203,7 @@ def diverse_tasks(track: str, split: str) -> list[Task]:
 
 
 def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
-    """Returns the draw of the table that a teammate entry is, or None."""
+    """Return the draw of the table that a teammate entry is, or None."""
     family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
     if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
         return None
@@ -223,7 +223,7 @@ def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
 
 
 def hosted_families(layout: str, base_seed: int = 0) -> list[str]:
-    """Returns the families with draws that tasks of a training layout may have, in the order of the paper."""
+    """Return the families with draws that tasks of a training layout may have, in the order of the paper."""
     return [family for family in HEURISTIC_FAMILIES if _usable(get_layout(layout).name, family, base_seed)]
 
 

@@ -50,7 +50,7 @@ def fill_draws_table(
 
 
 def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW_NUMBERS) -> list[Draw]:
-    """Measures draws on a training layout. Behaviours are numbered within these draws.
+    """Measure draws on a training layout. Behaviours are numbered within these draws.
 
     Args:
         layout: the layout.

@@ -27,7 +27,7 @@ _SEED = 11
 def reference_returns(
     layout: Layout, teammates: Sequence[Policy], episodes: int = REFERENCE_EPISODES
 ) -> dict[str, np.ndarray]:
-    """Measures the reference egos with teammates, in episodes of 100 steps.
+    """Measure the reference egos with teammates, in episodes of 100 steps.
 
     All pairs play from the same starts, and a teammate's returns do not depend on the other teammates. There is one
     compilation, in which policies with the same functions are one.
@@ -70,7 +70,7 @@ def _rows(tree: Any, rows: np.ndarray) -> Any:
 
 
 def reference_egos(layout: Layout) -> dict[str, Policy]:
-    """Returns the egos "stay", "random" (uniform over the six actions) and "oracle", whose draws are the episode's."""
+    """Return the egos "stay", "random" (uniform over the six actions) and "oracle", whose draws are the episode's."""
 
     def act_randomly(params, key, view, _):
         key, own = jax.random.split(key)
@@ -108,7 +108,7 @@ def player_in_some(
 
 
 def stacked_families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
-    """Yields policies that share their functions: their numbers, and one policy with stacked parameters."""
+    """Yield policies that share their functions: their numbers, and one policy with stacked parameters."""
     groups: dict[tuple[Callable, Callable, str], list[int]] = defaultdict(list)
     for number, policy in enumerate(policies):
         groups[policy.init, policy.act, policy.sees].append(number)

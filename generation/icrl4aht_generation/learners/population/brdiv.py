@@ -18,7 +18,7 @@ from icrl4aht_generation.learners.population.population import Assignment
 
 
 def pairs_assignment(members: int, environments: int) -> Assignment:
-    """Returns the assignment of confederates and best responses.
+    """Return the assignment of confederates and best responses.
 
     Terms: i * K + j is the return of confederate i with best response j, as the confederate's objective counts it;
     K * K more are the same returns in the best response's objective.
@@ -47,7 +47,7 @@ def pairs_assignment(members: int, environments: int) -> Assignment:
 @dataclass(frozen=True)
 class BRDiv:
     """L(pi_k) = -w_SP J(pi_k, BR_k) + w_XP sum_{j != k} J(pi_k, BR_j), with w_SP = 1 + 2 w_XP (paper, App. B.1, BRDiv
-    "Training Objective"); best responses maximise their return with their own confederate only.
+    "Training Objective"); best responses maximize their return with their own confederate only.
 
     Attributes:
         members: K.

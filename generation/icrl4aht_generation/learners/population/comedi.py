@@ -8,7 +8,7 @@ the environments each:
 * cross-play (XP): the new member with the frozen one, which is the ego in half of them;
 * mixed play (MP): the new member or the frozen one as its partner, assigned by environment rather than drawn per
   episode; nothing is learned here, it only visits states;
-* mixed play from states that the third quarter visited (SMP), which gives J_MP: the new member cannot recognise its
+* mixed play from states that the third quarter visited (SMP), which gives J_MP: the new member cannot recognize its
   partner by such states, so it cannot learn to play badly with strangers on purpose.
 """
 

@@ -81,19 +81,19 @@ class Algorithm(Protocol):
     """Interface of the population algorithms. `memory` is a pytree of the algorithm, such as multipliers."""
 
     def assignment(self, environments: int) -> Assignment:
-        """Returns the pairing of policies, with this number of environments per member."""
+        """Return the pairing of policies, with this number of environments per member."""
         ...
 
     def init(self) -> Any:
-        """Returns the memory before the first update."""
+        """Return the memory before the first update."""
         ...
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
-        """Returns the weight of each term in the objective that is maximised; negative to minimise a return."""
+        """Return the weight of each term in the objective that is maximized; negative to minimize a return."""
         ...
 
     def adapt(self, memory: Any, returns: Float[Array, "P P"], seen: Bool[Array, "P P"]) -> Any:
-        """Returns the memory after an update.
+        """Return the memory after an update.
 
         Args:
             memory: the memory before it.
@@ -122,11 +122,11 @@ class PolicyGroup(NamedTuple):
         return slice(self.first, self.first + len(self.agent_slots))
 
     def take(self, tree: Any) -> Any:
-        """Returns the group's rows of leaves (P, ...)."""
+        """Return the group's rows of leaves (P, ...)."""
         return jax.tree.map(lambda leaf: leaf[self._rows], tree)
 
     def put(self, tree: Any, rows: Any) -> Any:
-        """Returns a tree of leaves (P, ...) with the group's rows replaced."""
+        """Return a tree of leaves (P, ...) with the group's rows replaced."""
         return jax.tree.map(lambda leaf, new: leaf.at[self._rows].set(new), tree, rows)
 
 
@@ -135,7 +135,7 @@ class PopulationState(NamedTuple):
 
     Attributes:
         params: parameters of all policies, leaves (P, ...).
-        optimizer: optimiser states of the learning policies, leaves (L, ...).
+        optimizer: optimizer states of the learning policies, leaves (L, ...).
         carry: environments and memories before the next roll-out.
         memory: the algorithm's memory.
         visited: uint8 (N, S), for each environment one of the states of its last roll-out.
@@ -212,9 +212,9 @@ class Population:
         return groups
 
     def init(self, key: Key[Array, ""]) -> PopulationState:
-        """Returns the state of untrained policies, each from a seed of its own, before the first step."""
+        """Return the state of untrained policies, each from a seed of its own, before the first step."""
         params_key, env_key, running_key = jax.random.split(key, 3)
-        # By `map`, not by `vmap`, under which the orthogonal initialisers deadlock on a CPU.
+        # By `map`, not by `vmap`, under which the orthogonal initializers deadlock on a CPU.
         channels = self.env.layout.channels
         seeds = jax.random.split(params_key, self.assignment.policies)
         params = jax.lax.map(lambda seed: self.network.untrained(seed, channels), seeds)
@@ -231,7 +231,7 @@ class Population:
         )
 
     def update(self, state: PopulationState) -> tuple[PopulationState, dict[str, Array]]:
-        """Plays one roll-out, then every policy learns from its slots and the algorithm adapts its memory.
+        """Play one roll-out, then every policy learns from its slots and the algorithm adapts its memory.
 
         A pure function of the state.
 
@@ -283,7 +283,7 @@ class Population:
         return restart if (source >= 0).any() else lambda state, done: state
 
     def _learn(self, state: PopulationState, players: list[Player], carry: RolloutCarry, rollout: Rollout, key: Array):
-        """Parameters and optimiser states of all policies after learning from the roll-out, and mean losses."""
+        """Parameters and optimizer states of all policies after learning from the roll-out, and mean losses."""
         weight = self._slot_weights(state.memory)
         shaping = shaping_weight(self.config, state.update)
         params, optimizer, losses = state.params, state.optimizer, []

@@ -54,7 +54,7 @@ def _off_beat(scene: Scene) -> Array:
 
 
 def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Returns whether the action is exempt from slips, and the action; rules are in order of priority."""
+    """Return whether the action is exempt from slips, and the action; rules are in order of priority."""
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
     final = scene.holds_dish | (ingredient & soup)
@@ -122,7 +122,7 @@ def _or_else(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -> Bool[
 
 
 def _makes_room(scene: Scene) -> Bool[Array, ""]:
-    """Returns whether agent 1 is empty-handed and adjacent to a partner who carries something."""
+    """Return whether agent 1 is empty-handed and adjacent to a partner who carries something."""
     if scene.slot == 0:
         return jnp.asarray(False)
     adjacent = jnp.asarray(scene.paths.manhattan)[scene.me, scene.partner] == 1

@@ -69,7 +69,7 @@ class Heuristic:
     def build(
         self, layout: Layout, theta: Mapping[str, float], slot: int = TEAMMATE, noise: Noise = "seeded"
     ) -> Policy:
-        """Returns a teammate of this family.
+        """Return a teammate of this family.
 
         Policies of one layout, slot and noise share their functions, and so their compilations.
 
@@ -87,7 +87,7 @@ class Heuristic:
         return Policy(params, init, act, "state")
 
     def is_valid(self, name: str, value: Any) -> bool:
-        """Returns whether a parameter may have this value."""
+        """Return whether a parameter may have this value."""
         if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
             return False
         # JSON has no integers of its own: 2.0 is a valid value of an integer parameter.
@@ -124,18 +124,18 @@ def _functions(heuristic: Heuristic, layout: Layout, slot: int, noise: Noise):
 
 
 def next_key(key: Key[Array, ""]) -> Key[Array, ""]:
-    """Returns the next key of the chain."""
+    """Return the next key of the chain."""
     return jax.random.split(key)[0]
 
 
 def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
-    """Returns the next key of the chain and the step's uniform draws u1..u4, float32 in [0, 1)."""
+    """Return the next key of the chain and the step's uniform draws u1..u4, float32 in [0, 1)."""
     # The published chain: a split into five keys, of which the first continues it. Golden actions depend on it.
     keys = jax.random.split(key, 5)
     return keys[0], jax.vmap(jax.random.uniform)(keys[1:])
 
 
 def extra_split(key: Key[Array, ""], where: Bool[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""]]:
-    """Splits the chain once more where a branch draws more: the chain's key after it, and the key to draw from."""
+    """Split the chain once more where a branch draws more: the chain's key after it, and the key to draw from."""
     following, own = jax.random.split(key)
     return jnp.where(where, following, key), own

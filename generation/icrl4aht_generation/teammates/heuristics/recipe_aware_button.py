@@ -161,7 +161,7 @@ def _wants_plate(scene: Scene, params, role: Role) -> Bool[Array, ""]:
 
 
 def _decoded(scene: Scene) -> np.ndarray:
-    """bool (types,): the piled types that H1 recognises in an item; not the fourth, id 3 (published quirk)."""
+    """bool (types,): the piled types that H1 recognizes in an item; not the fourth, id 3 (published quirk)."""
     return np.array(scene.paths.layout.ingredients) < 3
 
 
@@ -201,7 +201,7 @@ def _piles(scene: Scene, ingredient: Int[Array, ""]) -> Bool[Array, " cells"]:
 
 
 def _block(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Returns whether a cell adjacent to a pot or a goal can be reached, and the step to the nearest, or stay on it."""
+    """Return whether a cell adjacent to a pot or a goal can be reached, and the step to the nearest, or stay on it."""
     critical = _access_cells(scene.paths, POT) | _access_cells(scene.paths, GOAL)
     distance = jnp.where(critical, jnp.asarray(scene.paths.distance)[scene.me], UNREACHABLE)
     nearest = jnp.argmin(distance)
@@ -217,7 +217,7 @@ def _access_cells(paths: Paths, kind: int) -> np.ndarray:
 
 
 def is_cramped(layout: Layout) -> bool:
-    """Returns whether a layout is so small that H1 teammates give way to their partner."""
+    """Return whether a layout is so small that H1 teammates give way to their partner."""
     return int(layout.walkable.sum()) <= _CRAMPED_CELLS
 
 
@@ -240,7 +240,7 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: bool) -> Int[Array, ""]
 
 
 def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Returns whether the partner has an ingredient and is about as near to the pot, and the step away from it."""
+    """Return whether the partner has an ingredient and is about as near to the pot, and the step away from it."""
     manhattan = jnp.asarray(scene.paths.manhattan)
     access = jnp.asarray(scene.paths.only_access)[pot]
     as_near = manhattan[scene.partner, access] <= manhattan[scene.me, access] + 1
@@ -249,7 +249,7 @@ def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[
 
 
 def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
-    """Returns whether to leave the plates to a partner without one: they are accessible from a single cell."""
+    """Return whether to leave the plates to a partner without one: they are accessible from a single cell."""
     piles = scene.paths.static(PLATES).nonzero()[0]
     single = bool(len(piles)) and bool(scene.paths.only_access[piles[0]] >= 0)
     carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)
