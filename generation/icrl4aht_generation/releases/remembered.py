@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from icrl4aht_data.errors import IndexFormatError
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
+from icrl4aht_data.utils.files import atomic_write, read_text
 
 T = TypeVar("T")
 
@@ -25,10 +25,10 @@ def measured_once(path: Path, settings: dict[str, Any], kind: type[T], measure: 
         measure: makes them.
     """
     try:
-        content = parse_json(read_text(path))
+        content = msgspec.json.decode(read_text(path))  # unlike `json`, it refuses NaN
         if content["settings"] == json.loads(json.dumps(settings)):
             return msgspec.convert(content["measured"], kind)
-    except (IndexFormatError, KeyError, TypeError, msgspec.ValidationError):
+    except (IndexFormatError, KeyError, TypeError, msgspec.MsgspecError):
         pass  # damaged, or of another version
     measured = measure()
     with atomic_write(path) as partial:
