@@ -111,7 +111,7 @@ def test_settings_of_an_artefact_are_the_task_the_learner_and_its_ego(changed):
 def test_given_hyper_parameters_replace_the_profiles_and_enter_its_hashes(changed):
     profile = load_profile(changed("keep = 8", "keep = 8"))
     assert profile.with_ego({}) == profile
-    other = profile.with_ego({"learning_rate": 1e-3, "gru": 4})
+    other = profile.with_ego({"learning_rate": 1e-3, "widths": {"gru": 4}})
     assert (other.ego.learning_rate, other.ego.widths.gru, other.ego.rollout) == (1e-3, 4, profile.ego.rollout)
     assert other.hash != profile.hash
     for given, message in (
