@@ -12,7 +12,6 @@ import pytest
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.encoder import CompactView, WindowEncoder, WindowEntries, WindowWords
 
-from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns
@@ -111,8 +110,3 @@ def test_widths_name_the_encoder():
     assert Widths() == Widths(encoder="paper")
     flat = replace(Widths(), encoder="mlp")
     assert (flat.pointwise, flat.spatial) == ((), ())
-    assert Widths.from_json({"encoder": "mlp", "pointwise": [], "spatial": [], "dense": 128}) == flat
-    with pytest.raises(UnknownNameError, match="words"):
-        Widths(encoder="word")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="pointwise"):
-        Widths(pointwise=(0,))
