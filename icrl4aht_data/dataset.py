@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack
 
+import msgspec
 import numpy as np
 
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, teammate_id
@@ -360,7 +361,7 @@ class Dataset(Selection):
             "environment_name": layout.alias,
             "map": list(layout.rows),
             "recipes": [list(recipe) for recipe in layout.recipes],
-            **asdict(self.info.environment),
+            **msgspec.structs.asdict(self.info.environment),
         }
 
     def recover_teammate(self, history_id: int) -> dict[str, Any]:

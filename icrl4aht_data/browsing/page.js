@@ -181,10 +181,7 @@ async function choose(change) {
   drawAll();
 }
 
-const chooseHistory = (history) => {
-  const last = index.histories[history].shown.length - 1;
-  return choose({ history, episode: last, step: 0 });
-};
+const chooseHistory = (history) => choose({ history, episode: 0, step: 0 });
 
 const chooseEpisode = (number) => choose({ episode: currentFacts().shown.indexOf(nearest(number)), step: 0, ends: false });
 
@@ -217,7 +214,7 @@ function remembered() {
   const episode = shown.indexOf(number("episode", 0) - 1);
   return {
     history,
-    episode: episode < 0 ? shown.length - 1 : episode,
+    episode: Math.max(0, episode),
     step: number("step", 0),
     ends: values.get("ends") === "1" && shown.length > 1,
   };

@@ -122,6 +122,8 @@ def show(
         raise click.UsageError("--overwrite replaces a picture: give --plot FILE with it")
     if plot is not None:
         check_output(plot, overwrite)
+    if isinstance(root, Path) and str(root).isdecimal() and not root.exists():
+        raise click.UsageError(f"{root}: no such folder; give a history's id as --history {root}")
     dataset = _load(root, filters)
     if history_id is None:
         facts = summarize_selection(dataset)
@@ -256,7 +258,7 @@ def verify(
         "icrl4aht-data convert path/to/release --layout demo_wide --to minari --out demo_wide-v0",
     )
 )
-@click.argument("root", type=Root(), metavar="SOURCE")
+@click.argument("root", required=False, type=Root(), metavar="[SOURCE]")
 @click.option(
     "--out",
     "target",
@@ -281,7 +283,7 @@ def verify(
 @filter_options
 @quiet_option
 def convert(
-    root: str | Path,
+    root: str | Path | None,
     target: Path,
     overwrite: bool,
     form: str | None,
@@ -293,9 +295,10 @@ def convert(
 ) -> None:
     """Convert a release or published files.
 
-    SOURCE is a release, or a folder with the published code's histories.h5 and histories_index.jsonl. Writes a release
-    folder (full, lite, observations), a folder with the published code's two files (published), a Minari dataset
-    (minari) in a folder named as in demo_wide-v0, which minari.load_dataset opens, or a Parquet file with the index
+    SOURCE is a release, by default the bundled mini release, or a folder with the published code's histories.h5 and
+    histories_index.jsonl. Writes a release folder (full, lite, observations), a folder with the published code's two
+    files (published), a Minari dataset (minari) in a folder named as in demo_wide-v0, which minari.load_dataset opens,
+    or a Parquet file with the index
     (parquet). Published files become lite by default or, where they have no state records, observations.
     """
     with progress_bars(quiet) as show:
@@ -322,7 +325,7 @@ def convert(
                 )
             if tasks or family_map or kept_steps != KEPT_STEPS:
                 raise click.UsageError(
-                    f"{root} is a release: --tasks, --family-map and --kept-steps are for published files"
+                    f"{dataset.root} is a release: --tasks, --family-map and --kept-steps are for published files"
                 )
             if form in ALL_KINDS:
                 to_release(dataset, target, form, overwrite=overwrite, advance=advance)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,15 +115,19 @@ class Index:
         return -1
 
     def summary(self) -> str:
-        """Return the combinations of split, layout and family that exist, in one line."""
-        counts: Counter[tuple[str, str, str]] = Counter()
+        """Return the splits with their layouts and families of teammates, in one line."""
+        found: dict[str, dict[str, list[str]]] = {}
         names = {name: self.values(name) for name in ("split", "layout", "teammate_family")}
-        histories = np.diff(self.entries.starts).tolist()
-        for codes, number in zip(self.entries.combinations.tolist(), histories, strict=True):
+        for codes in self.entries.combinations.tolist():
             split, layout, family = (names[name][codes[QUERY_FIELDS.index(name)]] for name in names)
-            counts[split, layout, family] += number
-        parts = [f"{split}/{layout} with {family} ({n})" for (split, layout, family), n in counts.items()]
-        return ", ".join(parts) or "no histories"
+            parts = found.setdefault(split, {"layout": [], "family": []})
+            parts["layout"].append(layout)
+            parts["family"].append(family)
+        texts = [
+            f"{split} on {', '.join(dict.fromkeys(parts['layout']))} with {', '.join(dict.fromkeys(parts['family']))}"
+            for split, parts in found.items()
+        ]
+        return "; ".join(texts) or "no histories"
 
 
 def read_index(root: Path) -> Index:

@@ -49,6 +49,7 @@ verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Di
 verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid:
 verify --deeep | No such option
 verify --from x | --from is the source of a repair: give --repair with it
+show 158 | 158: no such folder; give a history's id as --history 158
 show --history -1 | -1 is not in the range x>=0
 show --history 9999 | this selection has no history [9999], ids are within 0..
 show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
@@ -57,7 +58,7 @@ show --plot empty | 'empty' is a directory
 download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 download s3://a/b --to file | 'file' is a file
-convert {MINI} --out out | give the form to convert to: --to full, lite, observations, published,
+convert --out out | give the form to convert to: --to full, lite, observations, published,
 convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps are for published files
 convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
 convert {MINI} --out out --to lite --tasks none | 'none' does not exist
@@ -115,7 +116,7 @@ list none | none: no release here, expected meta/info.json in it; there is no su
 list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
 list outer | outer: no release here, expected meta/info.json in it; did you mean outer/lite?
 list file | file: no release here
-list --split test | no history has split=['test']. This release has train/coord_simple
+list --split test | no history has split=['test']. This release has train on coord_simple,
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 verify --split test | no history has split=['test']
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/

@@ -85,6 +85,7 @@ def table_of(page) -> dict[str, str]:
 
 def test_the_browser_decodes_the_states_of_the_reader(open_page, dataset):
     page = open_page()
+    assert page.evaluate("[chosen.history, chosen.episode, chosen.step]") == [0, 0, 0]
     decode = """async (position) => (await episodesOf(position)).map(({ records, rewards, actions, expert_actions }) =>
         [records.map((record) => [...record]), [...rewards], [...actions], [...expert_actions]])"""
     for position, history in enumerate(dataset):
