@@ -43,10 +43,8 @@ def say(capsys, monkeypatch, tmp_path):
 MISUSED = """
 lst | unknown command 'lst'; valid: list, show,
 list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
-list --split tran | unknown split 'tran'; valid: train, validation, test, heldout. Did you mean 'train'?
 list --source nois | unknown source 'nois'; valid: ppo, noise, student. Did you mean 'noise'?
 verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
-verify --teammate-kind greedy | unknown teammate_kind 'greedy'; valid:
 verify --deeep | No such option
 verify --from x | --from is the source of a repair: give --repair with it
 show 158 | 158: no such folder; give a history's id as --history 158
@@ -54,7 +52,6 @@ show --history -1 | -1 is not in the range x>=0
 show --history 9999 | this selection has no history [9999], ids are within 0..
 show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
 show --plot none/curves.png | no folder none: make it first, or give another path
-show --plot empty | 'empty' is a directory
 download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 download s3://a/b --to file | 'file' is a file
@@ -62,71 +59,52 @@ convert --out out | give the form to convert to: --to full, lite, observations, 
 convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps are for published files
 convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
 convert {MINI} --out out --to lite --tasks none | 'none' does not exist
-combine {MINI} --out file | 'file' is a file
 release build a b --out c | unexpected extra argument
 upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
 generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, small, smoke.
-generate --out file | 'file' is a file
 generate --out g --seed -1 | -1 is not in the range 0<=x<=4294967295
 generate --out g --workers 2 | --address and --workers need --executor ray
-plan --devices 0 | 0 is not in the range x>=1
 research speed --layout x | unknown layout 'x'; valid: coord_simple,
 teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
 train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline, rl2.
-train ad --layout demo_wide --size smal | unknown size 'smal'; valid: tiny, small, medium, large.
 train ad --layout demo_wide --order rnd | unknown order 'rnd'; valid: contiguous, random.
-train dpt --layout demo_wide --labels orcale | unknown labels 'orcale'; valid: expert, oracle.
 train ad --layout demo_wide --batch-size 0 | batch_size = '0': expected `int` >= 1
 train ad --layout demo_wide --learning-rate nan | learning_rate = 'nan': expected `float` > 0
 train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
-train ad --layout demo_wide --coordinator a:1 --process 2 | --process 2: expected a number below 1
 train rl2 --layout demo_wide --context 5 | --context: not with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
-collect --agent none --out c | A trained model is named by its folder
 collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
 collect --agent stay --out c --noise 2 0 | noise = '2': expected `float` <= 1
 research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2,
 research reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states its results
 research reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 results empty | Missing option '--out'
-collect --agent stay --out file | 'file' is a file
 research tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid: ad, dpt, hybrid_ad, amago_offline.
 evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
-evaluate --agent randm --out e | unknown agent 'randm'; valid: stay, random, oracle, ad-reference,
 evaluate --agent none --out e | A trained model is named by its folder
 evaluate --agent empty --out e | empty: not a run: config.json is missing
-evaluate --agent stay --out e --acting cach | unknown acting 'cach'; valid: cached, exact.
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
-evaluate --agent stay --out e --manifest empty | 'empty' is a directory
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
 research headroom --protocol x | unknown protocol 'x'; valid: published, seeded.
-research sweep contxt | unknown sweep 'contxt'; valid: context, size. Did you mean 'context'?
 research sweep size --only smal | unknown setting of sweep size 'smal'; valid: small, medium, large.
 results --ablation ta empty --out r | unknown ablation 'ta'; valid: windows, contexts.
-research ablate tb | unknown ablate 'tb'; valid: ta, windows, contexts.
 research ablate windows --method dpt | unknown method of ablate windows 'dpt'; valid: ad
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
-research heldout-rl --suite file | 'file' is a file
 """
 
 FAILED = """
 list none | none: no release here, expected meta/info.json in it; there is no such folder: check
 list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
 list outer | outer: no release here, expected meta/info.json in it; did you mean outer/lite?
-list file | file: no release here
 list --split test | no history has split=['test']. This release has train on coord_simple,
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
-verify --split test | no history has split=['test']
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
-convert none --out out | none: no release here
 convert {MINI} --out file/x --to lite | file: File exists; a file is where a folder is needed
 convert {MINI} --out none/index --to parquet | none/index: No such file or directory; check the path;
 combine --out out {MINI} --data-version banana | data version 'banana': expected one such as 1.0.0
 combine --out out {MINI} {MINI} | leave one of them out
-release build empty --out out | empty: no release here
-upload none hf://datasets/a/b --dry-run | none: no release here
 check none empty | none: no such folder
 research diversity --suite empty | empty: no layout has all its populations finished; `icrl4aht-data
 train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
@@ -139,8 +117,6 @@ results --ablation windows empty --out r | empty: no results of plain; expected 
 collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON
 results empty --out r | empty: no results in empty/tasks; run `icrl4aht-data evaluate --out empty`
 train ad --layout all --channels own | channels = own: the layouts coord_simple,
-train ad --layout demo_wide --source nois | source = nois: none of Dataset(
-train ad --layout demo_wide --root none | none: no release here
 report empty | empty: no results in empty/tasks; run `icrl4aht-data evaluate --out empty`
 evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in
 research drift empty | empty: not a run
