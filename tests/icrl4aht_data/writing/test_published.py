@@ -17,16 +17,12 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, PublishedFormatError
 from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.format.schema import PROVENANCE
-from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
-from icrl4aht_data.overcooked.observe import fixed_channels, observe
-from icrl4aht_data.overcooked.state import columns, record_size
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.observe import fixed_channels
 from icrl4aht_data.writing.published import from_published, to_published
-from icrl4aht_data.writing.published_views import complete_views
 from tests.helpers.damages import contents
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import random_release
-
-CRAMPED = [layout for layout in LAYOUTS.values() if layout.height < 5]
 
 
 def relabel(source: Path, target: Path, changes: dict[int, dict[str, Any]]) -> Path:
@@ -80,13 +76,6 @@ def test_other_names_are_mapped_by_hand(published_folder, tmp_path):
         "my_pbt=H9": "unknown family or kind of teammates 'H9'",
     }.items():
         assert message in str(CliRunner().invoke(cli, [*command, "--family-map", wrong]).exception)
-
-
-def test_a_kind_that_contradicts_the_family(published_folder, tmp_path):
-    names = {"teammate_family": "ippo", "teammate_kind": "heuristic"}
-    files = relabel(published_folder[0], tmp_path / "files", {2: names})
-    with pytest.raises(PublishedFormatError, match="line 3: teammate_kind 'heuristic', but teammate_family 'ippo'"):
-        from_published(files, tmp_path / "out", kept_steps=KEPT)
 
 
 @pytest.fixture(scope="module")
@@ -148,16 +137,6 @@ def test_short_views_with_states(short_views, tmp_path, kind):
         from_published(tmp_path / "files", tmp_path / "again", kind, kept_steps=20)
 
 
-@pytest.mark.parametrize("layout", CRAMPED, ids=lambda layout: layout.name)
-def test_every_cell_of_a_cramped_map_is_told_by_its_short_view(layout):
-    records = np.zeros((len(layout.rooms[0]), record_size(layout)), np.uint8)
-    records[:, columns(layout).positions] = layout.rooms[0][:, None]
-    views = np.asarray(observe(layout, records, 0))
-    views[..., : fixed_channels(layout).start] = 0
-    assert len({view[:4].tobytes() for view in views}) == len(views)
-    np.testing.assert_array_equal(complete_views(layout, views[:, :4]), views)
-
-
 def test_short_views_of_nothing_are_refused(short_views, tmp_path):
     shutil.copytree(short_views[0], tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
@@ -167,11 +146,14 @@ def test_short_views_of_nothing_are_refused(short_views, tmp_path):
         from_published(tmp_path / "files", tmp_path / "out", kept_steps=20)
 
 
-def test_duplicates_are_refused(published_folder, tmp_path):
+def test_duplicates_and_contradictions_are_refused(published_folder, tmp_path):
     cases = {
         "line 2: group '0' is already that of line 1": {1: {"h5_group": "0"}},
         "line 2: stream 10 of task 'task_a' is already that of line 1": {1: {"env_idx": 10}},
         "line 2: field 'env_idx'": {1: {"env_idx": -1}},
+        "line 3: teammate_kind 'heuristic', but teammate_family 'ippo'": {
+            2: {"teammate_family": "ippo", "teammate_kind": "heuristic"}
+        },
     }
     for number, (message, changes) in enumerate(cases.items()):
         files = relabel(published_folder[0], tmp_path / str(number), changes)

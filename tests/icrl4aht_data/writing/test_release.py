@@ -24,28 +24,12 @@ from icrl4aht_data.format.chunks import decode_chunk, encode_chunk
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
-from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.damages import contents
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import make_tasks, random_history, random_release
-
-
-def test_our_reader_returns_every_array(lite_or_full):
-    root, written = lite_or_full
-    dataset = load_icrl4aht(root)
-    assert len(dataset) == len(written) == 12
-    for history in dataset:
-        for name, array in written[history.entry.history_id].items():
-            found = history.read(name)
-            np.testing.assert_array_equal(found, array)
-            assert found.dtype == FIELDS[name].dtype
-        layout = get_layout(history.entry.layout)
-        np.testing.assert_array_equal(
-            history.read("obs"), observe(layout, written[history.entry.history_id]["state"], 0)
-        )
 
 
 def test_plain_h5py_reads_every_array(lite_or_full):
