@@ -31,7 +31,7 @@ def check_files(
 ) -> None:
     """Check that the chosen files exist with the manifest's hashes, and that no unlisted files do.
 
-    Sizes come first: a file may have grown to a terabyte with a hole, whose hash would take hours.
+    Sizes are compared first, because hashing a sparse file of a terabyte would take hours.
 
     Args:
         origin: the release.

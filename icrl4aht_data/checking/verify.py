@@ -118,7 +118,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     provenance = _read_provenance(origin, report)
     check_references(listed, index, tasks, provenance, report)
     if report.level == "deep":
-        _note_what_is_believed(index, provenance or {}, report)
+        _note_unchecked_values(index, provenance or {}, report)
     if provenance is not None:
         check_provenance(index, tasks, provenance, report)
     check_index(index, tasks, provenance, report)
@@ -132,8 +132,8 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         _check_shards(index, shards, report, advance)
 
 
-def _note_what_is_believed(index: Index, provenance: Mapping[str, Provenance], report: Report) -> None:
-    """Add a note on every kind of value that was not computed again."""
+def _note_unchecked_values(index: Index, provenance: Mapping[str, Provenance], report: Report) -> None:
+    """Add a note for each kind of value that verification cannot recompute."""
     for name, note in _NOT_RECOMPUTED.items():
         if name == "oracle_actions":
             count = np.count_nonzero(index.entries.column("has_oracle_actions"))

@@ -1,7 +1,7 @@
 """MANIFEST.sha256: every file of a release with its hash, in sha256sum's format.
 
-Nothing of a release is believed because it is there: the manifest has the hashes of `meta/`, and the chunk tables in
-`meta/chunks/` have those of the chunks.
+The manifest has the hashes of `meta/`, and the chunk tables in `meta/chunks/` have those of the chunks, so that every
+byte of a release can be checked.
 """
 
 from __future__ import annotations

@@ -278,7 +278,7 @@ def _check_noise(noise: _NoiseSetting | None) -> None:
 
 
 class _TeammateSetting(msgspec.Struct, forbid_unknown_fields=True):
-    """How a teammate played. What it is, its task says, whose id is a hash of it: nothing here may say otherwise."""
+    """How a teammate played. The task defines the teammate itself, so other fields are refused."""
 
     slot: Literal[1]
     noise: str | None = None

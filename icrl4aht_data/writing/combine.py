@@ -121,7 +121,7 @@ def _source_card(datasets: Sequence[Dataset]) -> str:
         )
         names = [RELEASE_CARD] + [name for name in listed if name == SOURCE_CARD]
         cards += [_card_text(read_text(dataset.origin.file(name))) for name in names]
-    heading = "# ICRL4AHT learning histories, combined\n\nMade of these releases, whose own cards follow:\n\n"
+    heading = "# ICRL4AHT learning histories, combined\n\nMade of these releases. Their cards follow.\n\n"
     return f"{heading}{''.join(parts)}\n" + "\n".join(cards)
 
 
