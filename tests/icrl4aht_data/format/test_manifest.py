@@ -65,11 +65,11 @@ def test_a_damaged_file_is_an_error_that_names_it(damaged, name, damage):
 
 def test_an_empty_manifest_is_refused(damaged):
     (damaged / MANIFEST).write_text("")
-    with pytest.raises(IndexFormatError, match=rf"{MANIFEST}: lists no file; fetch the release again"):
+    with pytest.raises(IndexFormatError, match=rf"{MANIFEST}: empty: expected a line for each file"):
         load_icrl4aht(damaged)
     for level in ("quick", "full"):
         report = verify_release(damaged, level=level)
-        assert any(finding.file == MANIFEST and "lists no file" in finding.problem for finding in report.findings)
+        assert any(finding.file == MANIFEST and "empty: expected" in finding.problem for finding in report.findings)
 
 
 def test_a_file_of_meta_that_the_manifest_does_not_list(damaged):
