@@ -191,8 +191,8 @@ def _folders(problems: list[Problem]) -> dict[str, Any]:
         facts["cache"]["limit"] = cache_limit()
     except OptionError as error:
         problems.append(Problem(str(error), "correct it, or unset it"))
-    facts["cache"]["left_over"] = [str(p) for name in (".*.partial", ".*.removed-*") for p in cache.glob(name)]
-    facts["data"]["in_part"] = _disk_usage(path for part in data.glob("*/*.partial") for path in part.rglob("*"))
+    facts["cache"]["left_over"] = [str(p) for p in cache.glob(".*.partial-*")]
+    facts["data"]["in_part"] = _disk_usage(path for part in data.glob("*/*/.partial-*") for path in part.rglob("*"))
     return facts
 
 
