@@ -12,8 +12,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from icrl4aht_data.clients import Advance, without_credentials
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
-from icrl4aht_data.fetch import Advance, ReleaseLocation, Remote, is_address, open_root, short_hash, without_credentials
+from icrl4aht_data.fetch import ReleaseLocation, Remote, is_address, open_root, short_hash
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import read_manifest

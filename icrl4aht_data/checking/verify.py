@@ -20,10 +20,11 @@ from icrl4aht_data.checking.index import check_index
 from icrl4aht_data.checking.provenance import check_provenance
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
 from icrl4aht_data.checking.structure import check_bytes_between, check_structure, has_grown
+from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.download import chosen_files
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, RemoteError, UnknownNameError, unknown
-from icrl4aht_data.fetch import ReleaseLocation, Remote, check_credentials, open_root, without_credentials
+from icrl4aht_data.fetch import ReleaseLocation, Remote, open_root
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance

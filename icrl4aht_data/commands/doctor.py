@@ -23,10 +23,11 @@ from packaging.specifiers import SpecifierSet
 
 from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
 from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.clients import check_credentials, offline_switches, without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.download import default_remote
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PluginError
-from icrl4aht_data.fetch import check_credentials, is_address, offline_switches, without_credentials
+from icrl4aht_data.fetch import is_address
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.safe_hdf5 import OLDEST_HDF5
 from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, get_layout

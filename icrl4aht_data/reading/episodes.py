@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Self, overload
 
 import numpy as np
 
+from icrl4aht_data.errors import PositionTypeError
 from icrl4aht_data.plotting import curve_svg
 from icrl4aht_data.utils.options import check_position
 from icrl4aht_data.utils.text import facts_html
@@ -149,7 +150,10 @@ class Episodes(Sequence[Episode]):
 
     def __getitem__(self, position: int | slice) -> Episode | Self:
         if isinstance(position, slice):
-            return type(self)(self._history, self.numbers[position])
+            try:
+                return type(self)(self._history, self.numbers[position])
+            except TypeError as error:
+                raise PositionTypeError(f"{position!r}: expected integers in a slice of episodes") from error
         return Episode(self._history, self.numbers[check_position(repr(self), position, len(self))])
 
     def __iter__(self) -> Iterator[Episode]:

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
 
-from icrl4aht_data.errors import EmptySelectionError, NotStoredError, OptionError, UnknownNameError, unknown
+from icrl4aht_data.errors import (
+    EmptySelectionError,
+    NotStoredError,
+    OptionError,
+    PositionTypeError,
+    UnknownNameError,
+    unknown,
+)
 from icrl4aht_data.fetch import ReleaseLocation
 from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.info import ReleaseInfo
@@ -179,7 +186,10 @@ class Selection:
 
     def __getitem__(self, position: int | slice) -> History | Self:
         if isinstance(position, slice):
-            return self.select(self.ids[position])
+            try:
+                return self.select(self.ids[position])
+            except TypeError as error:
+                raise PositionTypeError(f"{position!r}: expected integers in a slice of histories") from error
         return self.history(int(self.ids[check_position("the selection's histories", position, len(self))]))
 
     def __iter__(self) -> Iterator[History]:
@@ -458,7 +468,10 @@ class Selection:
             UnknownNameError: for an id that this selection does not have.
             OptionError: for anything but integers, and for a bool array of another length.
         """
-        given = np.asarray(ids)
+        try:
+            given = np.asarray(ids)
+        except (TypeError, ValueError) as error:  # rows of unequal length
+            raise OptionError(f"select: expected a list of history ids, found {ids!r:.200}") from error
         if given.dtype == bool and given.ndim == 1:
             if len(given) != len(self):
                 raise OptionError(

@@ -24,7 +24,8 @@ from click.testing import CliRunner
 from huggingface_hub import file_download
 from huggingface_hub.utils import _http
 
-from icrl4aht_data import download, fetch, load_icrl4aht, verify_release
+from icrl4aht_data import clients, download, load_icrl4aht, verify_release
+from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.download import fetch_planned, plan_download, repair
 from icrl4aht_data.errors import (
@@ -36,7 +37,6 @@ from icrl4aht_data.errors import (
     RootNotFoundError,
     UnknownNameError,
 )
-from icrl4aht_data.fetch import check_credentials, without_credentials
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from tests.helpers.batches import assert_equal
@@ -70,7 +70,7 @@ def data(tmp_path, monkeypatch) -> Path:
     """The data folder, empty at first. Waits before retries are short."""
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     monkeypatch.delenv("ICRL4AHT_REMOTE", raising=False)
-    monkeypatch.setattr(fetch, "_WAITS", (0.01, 0.01, 0.01))
+    monkeypatch.setattr(clients, "_WAITS", (0.01, 0.01, 0.01))
     hurried = SimpleNamespace(**vars(time) | {"sleep": lambda seconds: time.sleep(seconds / 500)})
     monkeypatch.setattr(_http, "time", hurried)
     monkeypatch.setattr(file_download, "time", hurried)
@@ -330,7 +330,7 @@ def test_the_first_file_that_fails_ends_a_download(lite, tmp_path):
         seen = len(server.log)
         with pytest.raises(RemoteError, match="expected sha256"):
             fetch_planned(plan)
-        assert len(server.log) - seen <= min(len(plan.files), fetch._THREADS + 2)
+        assert len(server.log) - seen <= min(len(plan.files), clients.THREADS + 2)
     assert set(contents(tmp_path / "mine")) - set(plan.absent) == set(contents(tmp_path / "mine"))
 
 
@@ -344,7 +344,7 @@ def silent_server() -> socket.socket:
 
 @pytest.mark.parametrize("what", ["http", "hub", pytest.param("s3", marks=pytest.mark.slow), "refused", "hub refused"])
 def test_no_answer_is_an_error_soon(what, tmp_path, monkeypatch):
-    monkeypatch.setattr(fetch, "_TIMEOUT", 0.5)
+    monkeypatch.setattr(clients, "_TIMEOUT", 0.5)
     with silent_server() as server:
         endpoint = f"http://127.0.0.1:{9 if 'refused' in what else server.getsockname()[1]}"
         url = {"http": endpoint, "refused": endpoint, "s3": "s3://bucket/x"}.get(what, HUB)
@@ -361,7 +361,7 @@ def test_no_answer_is_an_error_soon(what, tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["http", "hub"])
 @pytest.mark.parametrize("path", ["*.h5", "*/api/*", f"*{INFO}"])
 def test_a_server_that_stops_answering(kind, path, lite, tmp_path, monkeypatch):
-    monkeypatch.setattr(fetch, "_TIMEOUT", 0.5)
+    monkeypatch.setattr(clients, "_TIMEOUT", 0.5)
     with served(kind, lite[0]) as (url, server):
         assert server is not None
         server.faults.next(Slow(60), times=ALWAYS, path=path, method=None)

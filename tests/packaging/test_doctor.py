@@ -106,17 +106,17 @@ def test_sources_of_folders(elsewhere, monkeypatch):
 def test_content_of_folders(elsewhere):
     (elsewhere / "cache" / "set").mkdir(parents=True)
     (elsewhere / "cache" / "set" / "state.npy").write_bytes(bytes(10_000))
-    (elsewhere / "cache" / ".other.partial").mkdir()
-    part = elsewhere / "data" / "host-1" / "0.partial" / "data"
+    (elsewhere / "cache" / ".other.partial-x").mkdir()
+    part = elsewhere / "data" / "host-1" / "0" / ".partial-x" / "data"
     part.mkdir(parents=True)
     (part / "shard.h5").write_bytes(bytes(5_000))
     facts, text = run_doctor()
     cache, data = facts["folders"]["cache"], facts["folders"]["data"]
     assert cache["bytes"] >= 10_000
-    assert cache["left_over"] == [str(elsewhere / "cache" / ".other.partial")]
+    assert cache["left_over"] == [str(elsewhere / "cache" / ".other.partial-x")]
     assert data["bytes"] >= data["in_part"] >= 5_000
     assert "limit 100,000,000,000" in text
-    assert str(elsewhere / "cache" / ".other.partial") in text
+    assert str(elsewhere / "cache" / ".other.partial-x") in text
 
 
 def test_folders_that_cannot_be_written(elsewhere, monkeypatch):

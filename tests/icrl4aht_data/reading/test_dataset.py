@@ -1,4 +1,4 @@
-"""Loading, selecting, other options, lazy arrays."""
+"""Loading, selecting, other options, fields of histories."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import get_layout, load_icrl4aht
-from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
+from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.batches import assert_equal
 from tests.helpers.random_releases import random_release
@@ -112,7 +112,7 @@ def test_other_options_share_index_and_shards(lite, converted_release):
     ],
     ids=str,
 )
-def test_lazy_arrays_index_as_arrays_do(lite, key):
+def test_fields_index_as_arrays_do(lite, key):
     root, written = lite
     lazy = load_icrl4aht(root)[4].state
     expected = written[4]["state"]
@@ -120,7 +120,37 @@ def test_lazy_arrays_index_as_arrays_do(lite, key):
     np.testing.assert_array_equal(lazy[key], expected[np.asarray(key) if isinstance(key, list) else key])
 
 
-def test_lazy_array_out_of_range(lite):
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda ds: ds.select([[1], [1, 2]]),
+        lambda ds: ds.select(["a"]),
+        lambda ds: ds[True],
+        lambda ds: ds["a"],
+        lambda ds: ds["a":],
+        lambda ds: ds[0].episodes["a":],
+        lambda ds: ds[0].episodes[True],
+        lambda ds: ds[0].read("actions", "a"),
+        lambda ds: ds[0].read("actions", 0, 1.5),
+        lambda ds: ds[0]["nothing"],
+    ],
+)
+def test_impossible_positions_are_errors_of_this_package(lite, use):
+    with pytest.raises(Icrl4ahtError):
+        use(load_icrl4aht(lite[0]))
+
+
+def test_a_field_is_one_read_only_array(lite):
+    history = load_icrl4aht(lite[0])[4]
+    assert history.actions is history["actions"] and isinstance(history.actions, np.ndarray)
+    assert history.episodes[1].obs.base is None, "an episode reads its own steps only"
+    with pytest.raises(ValueError, match="read-only"):
+        history.actions[0] = 3
+    copy = pickle.loads(pickle.dumps(history))
+    np.testing.assert_array_equal(copy.obs, history.obs)
+
+
+def test_a_step_out_of_range(lite):
     with pytest.raises(IndexError):
         load_icrl4aht(lite[0])[0].actions[120]
 
