@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -34,7 +34,7 @@ from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.plotting import check_can_draw, plot_layout_curves
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.files import check_output
-from icrl4aht_data.utils.progress import counted, progress_bars
+from icrl4aht_data.utils.progress import progress_bars
 
 FLOOR = ("stay", "random")
 """Reference egos that an agent has to exceed before its return says anything."""
@@ -194,18 +194,8 @@ def _evaluate(name: str, out: Path, tasks: Sequence[Task], settings: DemoSetting
     """Evaluate an agent. Return the folder of its results, and its returns in each task, (seeds, episodes)."""
     agent = find_agent(name)
     folder = out / "results" / agent.name
-    total = len(tasks) * len(settings.seeds) * settings.protocol.episodes
-    with progress_bars(unit="episodes") as show:
-        results = evaluate(
-            agent.name,
-            agent.make,
-            tasks,
-            settings.protocol,
-            seeds=settings.seeds,
-            out=folder,
-            details=agent.details,
-            played=counted(show, agent.name, total),
-        )
+    rules: Any = {"seeds": settings.seeds, "out": folder, "details": agent.details}
+    results = evaluate(agent.name, agent.make, tasks, settings.protocol, **rules)
     note_results(folder, agent.run, tasks)
     return folder, [np.array(result.returns) for result in results]
 

@@ -45,7 +45,7 @@ def release(tmp_path_factory) -> Path:
     return root
 
 
-def evaluate_without_playing(agent, make, tasks, protocol, *, seeds, out, details, played):
+def evaluate_without_playing(agent, make, tasks, protocol, *, seeds, out, details):
     """Write results: the model earns 10 more than `random` with H4, and as much as `random` with H2."""
     settings = {"agent": agent, "seeds": list(seeds), "protocol": asdict(protocol), "code_version": "0"}
     settings |= {"details": details} if details else {}
