@@ -268,26 +268,18 @@ def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[lis
     kind = "training histories" + "".join(f" of {name} {' and '.join(values)}" for name, values in filters.items())
     if ALL_LAYOUTS in plan.layouts:
         return list(HistoryOptions(plan.layouts).layouts), []
-    if plan.layouts:
-        names = [get_layout(name).name for name in plan.layouts]
-        for name in names:
-            if name not in TESTED_ON:
-                raise unknown("training layout", name, TESTED_ON)
-        missing = [name for name in names if name not in available]
-        if missing:
-            raise EmptySelectionError(
-                f"{release}: no {kind} on {', '.join(missing)}; it has {', '.join(sorted(available)) or 'none'}: "
-                f"choose among them, or give a --root that has the others"
-            )
-        return names, []
-    names = [name for name in experiment.layouts if name in available]
-    if not names:
+    wanted = tuple(get_layout(name).name for name in plan.layouts)
+    for name in wanted:
+        if name not in TESTED_ON:
+            raise unknown("training layout", name, TESTED_ON)
+    missing = [name for name in wanted or experiment.layouts if name not in available]
+    names = [name for name in wanted or experiment.layouts if name in available]
+    if not names or (wanted and missing):
         raise EmptySelectionError(
-            f"{release}: no {kind} on {', '.join(experiment.layouts)}, where the paper runs this; it has "
-            f"{', '.join(sorted(available)) or 'none'}: give --layout, or another --root"
+            f"{release}: no {kind} on {', '.join(missing)}; it has {', '.join(sorted(available)) or 'none'}: choose "
+            f"among them, or give a --root that has the others"
         )
-    left = [name for name in experiment.layouts if name not in available]
-    return names, [f"left out, the release has no {kind} of them: {', '.join(left)}"] if left else []
+    return names, [f"left out, the release has no {kind} of them: {', '.join(missing)}"] if missing else []
 
 
 def _pass_all(histories: Dataset, filters: dict[str, tuple[str, ...]]) -> bool:
@@ -344,8 +336,10 @@ def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> 
         OptionError: if the suite has no held-out teammates there, or one of them is in the release.
     """
     if suite is None:
-        raise OptionError("held-out teammates: expected a suite, found none; give --suite, a folder that `python -m "
-                          "generation teammates` made")  # fmt: skip
+        raise OptionError(
+            "held-out teammates: expected a suite, found none; give --suite, a folder that `icrl4aht-data teammates` "
+            "made"
+        )
     path = suite / "manifests" / f"{track_of(layout)}_heldout.jsonl"
     if not path.is_file():
         raise OptionError(

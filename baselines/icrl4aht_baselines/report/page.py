@@ -16,7 +16,6 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pandas as pd
-from icrl4aht_generation.teammates.instances import INSTANCES
 
 from icrl4aht_baselines.plotting import SMOOTHING, plot_return_curves
 from icrl4aht_baselines.report.figures import (
@@ -62,7 +61,6 @@ _SHOWN_SETTINGS = {
     "model": ("layers", "width", "encoder", "positions"),
     "histories": ("channels",),
 }
-_PAPER_CONDITIONS = f"Paper: protocol {PUBLISHED_PROTOCOL}, {INSTANCES} instances, 100 episodes of 100 steps."
 
 
 def report_files(runs: Sequence[EvaluationRun] = ()) -> list[str]:
