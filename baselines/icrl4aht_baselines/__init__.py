@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from icrl4aht_baselines.agents.host import from_host
     from icrl4aht_baselines.evaluate.evaluator import evaluate
     from icrl4aht_baselines.evaluate.protocols import test_tasks
+    from icrl4aht_baselines.report import report
 
-__all__ = ["evaluate", "find_agent", "from_host", "test_tasks"]
+__all__ = ["evaluate", "find_agent", "from_host", "report", "test_tasks"]
 
 _MODULES = {"find_agent": "agents.egos", "from_host": "agents.host", "test_tasks": "evaluate.protocols"}
 

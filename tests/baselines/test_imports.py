@@ -18,6 +18,7 @@ from icrl4aht_baselines import evaluate, find_agent, from_host, report, test_tas
 agent = find_agent("stay")
 tasks = test_tasks("teammate", "coord_simple", "H4")[:1]
 (result,) = evaluate(agent.name, agent.make, tasks, icrl4aht_baselines.evaluate.get_protocol("published", 2))
+assert report([result]).startswith("# Returns per layout")
 print(result.returns)
 """
 
