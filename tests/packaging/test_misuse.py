@@ -89,8 +89,6 @@ watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
 research headroom --protocol x | unknown protocol 'x'; valid: published, seeded.
 research sweep size --only smal | unknown setting of sweep size 'smal'; valid: small, medium, large.
-results --ablation ta empty --out r | unknown ablation 'ta'; valid: windows, contexts.
-research ablate windows --method dpt | unknown method of ablate windows 'dpt'; valid: ad
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """
 
@@ -112,8 +110,6 @@ train amago_offline --layout demo_wide --labels oracle | amago_offline learns fr
 train rl2 --layout demo_wide --every 2 | every = 2: rl2 learns by playing, not from histories
 train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
 collect --agent stay --source student --out c | source = student: none of Dataset(
-research ablate windows --reward-scale 1 | reward_scale = 1.0: `ablate windows` sets it; choose by --only, such as
-results --ablation windows empty --out r | empty: no results of plain; expected a folder that `icrl4aht-data
 collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON
 results empty --out r | empty: no results in empty/tasks; run `icrl4aht-data evaluate --out empty`
 train ad --layout all --channels own | channels = own: the layouts coord_simple,

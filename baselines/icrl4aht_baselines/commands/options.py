@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from icrl4aht_baselines.training.options import (
 )
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options
+from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options, topic
 from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, SEED, Folder, Names, Root
 from icrl4aht_data.errors import UnknownNameError
 from icrl4aht_data.utils.options import Positive
@@ -227,99 +227,60 @@ def default_batch_size(size: str = "small") -> int:
     return SIZES[size].cpu_batch if jax.default_backend() == "cpu" else TrainOptions.batch_size
 
 
-def sized_settings(
-    size: str | None, model: Mapping[str, Any], train: Mapping[str, Any]
-) -> tuple[ModelOptions, TrainOptions, str]:
-    """Returns the settings of a size, in which given values take precedence, and a line that describes them.
-
-    Args:
-        size: name of the size; None for tiny on a CPU and small elsewhere.
-        model: given values of `ModelOptions`.
-        train: given values of `TrainOptions`.
-    """
-    import jax
-
-    default = "tiny" if jax.default_backend() == "cpu" else "small"
-    name = size or default
-    options = ModelOptions(**SIZES[name].model | dict(model))
-    training = TrainOptions(**SIZES[name].train | {"batch_size": default_batch_size(name)} | dict(train))
-    reason = "" if size else f", the default {'on a CPU' if default == 'tiny' else 'on this device'}"
-    text = (
-        f"size {name}{reason}: layers {options.layers}, width {options.width}, encoder {options.encoder}, positions "
-        f"{options.positions}, K = {training.context}, steps {training.steps}, batch size {training.batch_size}"
-    )
-    return options, training, text
-
-
-def prepare_method(
+def prepare_training(
     method: str,
     size: str | None,
-    model: Mapping[str, Any],
-    train: Mapping[str, Any],
-    play: Mapping[str, Any],
+    model: dict[str, Any],
+    train: dict[str, Any],
+    play: dict[str, Any],
     histories: HistoryOptions,
     manifests: Sequence[Path] = (),
 ) -> tuple[Any, TrainOptions, str]:
-    """Returns the training of a method on histories, its options, and text that describes it.
+    """Return a training, its options, and text that describes it.
 
     Args:
         method: its name.
-        size: name of the model's size, see `sized_settings`.
-        model: given values of `ModelOptions`.
-        train: given values of `TrainOptions`.
-        play: given values of `PlayOptions`; expected to be empty.
-        histories: to train on.
-        manifests: files of tasks to play; expected to be empty.
-
-    Raises:
-        click.UsageError: for options of methods that learn by playing.
-    """
-    from icrl4aht_baselines.training.histories import prepare
-
-    if manifests:
-        raise click.UsageError(f"--manifest: not with {method}, only with rl2, which learns by playing")
-    if play:
-        raise click.UsageError(f"{_flags(play)}: not with {method}, only with rl2, which learns by playing")
-    sized, options, description = sized_settings(size, model, train)
-    job = prepare(method, sized, options, histories)
-    return job, options, f"{description}\n{training_summary(job.about['histories'])}"
-
-
-def prepare_rl2(
-    size: str | None,
-    model: Mapping[str, Any],
-    train: Mapping[str, Any],
-    play: Mapping[str, Any],
-    histories: HistoryOptions,
-    manifests: Sequence[Path] = (),
-) -> tuple[Any, TrainOptions, str]:
-    """Returns the training of RL^2, its options, and text that describes it.
-
-    Args:
-        size: expected to be None.
-        model: given values of `ModelOptions`.
-        train: given values of `TrainOptions`.
-        play: given values of `PlayOptions`.
-        histories: with whose teammates to play.
+        size: name of the model's size; None for tiny on a CPU and small elsewhere. Not of a method that plays.
+        model, train, play: given values of `ModelOptions`, `TrainOptions` and `PlayOptions`.
+        histories: to train on, or with whose teammates to play.
         manifests: files of tasks with whose teammates to play as well.
 
     Raises:
-        click.UsageError: for options that only methods trained on histories have.
+        click.UsageError: for options that the method does not have.
     """
-    from icrl4aht_baselines.online.prepare import prepare_play
+    import jax
 
-    unused = UNUSED_OPTIONS["rl2"] & (train.keys() | model.keys())
-    if size or unused:
-        raise click.UsageError(f"{_flags(unused or ['size'])}: not with rl2, which learns by playing")
-    sized = ModelOptions(**RL2_SETTINGS["model"] | dict(model))
-    tasks = [task for manifest in manifests for task in read_tasks(manifest)]
-    options = TrainOptions(**RL2_SETTINGS["train"] | dict(train))
-    job = prepare_play("rl2", sized, options, PlayOptions(**dict(play)), histories, tasks)
-    played = job.about["histories"]
+    from icrl4aht_baselines.methods.registry import PLAYING
+    from icrl4aht_baselines.online.prepare import prepare_play
+    from icrl4aht_baselines.training.histories import prepare
+
+    if method in PLAYING:
+        if unused := {"size"} if size else UNUSED_OPTIONS[method] & (train.keys() | model.keys()):
+            raise click.UsageError(f"{_flags(unused)}: not with {method}, which learns by playing")
+        sized = ModelOptions(**RL2_SETTINGS["model"] | model)
+        options = TrainOptions(**RL2_SETTINGS["train"] | train)
+        tasks = [task for manifest in manifests for task in read_tasks(manifest)]
+        job = prepare_play(method, sized, options, PlayOptions(**play), histories, tasks)
+        played = job.about["histories"]
+        text = (
+            f"{method}: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps "
+            f"{options.steps}, each an episode of {job.trainer.tasks} tasks\nplaying on "
+            f"{', '.join(played['layouts'])}, canonical channels, with the teammates of {len(played['groups'])} "
+            f"families and layouts"
+        )
+        return job, options, text
+    if given := {*play, *(["manifest"] if manifests else [])}:
+        raise click.UsageError(f"{_flags(given)}: not with {method}, only with rl2, which learns by playing")
+    on_cpu = jax.default_backend() == "cpu"
+    name = size or ("tiny" if on_cpu else "small")
+    sized = ModelOptions(**SIZES[name].model | model)
+    options = TrainOptions(**SIZES[name].train | {"batch_size": default_batch_size(name)} | train)
+    job = prepare(method, sized, options, histories)
+    reason = "" if size else f", the default {'on a CPU' if on_cpu else 'on this device'}"
     text = (
-        f"rl2: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps {options.steps}, "
-        f"each an episode of {job.trainer.tasks} tasks\nplaying on {', '.join(played['layouts'])}, canonical channels, "
-        f"with the teammates of {len(played['groups'])} families and layouts"
+        f"size {name}{reason}: layers {sized.layers}, width {sized.width}, encoder {sized.encoder}, positions "
+        f"{sized.positions}, K = {options.context}, steps {options.steps}, batch size {options.batch_size}\n"
+        f"{training_summary(job.about['histories'])}"
     )
     return job, options, text
 
@@ -340,16 +301,13 @@ def _flags(names: Iterable[str]) -> str:
     return ", ".join("--" + name.replace("_", "-") for name in sorted(names))
 
 
-def process_options(command: Any) -> Any:
-    """Add the options of training on several machines; `join_processes` takes their values."""
-    options = [
-        click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines."),
-        click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes."),
-        click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process."),
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+process_options = topic(
+    "Machines",
+    click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines."),
+    click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes."),
+    click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process."),
+)
+"""The options of training on several machines; `join_processes` takes their values."""
 
 
 def join_processes(coordinator: str | None, processes: int, process: int) -> None:

@@ -27,8 +27,7 @@ from icrl4aht_baselines.commands.options import (
     manifests_option,
     model_options,
     play_options,
-    prepare_method,
-    prepare_rl2,
+    prepare_training,
     process_options,
     protocol_option,
     root_option,
@@ -270,7 +269,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     save_minutes_option,
     tensorboard_option,
 )
-@topic("Machines", process_options)
+@process_options
 def train_command(
     method: str,
     layouts: tuple[str, ...],
@@ -309,10 +308,7 @@ def train_command(
     folder, plays = out or Path("runs") / method, method in PLAYING
     if plays and processes > 1:
         raise click.UsageError(f"--processes {processes}: {method} is trained by one process on one device")
-    if plays:
-        job, options, description = prepare_rl2(size, model, train, play, choice, manifests)
-    else:
-        job, options, description = prepare_method(method, size, model, train, play, choice, manifests)
+    job, options, description = prepare_training(method, size, model, train, play, choice, manifests)
     _console.print(description, highlight=False)
     with progress_bars(unit="steps") as show:
 

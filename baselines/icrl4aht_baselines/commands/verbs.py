@@ -2,10 +2,10 @@
 
 from icrl4aht_data.commands.verbs import Verb
 
-_CLI, _MODELS, _EXPERIMENTS = (
+_CLI, _MODELS, _LAB = (
     f"icrl4aht_baselines.commands.{name}" for name in ("train_commands", "model_commands", "experiment_commands")
 )
-_TRAIN, _PAPER, _REFERENCE = "Train and evaluate", "The paper's experiments", "Reference models and checks"
+_TRAIN, _PAPER, _CHECKS = "Train and evaluate", "The paper's experiments", "Reference models and checks"
 
 VERBS = (
     Verb("demo", f"{_CLI}:demo_command", _TRAIN, "Demonstrate every step on the bundled release."),
@@ -16,40 +16,23 @@ VERBS = (
     Verb("models", f"{_MODELS}:models_command", _TRAIN, "List the bundled models."),
     Verb("watch", f"{_CLI}:watch_command", _TRAIN, "Play an episode and draw it as a GIF."),
     Verb("collect", f"{_MODELS}:collect_command", _TRAIN, "Record histories of an agent with a release's teammates."),
-    Verb("control", f"{_EXPERIMENTS}:control_command", _TRAIN, "Check that the models adapt in context."),
-    Verb("research tracks", f"{_EXPERIMENTS}:tracks_command", _PAPER, "Train and evaluate on both tracks."),
-    Verb(
-        "research sweep", f"{_EXPERIMENTS}:sweep_command", _PAPER, "Train and evaluate over sizes, or context lengths."
-    ),
-    Verb("research ablate", f"{_EXPERIMENTS}:ablate_command", _PAPER, "Train and evaluate with and without parts."),
-    Verb(
-        "research heldout-rl",
-        f"{_EXPERIMENTS}:heldout_rl_command",
-        _PAPER,
-        "Train, and evaluate with held-out teammates.",
-    ),
+    Verb("control", f"{_LAB}:control_command", _TRAIN, "Check that the models adapt in context."),
+    Verb("research tracks", f"{_LAB}:tracks_command", _PAPER, "Train and evaluate on both tracks."),
+    Verb("research sweep", f"{_LAB}:sweep_command", _PAPER, "Train and evaluate over sizes, or context lengths."),
+    Verb("research ablate", f"{_LAB}:ablate_command", _PAPER, "Train and evaluate with and without parts."),
+    Verb("research heldout-rl", f"{_LAB}:heldout_rl_command", _PAPER, "Train, and evaluate with held-out teammates."),
     Verb(
         "research reference",
         f"{_MODELS}:reference_command",
-        _REFERENCE,
+        _CHECKS,
         "Make reference models, with everything that they need.",
     ),
-    Verb(
-        "research headroom",
-        f"{_EXPERIMENTS}:headroom_command",
-        _REFERENCE,
-        "Measure the reference egos on every test task.",
-    ),
-    Verb(
-        "research drift",
-        f"{_EXPERIMENTS}:drift_command",
-        _REFERENCE,
-        "Measure the difference between cached and exact acting.",
-    ),
+    Verb("research headroom", f"{_LAB}:headroom_command", _CHECKS, "Measure the reference egos on every test task."),
+    Verb("research drift", f"{_LAB}:drift_command", _CHECKS, "Measure the difference between cached and exact acting."),
     Verb(
         "research unseen",
-        f"{_EXPERIMENTS}:unseen_command",
-        _REFERENCE,
+        f"{_LAB}:unseen_command",
+        _CHECKS,
         "Evaluate on rearranged layouts that no model was trained on.",
     ),
 )
