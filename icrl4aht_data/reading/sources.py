@@ -225,7 +225,7 @@ class FlatSource:
             gather_rows(array, first[:, None] + rows, out)
             return
         # Windows that end at most one step behind their history, at its row of zeros, are contiguous in the array.
-        # Copied as blocks, 64 windows of 500 state records take 0.2 ms; gathered row by row 2 ms.
+        # Copied as blocks, 64 windows of 500 state records take 60 microseconds; gathered row by row 120.
         if length <= len(array) and (rows + length - count[histories] <= 1).all():
             _copy_windows(array, first + rows, out)
             return
