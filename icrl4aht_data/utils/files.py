@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -239,8 +239,6 @@ def check_own_folder(folder: Path, names: Collection[str], what: str) -> None:
 
 T = TypeVar("T")
 
-_ATTEMPTS = 100  # to make a file in a folder that other processes remove just then
-
 
 @contextmanager
 def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
@@ -258,7 +256,8 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
         OSError: if the file cannot be made.
     """
     lock = FileLock(path, timeout=-1 if wait else 0)
-    in_new_folder(path, lock.acquire)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock.acquire()
     try:
         yield
     finally:
@@ -270,32 +269,6 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
 def lock_path(folder: Path) -> Path:
     """Path of a folder's lock: next to the folder, so that the folder can be renamed or removed meanwhile."""
     return folder.with_name(f".{folder.name}.lock")
-
-
-def in_new_folder(path: Path, create: Callable[[], T]) -> T:
-    """Call a function that creates a file, after making the file's folder; again, if another process has removed the
-    folder in between because it was empty.
-
-    Raises:
-        OSError: if the folder or the file cannot be made.
-    """
-    for _ in range(_ATTEMPTS):
-        with suppress(FileNotFoundError, FileExistsError):  # the second one if the folder was there, and then was not
-            path.parent.mkdir(parents=True, exist_ok=True)
-            return create()
-    path.parent.mkdir(parents=True, exist_ok=True)  # something else is wrong, and is raised
-    return create()
-
-
-def remove_empty_folders(folder: Path) -> None:
-    """Remove a folder and those below it, as far as they are empty. Symbolic links are not followed."""
-    if folder.is_symlink():
-        return
-    with suppress(OSError):
-        for path in folder.iterdir():
-            if path.is_dir():
-                remove_empty_folders(path)
-        folder.rmdir()
 
 
 LARGEST = 4 * 2**30
