@@ -346,6 +346,13 @@ UNSIGNED = Layout("unsigned", "test_unsigned", ("WWLWPWW", "0A   AX", "1     B",
 SURE = {"press_L_when_unknown": 1.0, "cost_sensitivity": 0.0}
 
 
+def links(key: jax.Array, n: int) -> list[int]:
+    """Return the data of a key after n splits, each of which keeps the first half."""
+    for _ in range(n):
+        key = jax.random.split(key)[0]
+    return jax.random.key_data(key).tolist()
+
+
 @pytest.mark.parametrize(
     ("theta", "memory", "fields", "expected", "steps"),
     [
