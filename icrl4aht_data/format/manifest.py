@@ -72,7 +72,9 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         IndexFormatError: if it lists nothing, or a line is wrong, which it names.
         UnsafePathError: for a path that leads out of the release, or is not that of a file which releases have.
     """
-    if text and not text.endswith("\n"):
+    if not text:
+        raise IndexFormatError(f"{path}: empty: expected a line for each file of the release; fetch it again")
+    if not text.endswith("\n"):
         raise IndexFormatError(f"{path}: cut off: its last line has no end; fetch it again")
     listed: dict[str, str] = {}
     folded: dict[str, str] = {}  # names as a disk compares them that ignores case

@@ -407,10 +407,10 @@ def test_damaged_manifests(kind, lite, tmp_path):
     for use in (load_icrl4aht, lambda url: plan_download(str(url))):
         with (
             served(kind, root) as (url, _),
-            pytest.raises(IndexFormatError, match="lists no file"),
+            pytest.raises(IndexFormatError, match="empty: expected a line for each file"),
         ):
             use(url)
-    with pytest.raises(IndexFormatError, match="lists no file"):
+    with pytest.raises(IndexFormatError, match="empty: expected a line for each file"):
         load_icrl4aht(root)
     with served(kind, lite[0]) as (url, server):
         assert server is not None
