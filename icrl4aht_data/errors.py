@@ -22,15 +22,15 @@ class EmptySelectionError(Icrl4ahtError, ValueError):
 
 
 class OptionError(Icrl4ahtError, ValueError):
-    """An option has an impossible value (a window of no steps, layouts whose observations differ in shape)."""
+    """An option has an invalid value, such as a window of 0 steps."""
 
 
 class PositionError(Icrl4ahtError, IndexError):
-    """A sequence of histories or episodes has no item at the position."""
+    """A position is out of range for a sequence of histories or episodes."""
 
 
 class PositionTypeError(Icrl4ahtError, TypeError):
-    """The position in a sequence of histories or episodes is neither an integer nor a slice."""
+    """A position in a sequence of histories or episodes is neither an integer nor a slice."""
 
 
 class LabelsMissingError(Icrl4ahtError):
@@ -42,15 +42,15 @@ class NotStoredError(Icrl4ahtError):
 
 
 class ReleaseError(Icrl4ahtError):
-    """A release cannot be read; base class of the errors that say why."""
+    """Base class of errors about a release that cannot be read."""
 
 
 class RootNotFoundError(ReleaseError, FileNotFoundError):
-    """The root is not a release folder."""
+    """The given folder is not a release."""
 
 
 class IndexFormatError(ReleaseError):
-    """meta/info.json, a line of meta/histories.jsonl, or another text file of meta/ is missing or malformed."""
+    """A text file in meta/, such as info.json or histories.jsonl, is missing or malformed."""
 
 
 class ChunkTableError(ReleaseError):
@@ -62,7 +62,7 @@ class ShardMissingError(ReleaseError, FileNotFoundError):
 
 
 class ShardUnreadableError(ReleaseError, OSError):
-    """A shard exists, but this user may not read it, or the disk fails."""
+    """A shard exists but cannot be read: no permission, or a disk error."""
 
 
 class ShardCorruptError(ReleaseError):
@@ -74,7 +74,7 @@ class ShardTruncatedError(ShardCorruptError):
 
 
 class ShardMismatchError(ReleaseError):
-    """Index, chunk table and shard disagree."""
+    """The index, the chunk table and the shard contradict one another."""
 
 
 class PublishedFormatError(ReleaseError):
@@ -93,9 +93,9 @@ class RemoteError(ReleaseError, OSError):
     """A remote failed after all retries, or returned content that differs from its manifest.
 
     Args:
-        message: names the address.
-        missing: whether the remote has no such file.
-        is_content: whether the remote answered, without the file or with another content.
+        message: the error message, with the address.
+        missing: whether the file does not exist on the remote.
+        is_content: whether the remote answered, but with a missing file or unexpected content.
     """
 
     def __init__(self, message: str, missing: bool = False, is_content: bool = False) -> None:
@@ -104,7 +104,7 @@ class RemoteError(ReleaseError, OSError):
 
 
 class OfflineError(ReleaseError):
-    """A file is not on this machine and may not be fetched: HF_HUB_OFFLINE or ICRL4AHT_OFFLINE is set."""
+    """A file is not on this machine, and HF_HUB_OFFLINE or ICRL4AHT_OFFLINE forbids fetching it."""
 
 
 class UnsafePathError(ReleaseError):
@@ -112,38 +112,38 @@ class UnsafePathError(ReleaseError):
 
 
 class CacheError(Icrl4ahtError):
-    """The cache folder has no room, cannot be written, or is not a folder."""
+    """The cache folder is full, not writable, or not a folder."""
 
 
 class DiskFullError(Icrl4ahtError, OSError):
-    """The disk that is written to is full; names the file or folder, the disk, and its free space."""
+    """The disk is full. The message names the file or folder, the disk, and its free space."""
 
 
 class UploadError(Icrl4ahtError):
-    """Uploading a release failed, or the repository's content differs from it; names the repository."""
+    """Uploading a release failed, or the repository differs from the release after the upload."""
 
 
 class PluginError(Icrl4ahtError):
-    """An object that another installed package registers cannot be used; names the package and the entry point."""
+    """An object registered by another installed package cannot be used."""
 
 
 class TaskFormatError(Icrl4ahtError, ValueError):
-    """A task line is malformed."""
+    """A line of a tasks file is malformed."""
 
 
 class WeakLabelsWarning(UserWarning):
-    """The expert actions of some tasks come from a policy that earns far less than the histories do at their end."""
+    """The expert of some tasks earns far less than the ego does at the end of its histories."""
 
 
 class MixedSplitsWarning(UserWarning):
-    """A sampler draws from histories of split `train` together with those of splits that judge a model."""
+    """A sampler draws training histories together with validation or test histories."""
 
 
-_LISTED, _COMPARED = 50, 1000  # names that an error lists, and names compared to find the nearest
+_LISTED, _COMPARED = 50, 1000  # numbers of valid names that an error lists, and that are searched for the nearest
 
 
 def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
-    """Return the error for a name that does not exist; it lists the valid names, and the nearest if one is close."""
+    """Return the error for an unknown name, which lists the valid names and suggests the nearest."""
     names = list(dict.fromkeys(valid))
     by_small_letters = {name.casefold(): name for name in reversed(names[:_COMPARED])}
     nearest = get_close_matches(str(found).casefold(), by_small_letters, n=1)

@@ -1,1 +1,1 @@
-"""The page `icrl4aht-data browse`: histories to look at in a web browser."""
+"""HTML pages of `icrl4aht-data browse`, which show histories in a web browser."""

@@ -1,4 +1,4 @@
-"""Drawings of a layout's states as lists of shapes, which a page draws without knowledge of the game."""
+"""Conversion of states to lists of shapes, which a page can draw without knowing the game."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from icrl4aht_data.overcooked.drawing import FOOTER, PAPER, VIEW, Canvas, Colour
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
-_DIGITS = 3  # of coordinates: a thousandth of a cell
+_DIGITS = 3  # decimals of coordinates, in cells
 
 
 class ShapeRecorder(Canvas):
-    """A canvas that records shapes, as lists of their kind and the arguments of the methods of `Canvas`.
+    """Canvas that records shapes as lists: the kind of shape, then the arguments of the method of `Canvas`.
 
     Attributes:
         shapes: ["box", x, y, width, height, fill, radius], ["disc", x, y, radius, fill, part],
@@ -53,19 +53,19 @@ def _rounded(value: float) -> float:
 
 
 def _distinct(rows: np.ndarray) -> list[list[int]]:
-    """The different rows among uint8 (N, K), for few columns much faster than `np.unique`."""
+    """Return the distinct rows of uint8 (N, K); much faster than `np.unique` for few columns."""
     found = np.zeros((256,) * rows.shape[1], bool)
     found[tuple(rows.T)] = True
     return np.argwhere(found).tolist()
 
 
 def hex_colour(colour: Colour) -> str:
-    """Return a colour as CSS writes it, such as #2b303a."""
+    """Return a colour in CSS notation, such as #2b303a."""
     return "#" + bytes(colour).hex()
 
 
 def layout_drawings(layout: Layout, records: np.ndarray) -> dict[str, Any]:
-    """Return everything that a page needs to draw these states of a layout, as JSON.
+    """Return a JSON object with the shapes that a page needs to draw these states of a layout.
 
     Args:
         layout: the layout.
@@ -75,9 +75,9 @@ def layout_drawings(layout: Layout, records: np.ndarray) -> dict[str, Any]:
         width, height: of the map, in cells; footer: height of the strip below it; paper: colour of the background.
         record_size: S.
         view: name of the part that outlines the cells that the ego observes.
-        parts: in the order in which they are drawn, see `StatePart`: [name, moves, anchor, columns].
-        drawings: name of a part -> the values of its columns, joined by commas -> its shapes, see `ShapeRecorder`,
-            relative to the centre of the cell. Only the values that are in the records.
+        parts: [name, moves, anchor, columns] of each part, in drawing order, see `StatePart`.
+        drawings: name of a part -> values of its columns, joined by commas -> shapes relative to the centre of the
+            cell, see `ShapeRecorder`; only for values in the records.
     """
     drawings: dict[str, dict[str, list]] = {}
     for part in state_parts(layout):

@@ -1,4 +1,4 @@
-"""Histories as compressed bytes and facts in JSON, for a page to decode: which ones, and which of their episodes."""
+"""Selection and compression of the histories and episodes that a page embeds."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from icrl4aht_data.overcooked.state import faults
 from icrl4aht_data.reading.history import History
 
 NO_ACTION = 255
-"""Action in an episode's last frame, the state after its last step."""
+"""Placeholder action of an episode's last frame, which shows the state after the last step."""
 
 
 class EmbeddedHistory(NamedTuple):
-    """A history as a page has it.
+    """One history in the form that a page embeds.
 
     Attributes:
-        facts: the history in JSON: what a person chooses it by; `returns` of all episodes; `shown`, the numbers from 0
-            of the episodes with frames; `frames`, how many each of them has, one more than steps; `columns`, the names
-            of the columns that follow the state record's.
+        facts: JSON object: properties to choose a history by; `returns` of all episodes; `shown`, the numbers of the
+            episodes with frames, from 0; `frames` per episode, one more than its steps; `columns`, the names of the
+            columns after those of the state record.
         records: uint8 (F, S), the state records of all frames.
-        data: the columns of F bytes each, those of the state record and `columns`, compressed by zlib. The action in
-            an episode's last frame is `NO_ACTION` and its reward 0; rewards are int8.
+        data: columns of F bytes each, compressed by zlib: those of the state record, then `columns`. Rewards are int8.
+            The last frame of an episode has action `NO_ACTION` and reward 0.
     """
 
     facts: dict[str, Any]
@@ -39,10 +39,7 @@ class EmbeddedHistory(NamedTuple):
 
 
 def spread_histories(dataset: Dataset, count: int) -> list[int]:
-    """Return the ids of at most `count` histories, ascending: of all layouts, and on each of all teammates and sources.
-
-    Layouts take turns, and on each layout its kinds of teammates and sources do.
-    """
+    """Return the ids of at most `count` histories, ascending, spread over layouts, kinds of teammates and sources."""
     groups: dict[str, dict[tuple[str, ...], list[int]]] = {}
     names = ("layout", "source", "teammate_family", "teammate_kind")
     for number, layout, *group in zip(dataset.ids.tolist(), *(dataset.column(n).tolist() for n in names), strict=True):
@@ -51,23 +48,23 @@ def spread_histories(dataset: Dataset, count: int) -> list[int]:
 
 
 def _alternating(lists: Iterable[list[int]]) -> list[int]:
-    """The first elements of all lists, then the second ones, and so on."""
+    """Return the first elements of all lists, then the second ones, and so on."""
     return [number for turn in zip_longest(*lists) for number in turn if number is not None]
 
 
 def spread_episodes(episodes: int, most: int | None) -> np.ndarray:
-    """Return numbers of at most `most` of a history's episodes, evenly spaced, the first and the last among them."""
+    """Return the numbers of at most `most` evenly spaced episodes of a history, including the first and the last."""
     if most is None or most >= episodes:
         return np.arange(episodes)
     return np.unique(np.linspace(0, episodes - 1, max(2, most)).round().astype(int))
 
 
 def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
-    """Return a history as a page has it, with frames of all its episodes, or of `most` of them.
+    """Return a history for embedding, with frames of all its episodes or at most `most` of them.
 
     Raises:
         NotStoredError: if the release has no state records.
-        ReleaseError: if the release cannot be read, or has states or actions that cannot be.
+        ReleaseError: if the release cannot be read, or has impossible states or actions.
     """
     entry, rewards, dones = history.entry, history.read("rewards"), history.read("dones")
     ends = np.flatnonzero(dones) + 1
@@ -75,7 +72,7 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     starts, shown = np.concatenate([[0], ends[:-1]]), spread_episodes(len(ends), most)
     steps = np.concatenate(
         [np.arange(int(starts[e]), int(ends[e]) + 1) for e in shown]
-    )  # an episode's last row is not a step
+    )  # no step follows the last frame of an episode
     last = np.cumsum(ends[shown] + 1 - starts[shown]) - 1
     steps[last] -= 1
 
@@ -89,7 +86,8 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
         values[name] = history.read(name)[steps].astype(np.uint8)
         _check(history, int(values[name].max()) < len(ACTIONS), f"{name} below {len(ACTIONS)}", values[name].max())
         values[name][last] = NO_ACTION
-    columns = np.vstack([records.T, *values.values()])  # equal columns of successive frames compress best
+    # Column-major order compresses best, since columns change little over time.
+    columns = np.vstack([records.T, *values.values()])
     facts = {
         **_index_facts(entry),
         "returns": episode_returns(rewards, dones).tolist(),
@@ -109,7 +107,7 @@ def _check(history: History, fulfilled: bool, expected: str, found: object) -> N
 
 
 def _embedded_actions(entry: Entry) -> list[str]:
-    """The action fields of a history; not the oracle's of a noise history whose expert, the oracle, has the same."""
+    """Return the action fields to show, without `oracle_actions` if they equal `expert_actions`."""
     names = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
     twice = entry.source == "noise" and "expert_actions" in names
     return [name for name in names if not (twice and name == "oracle_actions")]

@@ -1,4 +1,4 @@
-"""One self-contained HTML file with histories: their learning curves, and their episodes to watch."""
+"""Self-contained HTML page that shows learning curves of histories and replays their episodes."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.text import counted_histories
 
 PAGE_START = b'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>ICRL4AHT histories</title>'
-"""First bytes of a page, by which it is recognised before it is replaced."""
+"""First bytes of a page, which identify a file that may be replaced."""
 
 PAGE_HISTORIES = 30
-"""Histories on a page, unless another number is chosen."""
+"""Default number of histories on a page."""
 
 PAGE_MEGABYTES = 5
-"""Size below which a page stays, unless another one is chosen."""
+"""Default maximum size of a page, in MB."""
 
 _FILES = Path(__file__).parent
 
 
 @dataclass(frozen=True)
 class BrowserPage:
-    """A page with histories.
+    """HTML page with histories.
 
     Attributes:
         html: the complete file, UTF-8.
-        histories: number of histories on it.
-        episodes: number of their episodes.
-        shown_episodes: number of episodes that can be watched.
+        histories: number of histories on the page.
+        episodes: number of episodes of these histories.
+        shown_episodes: number of episodes that the page can replay.
     """
 
     html: bytes = field(repr=False)
@@ -54,10 +54,10 @@ class BrowserPage:
 
 
 def check_drawable(dataset: Dataset) -> None:
-    """Check that a release has what is needed to draw its episodes.
+    """Check that the episodes of a release can be drawn.
 
     Raises:
-        NotStoredError: if it has no state records.
+        NotStoredError: if the release has no state records.
     """
     if not dataset.has_states:
         raise NotStoredError(
@@ -74,17 +74,17 @@ def make_browser_page(
 ) -> BrowserPage:
     """Return a page with all histories of a selection; see `spread_histories` for a smaller one.
 
-    Every episode can be watched if the page stays below its size; if not, episodes of each history, evenly spaced, the
-    first and the last among them. The page says which.
+    Embeds all episodes if the page stays below `megabytes`; else evenly spaced episodes of each history, including the
+    first and the last. The page says which episodes can be watched.
 
     Args:
         dataset: the histories.
-        megabytes: the size, in millions of bytes.
-        advance: called with the number of histories that were read, and of those to read.
+        megabytes: maximum size of the page, in millions of bytes.
+        advance: called with the number of histories read and the total number to read.
 
     Raises:
         NotStoredError: if the release has no state records.
-        OptionError: if the page would be larger even with two episodes a history.
+        OptionError: if the page would be too large even with two episodes per history.
         ReleaseError: if the release cannot be read.
     """
     check_drawable(dataset)
@@ -109,7 +109,7 @@ def make_browser_page(
 
 
 def save_browser_page(page: BrowserPage, path: Path) -> None:
-    """Write a page, which appears complete or not at all."""
+    """Write a page atomically."""
     with atomic_write(path) as partial:
         partial.write_bytes(page.html)
 
@@ -134,7 +134,7 @@ def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
         release=escape(_release_name(dataset)),
         style=f":root {{ {style}}}\n{_source('page.css')}",
         script="\n".join(_source(name) for name in ("state.js", "curve.js", "page.js")),
-        data=json.dumps(data),  # base64 only: nothing in it can end the element
+        data=json.dumps(data),  # base64 cannot contain a closing tag
     )
     return text.encode()
 
@@ -146,14 +146,14 @@ def _release_facts(dataset: Dataset) -> dict[str, Any]:
 
 
 def _teammate(dataset: Dataset, history_id: int) -> str:
-    """The teammate's family, kind and, where the release has its tasks, its number among those of the kind."""
+    """Return the family and kind of a history's teammate, with its number if the release has tasks."""
     entry = dataset.index.entry(history_id)
     name = f"{entry.teammate_family}/{entry.teammate_kind}"
     return f"{name} t{dataset.recover_teammate(history_id)['theta_id']}" if dataset.knows_tasks else name
 
 
 def _release_name(dataset: Dataset) -> str:
-    """The address of a remote release, or the name of a folder without its path, which others do not have."""
+    """Return the address of a remote release, or the name of a local folder without its path."""
     return str(dataset.origin) if dataset.origin.remote else dataset.root.resolve().name
 
 

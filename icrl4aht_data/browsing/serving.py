@@ -1,4 +1,4 @@
-"""A web server for one page, which only this machine reaches."""
+"""Local web server for one page."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from icrl4aht_data.errors import OptionError
 
 LOOPBACK = "127.0.0.1"
-"""Address of this machine, which others do not reach."""
+"""Loopback address, which other machines cannot reach."""
 
 
 def page_server(html: bytes, port: int = 0) -> ThreadingHTTPServer:
     """Return a server of one page on the loopback interface; its `serve_forever` answers requests.
 
     Args:
-        html: the page; every other path than / is not found.
-        port: the port; 0 for a free one, which is then `server_port`.
+        html: the page, served at /; other paths return 404.
+        port: the port; 0 chooses a free one, see the server's `server_port`.
 
     Raises:
         OptionError: if the port cannot be used.
@@ -32,7 +32,7 @@ def page_server(html: bytes, port: int = 0) -> ThreadingHTTPServer:
             self.wfile.write(content)
 
         def log_message(self, format: str, *args: object) -> None:
-            """Print nothing: the command's output is the address."""
+            """Log no requests, since the command prints the address only."""
 
     try:
         return ThreadingHTTPServer((LOOPBACK, port), Handler)

@@ -1,8 +1,7 @@
-"""Arrays built once and kept in the cache folder as plain .npy files, shared by processes, bounded in size.
+"""Cache of arrays as .npy files, shared by processes and limited in size.
 
-A set of arrays is a folder whose name has a hash of what the arrays were made of. It is written under another name and
-renamed when it is complete. Damage that sizes and headers do not show is not looked for: remove the folder if a disk
-has failed.
+A set of arrays is a folder whose name contains a hash of its inputs. The folder is written under a temporary name and
+renamed when complete. Only sizes and headers are checked when it is read: delete the cache after a disk failure.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from icrl4aht_data.utils.files import NO_ROOM, add_filename, allocate
 from icrl4aht_data.utils.system import CACHE_VARIABLES, cache_folder, cache_limit
 
 _CONTENTS = "contents.json"  # name -> [dtype, shape] of every array
-_KEY = re.compile(r"[a-z]+(-\d+)?-[0-9a-f]{32,64}")  # nothing else in the cache folder is removed to make room
-_ABANDONED = 24 * 3600  # seconds after which an unfinished set is taken for one of a killed process
+_KEY = re.compile(r"[a-z]+(-\d+)?-[0-9a-f]{32,64}")  # only folders that match are evicted
+_ABANDONED = 24 * 3600  # seconds after which an unfinished set counts as left by a killed process
 
 Arrays = dict[str, np.ndarray]
 
 
 def cache_room() -> int:
-    """Return the bytes that one more set may take by the limit and the disk; 0 if the folder cannot be written."""
+    """Return the maximum size in bytes of a new set of arrays; 0 if the cache folder is not writable."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):  # permissions alone do not say whether it can be written
+        with tempfile.TemporaryFile(dir=folder):  # permissions alone do not show whether a folder is writable
             pass
         reusable = sum(size for _, size in _cached_sets(folder))
         return min(cache_limit(), shutil.disk_usage(folder).free + reusable)
@@ -45,19 +44,19 @@ def cache_room() -> int:
 
 
 def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
-    """Return the arrays of a key, memory-mapped read-only, built first if they are not cached.
+    """Return the cached arrays of a key, memory-mapped and read-only; build them first if needed.
 
-    Sets that were not used for longest are removed while the folder would exceed its limit, or the disk is full;
-    processes that have them mapped can still read them.
+    Removes the least recently used sets if the cache would exceed its limit or fill the disk. Processes that have
+    mapped a removed set can still read it.
 
     Args:
-        key: identifies the content; a file name that matches `<letters>-<number>-<hash>`, the number may be left out.
+        key: identifies the content; a file name of the form `<letters>-<number>-<hash>` or `<letters>-<hash>`.
         size: approximate size of the arrays in bytes.
         build: called with a new folder, into which it writes `<name>.npy` files.
 
     Raises:
         OptionError: if the arrays alone exceed the limit.
-        CacheError: if the folder cannot be written, or the disk has no room; nothing is left there.
+        CacheError: if the folder is not writable or the disk is full; unfinished files are removed.
     """
     assert _KEY.fullmatch(key), key
     folder = cache_folder() / key
@@ -81,7 +80,7 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
 
 
 def new_mapped_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:
-    """Return a writable array of zeros in a new .npy file, whose space on the disk is allocated.
+    """Create a .npy file with its disk space allocated, and return it as a writable memory map of zeros.
 
     Raises:
         OSError: if the disk is full or not writable; names the file.
@@ -94,7 +93,7 @@ def new_mapped_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.
 
 
 def _open(folder: Path) -> Arrays | None:
-    """Return the arrays of a folder and mark it as used; None without them, or if a size or header is wrong."""
+    """Return the arrays of a folder and mark it as used; None if it is missing or a size or header is wrong."""
     arrays = {}
     if not all(path.is_file() for path in (folder / _CONTENTS, *folder.glob("*.npy"))):  # opening a pipe would hang
         return None
@@ -107,7 +106,7 @@ def _open(folder: Path) -> Arrays | None:
             arrays[name] = np.asarray(array)
     except (OSError, ValueError, AttributeError):
         return None
-    with suppress(OSError):  # another user's folder, or removed meanwhile: the mapping stays valid
+    with suppress(OSError):  # the folder belongs to another user or was just removed; the mapping stays valid
         os.utime(folder)
     return arrays
 
@@ -117,7 +116,7 @@ def _describe(array: np.ndarray) -> list:
 
 
 def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> Arrays:
-    """Build a set of arrays in `scratch` and rename it, unless another process was quicker; return the arrays."""
+    """Build a set of arrays in `scratch`, rename it unless another process was faster, and return the arrays."""
     new = scratch / "new"
     new.mkdir()
     build(new)
@@ -128,9 +127,9 @@ def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> Arrays
         arrays = _open(folder)
         if arrays is not None:
             return arrays
-        with suppress(OSError):  # a damaged set, or anything else of that name
+        with suppress(OSError):  # a damaged set, or another file or folder of that name
             folder.rename(scratch / "damaged")
-        with suppress(OSError):  # another process has renamed its own meanwhile
+        with suppress(OSError):  # another process has just renamed its own set
             new.rename(folder)
     arrays = _open(folder)
     if arrays is None:
@@ -139,7 +138,7 @@ def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> Arrays
 
 
 def _unusable(folder: Path, size: int, error: OSError) -> CacheError:
-    """Return the error for arrays that cannot be written to the cache folder."""
+    """Return a `CacheError` for a failed write to the cache folder."""
     if error.errno in NO_ROOM:
         free = ""
         with suppress(OSError):
@@ -161,17 +160,17 @@ def _cached_sets(folder: Path) -> list[tuple[Path, int]]:
     found = []
     for path in folder.iterdir():
         if _KEY.fullmatch(path.name) and path.is_dir():
-            with suppress(OSError):  # another process has removed it
+            with suppress(OSError):  # just removed by another process
                 size = sum(file.stat().st_size for file in path.glob("*.npy"))
                 found.append((path.stat().st_mtime_ns, path, size))
     return [(path, size) for _, path, size in sorted(found)]
 
 
 def _make_room(folder: Path, size: int) -> None:
-    """Remove what killed processes left, then the least recently used sets until `size` more bytes fit.
+    """Remove files of killed processes, then the least recently used sets until `size` more bytes fit.
 
     Raises:
-        OSError: if the disk has no room for them even without those sets.
+        OSError: if the disk has too little space even after that.
     """
     for left in folder.glob(".*.partial-*"):
         with suppress(OSError):
@@ -186,5 +185,5 @@ def _make_room(folder: Path, size: int) -> None:
         if excess <= 0:
             return
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.partial-", dir=folder) as scratch, suppress(OSError):
-            path.rename(Path(scratch) / "removed")  # atomic, so that no process opens half of a set
+            path.rename(Path(scratch) / "removed")  # renaming is atomic: no process opens a partly removed set
             excess -= bytes_

@@ -1,4 +1,4 @@
-"""Checkpoints in a release: of learned teammates, which a suite of populations has too, and of egos as experts."""
+"""Paths and files of checkpoints: learned teammates of a release or a suite, and expert egos of a release."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from icrl4aht_data.format.schema import EXPERTS, TEAMMATES
 from icrl4aht_data.utils.files import plain_size, resolve_inside
 
 CHECKPOINT_BYTES = 64 * 2**20
-"""Most bytes of each file of a checkpoint, sixty times the paper's network."""
+"""Maximum size in bytes of a checkpoint file, sixty times the size of the paper's network."""
 
 
 def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
-    """Return the folder of a learned teammate's checkpoint: named by its hash in a release, by its path in a suite.
+    """Return the checkpoint folder of a learned teammate; named by hash in a release, by path in a suite.
 
     Args:
         folder: TEAMMATES of a release, or a suite.
@@ -26,7 +26,7 @@ def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
 
 
 def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict[str, Path]:
-    """Return the files of a task's learned teammate.
+    """Return the checkpoint files of a task's learned teammate.
 
     Args:
         folder: see `checkpoint_folder`.
@@ -47,12 +47,12 @@ def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict
 
 
 def expert_folder(sha256: str) -> str:
-    """Return the folder of an ego's checkpoint in a release, by the SHA-256 of its weights."""
+    """Return the path in a release of an expert's checkpoint folder, which is named by the SHA-256 of its weights."""
     return f"{EXPERTS}/{sha256}"
 
 
 def expert_files(folder: Path, sha256: str, root: Path | None = None) -> dict[str, Path]:
-    """Return the files of the ego's checkpoint that the expert actions of a task come from.
+    """Return the checkpoint files of the ego whose policy labelled a task's histories with expert actions.
 
     Args:
         folder: the checkpoint's folder, in a release `expert_folder`.

@@ -1,7 +1,7 @@
-"""Chunks of a shard: the chunk table that locates them, and the codec of their bytes.
+"""Chunk tables, which locate a shard's chunks, and the encoding of chunks.
 
-A shard is an HDF5 file, but is read without libhdf5: the chunk table gives the position, size and hash of every chunk,
-and the codec reverses HDF5's shuffle and deflate filters.
+A shard is an HDF5 file, but is read without libhdf5: the chunk table has the position, size and hash of every chunk,
+and this module reverses HDF5's shuffle and deflate filters.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
     import h5py  # takes 50 ms to import, and reading does not need it
 
 BETWEEN = 2048
-"""Most bytes between chunks that one row of the chunk table covers, and so the cost of repairing a fault there."""
+"""Maximum bytes of HDF5 metadata per row of the chunk table, fetched again as one piece if damaged."""
 
 DEFLATE_RATIO = 1100
-"""Upper bound of inflated bytes per deflated byte."""
+"""Upper bound of the compression ratio of deflate."""
 
 DEFLATE_LEVEL = 8
 """Compression level of chunks."""
 
 _POSITION = struct.Struct("<QIII")  # the start of a row; its hash follows
-_TABLE_BYTES = 256 * 2**20  # a thousand times the chunk table of a shard of usual size
-_ROW_BYTES = 16 * 2**20  # most stored bytes that one row may cover, thirty times our largest chunk
+_TABLE_BYTES = 256 * 2**20  # a thousand times the size of a usual chunk table
+_ROW_BYTES = 16 * 2**20  # maximum bytes of a stored chunk, thirty times our largest one
 
 
 def chunk_table_name(shard: str) -> str:
-    """Return the path in the release of a shard's chunk table.
+    """Return the path of a shard's chunk table, relative to the release folder.
 
     Args:
         shard: path in the release, `data/...h5`.
@@ -49,10 +49,10 @@ def chunk_table_path(root: Path, shard: str) -> Path:
 
 
 def read_table(path: Path) -> np.ndarray:
-    """Return a chunk table (rows,) of `CHUNK_DTYPE`, mapped from its file because it may be too large for memory.
+    """Return a chunk table (rows,) of `CHUNK_DTYPE`, memory-mapped because it may be large.
 
     Raises:
-        ChunkTableError: if it is missing, or not a chunk table.
+        ChunkTableError: if the file is missing or not a chunk table.
     """
     try:
         if path.stat().st_size > _TABLE_BYTES:
@@ -70,7 +70,7 @@ def read_table(path: Path) -> np.ndarray:
 
 
 def chunk_locations(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
-    """Return (offset, size, rows) of a history's chunks according to HDF5, in the order of the chunk table."""
+    """Return (offset, size, rows) of each chunk of a history as HDF5 reports it, in the order of the chunk table."""
     locations = []
     for field in entry.stored_fields(kind):
         dataset: Any = file[f"{entry.h5_group}/{field.name}"]
@@ -82,19 +82,19 @@ def chunk_locations(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int
 
 
 def chunk_hash(data: bytes) -> bytes:
-    """Return the hash of stored bytes in a chunk table: BLAKE2b of 16 bytes."""
+    """Return the 16-byte BLAKE2b hash of a stored chunk."""
     return hashlib.blake2b(data, digest_size=16).digest()
 
 
 def check_chunk(data: bytes, row: np.void) -> None:
-    """Check stored bytes against their row of the chunk table: their size, CRC-32, and hash.
+    """Check the size, CRC-32 and hash of a stored chunk against its row in the chunk table.
 
     Args:
-        data: the bytes read from `row["offset"]` on.
+        data: the bytes at `row["offset"]` in the shard.
         row: a row of `CHUNK_DTYPE`.
 
     Raises:
-        ValueError: says what differs, what was expected, and what was found.
+        ValueError: if the size, CRC-32 or hash differs; with the expected and the found value.
     """
     stored = row.tobytes()  # twice as fast as access by field names
     _, size, _, crc32 = _POSITION.unpack_from(stored)
@@ -107,10 +107,10 @@ def check_chunk(data: bytes, row: np.void) -> None:
 
 
 def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
-    """Return the bytes of a chunk after HDF5's shuffle and deflate filters.
+    """Encode a chunk with HDF5's shuffle and deflate filters.
 
     Args:
-        rows: the chunk's rows, C-contiguous; may be fewer than `length`, then zeros follow.
+        rows: the chunk's rows, C-contiguous; padded with zeros if fewer than `length`.
         length: rows of the chunk.
         itemsize: bytes of one element.
     """
@@ -124,7 +124,7 @@ def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
 
 
 def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
-    """Return the bytes of a chunk's elements from its stored bytes.
+    """Decode a stored chunk: inflate it and reverse the shuffle filter.
 
     Args:
         data: stored bytes.
@@ -141,8 +141,8 @@ def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
         raise ValueError(str(error)) from error
     if len(raw) != size or inflater.decompress(inflater.unconsumed_tail, 1) or not inflater.eof:
         raise ValueError(f"does not inflate to {size} bytes")
-    if inflater.unused_data:  # what follows could give any content any checksum
-        raise ValueError(f"{len(inflater.unused_data)} bytes behind the end of the deflate stream")
+    if inflater.unused_data:  # extra bytes could be chosen to forge the checksum
+        raise ValueError(f"{len(inflater.unused_data)} bytes after the end of the deflate stream")
     if itemsize > 1:
         raw = np.frombuffer(raw, np.uint8).reshape(itemsize, -1).T.tobytes()
     return raw

@@ -1,4 +1,4 @@
-"""meta/histories.jsonl as columns: decoded and checked block by block, kept in the cache folder."""
+"""Columns of meta/histories.jsonl: decoded and checked block by block, and kept in the cache folder."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from icrl4aht_data.utils.files import LARGEST, LINE_BYTES, plain_size, wrap_read
 from icrl4aht_data.utils.hashes import file_hash
 
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source")
-"""The entry fields that can be filtered by."""
+"""Entry fields that histories can be filtered by."""
 
 _VERSION = 3  # of the cached columns
-_UNCACHED = 2**20  # bytes: a smaller index is decoded as quickly as its columns are opened
+_UNCACHED = 2**20  # bytes; decoding a smaller index is as fast as opening cached columns
 _BLOCK = 2**19  # bytes decoded at a time
 
-_DERIVED = ("history_id", "obs_shape")  # checked, but not stored: they follow from the row and the layout
+_DERIVED = ("history_id", "obs_shape")  # checked but not stored, since the row number and the layout determine them
 _DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64, float | None: np.float64}
 _NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name not in _DERIVED}
 _OPTIONAL = {name: hint for name, hint in ENTRY_HINTS.items() if hint in (int | None, float | None)}
@@ -38,17 +38,17 @@ _DECODER = msgspec.json.Decoder(Entry)
 
 
 class Columns(Sequence[Entry]):
-    """The index as arrays with one row per history; also the sequence of its entries, which are made on access.
+    """Index of a release as columns with one row per history; a sequence of `Entry`, each made on access.
 
-    A string column is int32 codes into its values; None is -1 among integers and NaN among floats. Histories
-    that agree in all of `QUERY_FIELDS` form a combination.
+    A string column has int32 codes of its distinct values. None is stored as -1 in integer columns and as NaN in float
+    columns. Histories with equal values of all `QUERY_FIELDS` form a combination.
 
     Args:
         arrays: every column by name; see `combinations`, `order` and `starts`.
 
     Attributes:
         combinations: int64 (N, 7), codes of `QUERY_FIELDS`.
-        order: int64 (H,), the rows combination by combination, ascending within each.
+        order: int64 (H,), row numbers sorted by combination, ascending within each.
         starts: int64 (N + 1,), position of each combination's first row in `order`.
     """
 
@@ -66,15 +66,15 @@ class Columns(Sequence[Entry]):
         self.__init__(arrays)
 
     def column(self, name: str) -> np.ndarray:
-        """Return a number column's values (H,), or a string column's codes (H,)."""
+        """Return a column (H,): the values of a number column, the codes of a string column."""
         return self._arrays[name]
 
     def values(self, name: str) -> list[str]:
-        """Return the distinct values of a string column, by code, in order of first appearance."""
+        """Return the distinct values of a string column, in the order of their codes."""
         return [value.decode() for value in self._arrays[f"{name}.values"].tolist()]
 
     def code(self, name: str, value: str) -> int | None:
-        """Return the code of a string column's value, found by bisection; None if no line has it."""
+        """Return the code of a string column's value; None if no history has it."""
         values, ascending = self._arrays[f"{name}.values"], self._arrays[f"{name}.sorted"]
         wanted = value.encode()
         if len(wanted) > values.itemsize:
@@ -85,11 +85,11 @@ class Columns(Sequence[Entry]):
         return int(ascending[position])
 
     def rows(self, combination: int) -> np.ndarray:
-        """Return the rows of one combination, ascending."""
+        """Return the row numbers of a combination's histories, ascending."""
         return self.order[self.starts[combination] : self.starts[combination + 1]]
 
     def shard_rows(self, shard: str) -> np.ndarray:
-        """Return the rows of one shard, ascending."""
+        """Return the row numbers of a shard's histories, ascending."""
         code = self.code("shard", shard)
         if code is None:
             return self.order[:0]
@@ -116,16 +116,16 @@ class Columns(Sequence[Entry]):
 
 
 def read_columns(path: Path) -> Columns:
-    """Return the columns of an index file, from the cache folder if the file is large and was read before.
+    """Return the columns of an index file; those of a large file are cached on disk.
 
     Raises:
-        IndexFormatError: names the file and the line.
+        IndexFormatError: if a line is malformed; with the file and the line number.
     """
     with wrap_read_errors(path):
         size = plain_size(path, LARGEST)
         if size < _UNCACHED:
             return Columns(_parse(path))
-        key = f"index-{_VERSION}-{file_hash(path)}"  # as the manifest lists it
+        key = f"index-{_VERSION}-{file_hash(path)}"  # as in the manifest
     parsed: dict[str, np.ndarray] = {}
 
     def build(folder: Path) -> None:
@@ -135,12 +135,12 @@ def read_columns(path: Path) -> Columns:
 
     try:
         return Columns(cached_arrays(key, size, build))
-    except (CacheError, OptionError):  # there is no cache folder, or it is too small
+    except (CacheError, OptionError):  # the cache folder is missing or too small
         return Columns(parsed or _parse(path))
 
 
 def _parse(path: Path) -> dict[str, np.ndarray]:
-    """Return every array of `Columns`."""
+    """Read an index file and return the arrays of `Columns` by name."""
     codes = {name: _Codes() for name in (*_STRINGS, "obs_shape")}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
     first = 0
@@ -163,7 +163,7 @@ def _parse(path: Path) -> dict[str, np.ndarray]:
 
 
 def _blocks(path: Path) -> Iterator[bytes]:
-    """Yield the file in blocks of complete lines, without the newline after the last one."""
+    """Yield blocks of complete lines of a file, each without its last newline."""
     with wrap_read_errors(path), path.open("rb") as stream:
         while text := stream.read(_BLOCK):
             text += stream.readline(LINE_BYTES)
@@ -173,9 +173,9 @@ def _blocks(path: Path) -> Iterator[bytes]:
 
 
 def _decode(text: bytes, first: int, path: Path) -> list[Entry]:
-    """Return the entries of a block of lines, the first of which has number `first`, from 0."""
+    """Return the entries of a block of lines; `first` is the number of its first line, counted from 0."""
     newlines = text.count(b"\n")
-    # Every line starts an object. Without this the decoder would accept an object that spans two lines.
+    # Without this check, the decoder would accept an object that spans two lines.
     if text.count(b"\n{") == newlines:
         try:
             entries = _DECODER.decode_lines(text)
@@ -184,7 +184,7 @@ def _decode(text: bytes, first: int, path: Path) -> list[Entry]:
         except (msgspec.MsgspecError, UnicodeDecodeError):
             pass
     entries = []
-    for number, line in enumerate(text.split(b"\n"), start=first + 1):  # to find the malformed line
+    for number, line in enumerate(text.split(b"\n"), start=first + 1):  # decode line by line to find the malformed one
         try:
             entries.append(_DECODER.decode(line.decode()))
         except UnicodeDecodeError as error:
@@ -195,7 +195,7 @@ def _decode(text: bytes, first: int, path: Path) -> list[Entry]:
 
 
 class _LineError(Icrl4ahtError):
-    """A problem with one line of a block."""
+    """Error about one line of a block, at `row`."""
 
     def __init__(self, row: int, problem: object) -> None:
         super().__init__(str(problem))
@@ -203,7 +203,7 @@ class _LineError(Icrl4ahtError):
 
 
 class _Codes(dict[Any, int]):
-    """Value -> code. A value that is looked up for the first time gets the next code."""
+    """Mapping of values to codes, in which a new value gets the next code when it is looked up."""
 
     def __missing__(self, value: Any) -> int:
         if isinstance(value, str):
@@ -216,12 +216,12 @@ def _encode(entries: list[Entry], codes: dict[str, _Codes], first: int) -> dict[
     """Return the columns of a block of entries, after checking them.
 
     Args:
-        entries: valid one by one, as far as types and bounds go.
-        codes: of the coded fields; new values are added.
+        entries: entries with valid types and bounds.
+        codes: codes of each string field; new values are added.
         first: the number of the first line, counted from 0.
 
     Raises:
-        _LineError: for a name that is not printable, a wrong id, or fields that contradict one another.
+        _LineError: if a name is not printable, an id is wrong, or fields contradict one another.
     """
     values: dict[str, Sequence[Any]] = dict(
         zip(ENTRY_HINTS, zip(*map(msgspec.structs.astuple, entries), strict=True), strict=True)
@@ -245,7 +245,7 @@ def _encode(entries: list[Entry], codes: dict[str, _Codes], first: int) -> dict[
         raise _LineError(row, f"expected action_dim {len(ACTIONS)}, found {values['action_dim'][row]}")
     for row in np.flatnonzero(block["episodes"] > block["T"]).tolist():
         raise _LineError(row, f"{values['episodes'][row]} episodes in {values['T'][row]} steps")
-    # Histories of one task agree in the related fields, so that few combinations are left to check.
+    # The histories of a task agree in these fields, so few combinations have to be checked.
     combinations = np.zeros(len(entries), np.int64)
     for name in _RELATED:
         combinations = np.unique(combinations * len(codes[name]) + block[name], return_inverse=True)[1]
@@ -260,7 +260,7 @@ def _encode(entries: list[Entry], codes: dict[str, _Codes], first: int) -> dict[
 def _check_related(
     track: str, split: str, layout: str, family: str, obs_shape: tuple[int, int, int], shard: str
 ) -> None:
-    """Check the fields of an entry that depend on one another.
+    """Check that the track, family, shape and shard path of an entry fit its layout and split.
 
     Raises:
         IndexFormatError, UnknownNameError: without file and line, which the caller adds.
@@ -276,7 +276,7 @@ def _check_related(
 
 
 def _group_rows(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the rows of every combination of the query fields, and of every shard."""
+    """Return arrays that list the rows of each combination of query fields, and of each shard."""
     sizes = [max(1, len(arrays[f"{name}.values"])) for name in QUERY_FIELDS]
     keys = np.zeros(len(arrays["T"]), np.int64)
     for name, size in zip(QUERY_FIELDS, sizes, strict=True):

@@ -1,4 +1,4 @@
-"""A release's index: meta/info.json and meta/histories.jsonl, read, checked, and queried."""
+"""Reading and querying the index of a release: meta/info.json and meta/histories.jsonl."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_histories
 
 ALIASES = {"algorithm": "teammate_kind"}
-"""Other names of filters: the kind of a learned teammate is the algorithm that trained it."""
+"""Other names of filters: the kind of a learned teammate is its training algorithm."""
 
 _KNOWN_VALUES: dict[str, Callable[[], Sequence[str]]] = {
     "split": lambda: SPLITS,
@@ -31,7 +31,7 @@ _KNOWN_VALUES: dict[str, Callable[[], Sequence[str]]] = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Index:
-    """A release's index.
+    """Index of a release.
 
     Args:
         root: the release folder.
@@ -50,7 +50,7 @@ class Index:
         """Return the entry of one history.
 
         Raises:
-            UnknownNameError: if there is none.
+            UnknownNameError: if no history has this id.
             OptionError: if the id is not an integer.
         """
         number = check_int("history_id", history_id, -(2**63))
@@ -63,17 +63,17 @@ class Index:
         return self.entries.values(name)
 
     def query(self, **wanted: str | Sequence[str] | None) -> np.ndarray:
-        """Return the ids int64 (N,), ascending, of the histories with the wanted values of fields; None means any.
+        """Return the ids of the histories with the wanted field values, int64 (N,), ascending.
 
-        The time grows with the number of combinations of fields and of ids found, not with the number of histories.
+        The time depends on the number of combinations and of matching histories, not on the size of the release.
 
         Args:
-            wanted: field of `QUERY_FIELDS` or `ALIASES` -> a value or several.
+            wanted: field of `QUERY_FIELDS` or `ALIASES` -> one value or several; None accepts any.
 
         Raises:
-            UnknownNameError: for a field or a value that the benchmark does not know; lists the valid ones.
-            EmptySelectionError: for valid values that no history of this release has; says what exists.
-            OptionError: for a mapping.
+            UnknownNameError: if a field or value does not exist in the benchmark; lists the valid ones.
+            EmptySelectionError: if no history of this release has these values; lists what exists.
+            OptionError: if a value is a mapping.
         """
         filters = {name: value for name, value in wanted.items() if value is not None}
         combinations = self.entries.combinations
@@ -99,11 +99,12 @@ class Index:
         return ids if (np.diff(ids) > 0).all() else np.sort(ids)
 
     def _code(self, name: str, value: str, given: str) -> int:
-        """Return the code of a value, also of a layout's alias; -1 for a valid value that no history has.
+        """Return the code of a field's value or a layout's alias; -1 if the value is valid but absent from the release.
 
         Args:
-            name, value: of `QUERY_FIELDS`, and the wanted value.
-            given: the field's name in messages.
+            name: the field, one of `QUERY_FIELDS`.
+            value: the wanted value.
+            given: name of the field in messages.
         """
         canonical = get_layout(str(value)).name if name == "layout" else value
         code = self.entries.code(name, canonical) if isinstance(canonical, str) else None
@@ -115,7 +116,7 @@ class Index:
         return -1
 
     def summary(self) -> str:
-        """Return the splits with their layouts and families of teammates, in one line."""
+        """Return a line that lists the layouts and teammate families of each split."""
         found: dict[str, dict[str, list[str]]] = {}
         names = {name: self.values(name) for name in ("split", "layout", "teammate_family")}
         for codes in self.entries.combinations.tolist():
@@ -133,10 +134,12 @@ class Index:
 def read_index(root: Path) -> Index:
     """Read and check the index of a release folder.
 
-    A large one is parsed once; the parsed columns are kept in the cache folder, by content (`utils.cache`).
+    The parsed columns of a large index are kept in the cache folder, see `format.cached_arrays`.
 
     Raises:
-        RootNotFoundError, FormatTooNewError, FormatTooOldError, IndexFormatError: each names the file, and the line.
+        RootNotFoundError: if the folder is not a release.
+        FormatTooNewError, FormatTooOldError: if the release has another format version.
+        IndexFormatError: if a file is malformed; with the file and the line number.
     """
     info = read_info(root)
     path = resolve_inside(root, HISTORIES)

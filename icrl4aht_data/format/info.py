@@ -1,4 +1,4 @@
-"""meta/info.json of a release: what kind it is, what it contains, and how large its shards are."""
+"""Content of meta/info.json: kind, versions, layouts, totals and shard sizes of a release."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class EpisodeLengths(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Steps per episode.
 
     Args:
-        max_steps: steps of an episode in training.
-        kept_steps: how many of them, from the first on, the histories contain.
+        max_steps: steps of an episode while the ego learns.
+        kept_steps: number of leading steps of each episode that the histories contain.
     """
 
     max_steps: _Steps
@@ -62,12 +62,12 @@ class LayoutSummary:
 
     Args:
         environment_name: the layout's name in the paper's code.
-        map: the layout's cells, one string per row.
-        recipes: three ingredients each.
+        map: cells of the layout, one string per row.
+        recipes: recipes of the layout, three ingredients each.
         obs_shape: (5, 5, C) of one observation.
         histories: number of histories on this layout.
-        tasks: number of their tasks.
-        transitions: number of their steps.
+        tasks: number of tasks on this layout.
+        transitions: number of steps on this layout.
         mean_final_return: mean of `Entry.return_end` over the histories.
     """
 
@@ -86,17 +86,17 @@ class LayoutStatistics:
     """One column of the paper's table "Dataset statistics per layout".
 
     Args:
-        original_transitions: steps of all recorded streams, before the filter; None where it was not recorded.
-        filtered_transitions: steps of the release's histories.
+        original_transitions: steps of all recorded streams before filtering; None if unknown.
+        filtered_transitions: steps of the histories in the release.
         history_length: steps of the shortest and of the longest history.
-        teammates: number of different teammates; None where the tasks are unknown.
+        teammates: number of different teammates; None if the tasks are unknown.
         steps_per_episode: kept steps of an episode.
         obs_shape: (5, 5, C) of one observation.
         actions: number of actions.
         mean_final_return: mean of `Entry.return_end` over the histories.
         disk_bytes: size of the shards.
-        independent_teammates: number of teammates that were not trained together: several checkpoints of one member of
-            a population count once. None where the tasks are unknown.
+        independent_teammates: number of different teammates, with several checkpoints of one policy counted once; None
+            if the tasks are unknown.
     """
 
     original_transitions: int | None
@@ -113,19 +113,18 @@ class LayoutStatistics:
 
 @dataclass(frozen=True)
 class LeftOutTask:
-    """A task that was attempted, or considered, and has no histories in the release.
+    """A task that was planned or generated but has no histories in the release.
 
     Args:
         task_id: the task's id.
         layout: the layout's short name.
-        teammate: the teammate in words, such as "H3/t12" or "fcp/m1".
-        source: how its histories were to be made, see `Entry.source`.
-        learners: number of independent learners; 0 where none was trained.
-        streams: number of their recorded streams.
-        return_start: mean return of the streams' first episodes, see `schema.curve_ends`; None where nothing was
-            recorded.
-        return_end: mean return of their last episodes.
-        reason: why it was left out, as a sentence for people.
+        teammate: name of the teammate, such as "H3/t12" or "fcp/m1".
+        source: intended source of its histories, see `Entry.source`.
+        learners: number of independent learners; 0 if none was trained.
+        streams: number of recorded streams of all learners.
+        return_start: mean return of the streams' first episodes, see `schema.curve_ends`; None if nothing was recorded.
+        return_end: mean return of the streams' last episodes.
+        reason: a sentence that says why the task was left out.
     """
 
     task_id: str
@@ -141,20 +140,20 @@ class LeftOutTask:
 
 @dataclass(frozen=True, repr=False)
 class ReleaseInfo:
-    """The content of meta/info.json.
+    """Content of meta/info.json.
 
     Args:
         format_version: version of the file format, one of `schema.READABLE_VERSIONS`.
         data_version: version of the data, SemVer.
         kind: which arrays the shards store, see `schema.Kind`.
-        actions: the actions' names by number.
-        environment: steps of an episode.
+        actions: names of the actions, by action id.
+        environment: numbers of steps per episode.
         histories: number of histories.
-        transitions: number of their steps.
+        transitions: total number of steps.
         layouts: layout name -> summary, in order of first appearance in the index.
-        shards: shard, a path in the release -> its size in bytes.
-        statistics: layout name -> the paper's statistics; empty in releases written before there were any.
-        left_out: tasks without histories in the release, such as those whose learner did not learn.
+        shards: path of a shard in the release -> size in bytes.
+        statistics: layout name -> statistics as in the paper; empty in older releases.
+        left_out: tasks without histories in the release, for example because the learner did not improve.
     """
 
     format_version: int
@@ -178,13 +177,13 @@ class ReleaseInfo:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return the object to write, without `shards`, `statistics` and `left_out` where they are empty."""
+        """Return the JSON object of info.json, without `shards`, `statistics` and `left_out` if they are empty."""
         content = json.loads(msgspec.json.encode(self))
         return {name: value for name, value in content.items() if value not in ({}, [])}
 
     @classmethod
     def from_json(cls, content: Any) -> ReleaseInfo:
-        """Parse the content of an info.json of a readable format version.
+        """Parse the JSON object of an info.json.
 
         Raises:
             IndexFormatError: without the file, which the caller adds.
@@ -194,7 +193,7 @@ class ReleaseInfo:
         except msgspec.ValidationError as error:
             raise IndexFormatError(str(error)) from error
         try:
-            check_version(info.data_version)  # it names tags and folders
+            check_version(info.data_version)  # the version becomes part of tags and folder names
             for task in info.left_out:
                 get_layout(task.layout)
                 for text in (task.task_id, task.teammate, task.source, task.reason):
@@ -233,7 +232,7 @@ def read_info(root: Path) -> ReleaseInfo:
 
 
 def _instead(root: Path) -> str:
-    """Return advice for a folder that is not a release."""
+    """Return advice for the error about a folder that is not a release."""
     if not root.is_dir():
         hint = "there is no such folder: check the path"
     elif below := sorted(str(path.parent.parent) for path in root.glob(f"*/{INFO}")):
@@ -244,10 +243,10 @@ def _instead(root: Path) -> str:
 
 
 def check_version(version: str) -> str:
-    """Return a data version after checking it.
+    """Check that a data version is valid SemVer, and return it.
 
     Raises:
-        OptionError: if it does not have the form of SemVer.
+        OptionError: if it is not.
     """
     if not isinstance(version, str) or len(version) > _VERSION_LENGTH or not _SEMVER.fullmatch(version):
         raise OptionError(f"data version {version!r:.100}: expected one such as 1.0.0 or 1.0.0-rc.1 (SemVer)")
@@ -257,7 +256,7 @@ def check_version(version: str) -> str:
 def describe(
     kind: Kind, data_version: str, kept_steps: int, entries: list[Entry], format_version: int = FORMAT_VERSION
 ) -> ReleaseInfo:
-    """Return the info of a release with these histories, without sizes of shards and statistics."""
+    """Return the info of a release with these histories, without shard sizes and statistics."""
     layouts = {}
     for name in dict.fromkeys(entry.layout for entry in entries):
         members = [entry for entry in entries if entry.layout == name]
@@ -286,5 +285,5 @@ def describe(
 
 
 def shard_sizes(root: Path, entries: Iterable[Entry]) -> dict[str, int]:
-    """Return the bytes of every shard, in the order of the index."""
+    """Return shard path -> size in bytes, in the order of the index."""
     return {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in entries)}

@@ -1,7 +1,7 @@
-"""MANIFEST.sha256: every file of a release with its hash, in sha256sum's format.
+"""MANIFEST.sha256: paths and SHA-256 of all files of a release, in the format of `sha256sum`.
 
-The manifest has the hashes of `meta/`, and the chunk tables in `meta/chunks/` have those of the chunks, so that every
-byte of a release can be checked.
+The manifest covers the chunk tables in `meta/chunks/`, and they cover the shards, so every byte of a release can be
+checked.
 """
 
 from __future__ import annotations
@@ -52,32 +52,32 @@ _KNOWN = re.compile(
         )
     )
 )
-"""Paths of all files that a release may have. A release is unpacked into folders in which other programs look for
-files of their own (.git/config, sitecustomize.py, x.pth), so everything else is refused, whatever its name."""
+"""Patterns of the paths that a release may contain. All other paths are refused, because a downloaded file such as
+.git/config, sitecustomize.py or x.pth could make other programs run its content."""
 
 
 def is_known_file(name: str) -> bool:
-    """Return whether a path in a release is that of a file which releases have, except the manifest itself."""
+    """Return whether a release may contain a file with this path; False for the manifest itself."""
     return _KNOWN.fullmatch(name) is not None
 
 
 def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
-    """Return the files of a manifest: path in the release -> SHA-256.
+    """Parse a manifest: path in the release -> SHA-256.
 
     Args:
         text: content of the manifest.
-        path: its path or address, for errors.
+        path: path or address of the manifest, for error messages.
 
     Raises:
-        IndexFormatError: if it lists nothing, or a line is wrong, which it names.
-        UnsafePathError: for a path that leads out of the release, or is not that of a file which releases have.
+        IndexFormatError: if the manifest is empty or a line is malformed; with the line number.
+        UnsafePathError: if a path leads out of the release, or a release may not contain it.
     """
     if not text:
         raise IndexFormatError(f"{path}: empty: expected a line for each file of the release; fetch it again")
     if not text.endswith("\n"):
         raise IndexFormatError(f"{path}: cut off: its last line has no end; fetch it again")
     listed: dict[str, str] = {}
-    folded: dict[str, str] = {}  # names as a disk compares them that ignores case
+    folded: dict[str, str] = {}  # lower-case name -> name, for disks that ignore case
     for number, line in enumerate(text.splitlines(), start=1):
         match = _LINE.fullmatch(line)
         if match is None:
@@ -102,13 +102,13 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
 
 
 def read_manifest(folder: Path) -> dict[str, str]:
-    """Return the manifest of a release folder, see `parse_manifest`."""
+    """Read the manifest of a release folder, see `parse_manifest`."""
     path = resolve_inside(folder, MANIFEST)
     return parse_manifest(read_text(path), path)
 
 
 def _listed(root: Path) -> Mapping[str, str]:
-    """Return the manifest of a release folder, parsed again only if its text has changed."""
+    """Return the manifest of a release folder, parsed again only after a change."""
     path = resolve_inside(root, MANIFEST)
     return _parsed_once(read_text(path), path)
 
@@ -119,15 +119,15 @@ def _parsed_once(text: str, path: Path) -> Mapping[str, str]:
 
 
 def check_against_manifest(root: Path, names: Iterable[str]) -> None:
-    """Check that files of a release folder are those that its manifest lists.
+    """Check files of a release folder against their hashes in the manifest.
 
     Args:
         root: the release folder.
-        names: paths in it.
+        names: paths of the files, relative to `root`.
 
     Raises:
-        IndexFormatError, ChunkTableError: if a file is missing, not listed or another one, or if there is no valid
-            manifest; names the file, the expected and the found hash, and what to do.
+        IndexFormatError, ChunkTableError: if a file is missing, not listed or differs, or if the manifest is missing or
+            invalid; with the expected and the found hash.
     """
     manifest, listed = root / MANIFEST, _listed(root)
     for name in names:
@@ -149,9 +149,9 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
 
 
 def check_meta(root: Path) -> None:
-    """Check the files of meta/ before they are read, except chunk tables; see `check_against_manifest`.
+    """Check the files of meta/ except chunk tables; see `check_against_manifest`.
 
-    The card of a release's sources may be missing, since nothing is read from it.
+    `SOURCE_CARD` may be missing, since no code reads it.
     """
     listed = [name for name in _listed(root) if re.fullmatch(r"meta/[^/]+", name)]
     read = {name for name in (INFO, HISTORIES, TASKS, PROVENANCE) if name in listed or (root / name).exists()}
@@ -159,20 +159,19 @@ def check_meta(root: Path) -> None:
 
 
 def check_folder(root: Path, folder: str) -> None:
-    """Check the files of a release's folder that the manifest lists, as far as they exist; see
-    `check_against_manifest`."""
+    """Check the existing files of a subfolder of a release; see `check_against_manifest`."""
     check_against_manifest(root, [n for n in _listed(root) if n.startswith(f"{folder}/") and (root / n).exists()])
 
 
 def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
-    """Write MANIFEST.sha256 over every other file of a folder.
+    """Write MANIFEST.sha256 with all other files of a folder.
 
     Args:
         root: the folder.
-        known: file -> SHA-256 of files that need not be read.
+        known: path -> SHA-256, for files that need not be hashed again.
 
     Raises:
-        UnsafePathError: if the folder has a file that releases do not have.
+        UnsafePathError: if the folder has a file that a release may not contain.
     """
     known = known or {}
     names = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())

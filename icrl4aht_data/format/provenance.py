@@ -1,4 +1,4 @@
-"""meta/provenance.json of a release: how the histories of each task were made."""
+"""Content of meta/provenance.json: how the histories of each task were generated."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _Exponent = Annotated[float, Meta(gt=0, lt=1e15)]
 
 @dataclass(frozen=True)
 class StreamReturns:
-    """Mean returns of some environment streams of one learner.
+    """Mean returns of a set of environment streams.
 
     Args:
         streams: number of streams.
@@ -41,12 +41,12 @@ class StreamReturns:
 
 @dataclass(frozen=True)
 class StreamFilter:
-    """Effect of keeping a learner's best streams.
+    """Mean returns before and after filtering a task's streams.
 
     Args:
         before: all recorded streams.
         after: the streams that the release keeps.
-        least_improvement: how much a stream's end had to exceed its start; None where it did not have to.
+        least_improvement: minimum improvement of a kept stream's return; None without such a filter.
     """
 
     before: StreamReturns
@@ -56,14 +56,14 @@ class StreamFilter:
 
 @dataclass(frozen=True)
 class ExpertLabels:
-    """Origin of the expert actions: one policy for all histories of a task, whichever learner made them.
+    """Policy that produced the expert actions of all histories of a task.
 
     Args:
         policy_sha256: SHA-256 of the policy's weights; None for a script.
         action: how the policy chose actions.
         step: environment steps that the policy was trained for; None for a script.
-        return_greedy: its mean return over `episodes` episodes with the task's teammate, acting greedily.
-        return_sampled: its mean return with sampled actions.
+        return_greedy: mean return of the policy's greedy actions over `episodes` episodes with the task's teammate.
+        return_sampled: mean return of its sampled actions.
         episodes: number of episodes of each measurement.
         last_return_greedy: greedy return of the learner's last checkpoint, the paper's source of labels.
     """
@@ -79,16 +79,15 @@ class ExpertLabels:
 
 @dataclass(frozen=True, kw_only=True)
 class TeammateSuite:
-    """The populations that a learned teammate was selected from.
+    """Settings of the populations that a learned teammate was selected from.
 
     Args:
         algorithms: layout -> algorithms.
         members: policies in each population.
         train: training teammates wanted per population.
         total_steps: environment steps of each member's training.
-        threshold: self-play return that a checkpoint has to exceed.
-        xla_threads: threads of one operation on the CPU that trained them; None on other platforms and where it was not
-            recorded.
+        threshold: minimum self-play return of a checkpoint.
+        xla_threads: XLA's threads per operation on the CPU that trained them; None on other platforms or if unknown.
     """
 
     algorithms: dict[str, list[str]]
@@ -101,15 +100,15 @@ class TeammateSuite:
 
 @dataclass(frozen=True)
 class ReferenceEgos:
-    """Mean returns with the task's teammate of egos that do not learn, in episodes of `facts.KEPT_STEPS` steps.
+    """Mean returns of reference egos with the task's teammate, in episodes of `facts.KEPT_STEPS` steps.
 
     Args:
-        stay: the ego that never moves.
-        random: the ego of random actions.
-        oracle: the scripted ego, which sees the full state.
+        stay: an ego that never moves.
+        random: an ego with uniformly random actions.
+        oracle: the scripted oracle, which sees the full state.
         episodes: number of episodes of each measurement.
-        self_play: the policy that a learned teammate was trained with, which draws its actions: its last best response,
-            or itself; None for heuristics, and where it was not measured.
+        self_play: the training partner of a learned teammate (its last best response, or itself) with sampled actions;
+            None for heuristics or if not measured.
     """
 
     stay: _Return
@@ -120,13 +119,13 @@ class ReferenceEgos:
 
     @property
     def returns(self) -> dict[str, float]:
-        """The returns that are known, by the ego's name."""
+        """Name of the ego -> mean return, for all measured egos."""
         found = {"stay": self.stay, "random": self.random, "oracle": self.oracle, "self-play": self.self_play}
         return {name: value for name, value in found.items() if value is not None}
 
     @property
     def matters(self) -> bool:
-        """Whether the ego matters: some ego earns at least `LEAST_HEADROOM` more than another."""
+        """Whether the best ego earns at least `LEAST_HEADROOM` more than the worst."""
         return max(self.returns.values()) - min(self.returns.values()) >= LEAST_HEADROOM
 
     def describe(self) -> str:
@@ -140,9 +139,9 @@ class NearestTest:
 
     Args:
         teammate: family and number of the test teammate, such as "H3/t1".
-        distance: share of the steps in which the two choose other actions in the same states.
-        behaviour: number of the behaviour among the draws of one layout and family, which act alike if they share it;
-            None where it was not determined.
+        distance: share of states in which the two choose different actions.
+        behaviour: id of the teammate's behaviour; teammates of the same layout and family with equal ids act alike.
+            None if unknown.
     """
 
     teammate: str
@@ -152,30 +151,30 @@ class NearestTest:
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Origin of one task's histories. Everything that was not recorded is None.
+    """How the histories of one task were generated. None means not recorded.
 
     Args:
-        profile: name of the profile that sized the rebuild.
+        profile: name of the generation profile.
         profile_hash: hash of that profile's content.
-        ego: the ego's hyper-parameters, among them the integers `total_steps` and `environments`.
+        ego: the ego's hyper-parameters, including the integers `total_steps` and `environments`.
         ego_hash: hash of these hyper-parameters.
         code_version: version of this package.
         jax_version: version of JAX.
         platform: JAX backend, such as "cpu".
-        xla_threads: threads of one operation on a CPU, which decide the bits; None on other platforms.
+        xla_threads: XLA's threads per operation on a CPU, which affect the results' bits; None on other platforms.
         seed: the learner's seed.
         source: how the histories were made, see `Entry.source`.
         learners: number of independent learners, each with `ego["environments"]` streams; None for a script.
-        noise: settings of a noise history's schedules: numbers, and ranges [least, most] that each history draws from.
-        references: returns of egos that do not learn.
+        noise: settings of the schedules of noise histories: numbers, or ranges [least, most] to draw from.
+        references: returns of reference egos.
         nearest_test: the test teammate that acts most like this one.
-        teammate: how the teammate played: its `slot` and the source of its `noise`.
-        streams_recorded: environment streams of all learners.
-        streams_kept: how many of them became histories.
-        filter: their returns before and after keeping the best.
-        expert: where expert actions come from.
-        suite: the populations that a learned teammate comes from.
-        other: fields that this package does not know, kept as they were read.
+        teammate: the teammate's agent `slot` and the source of its `noise`.
+        streams_recorded: number of environment streams of all learners.
+        streams_kept: number of streams that became histories.
+        filter: returns of the streams before and after filtering.
+        expert: the policy that produced the expert actions.
+        suite: the populations that a learned teammate was selected from.
+        other: unknown fields, kept unchanged.
     """
 
     profile: str | None = None
@@ -201,7 +200,7 @@ class Provenance:
     other: dict[str, Any] = field(default_factory=dict)
 
     def entry_fields(self) -> dict[str, Any]:
-        """Return the fields of the task's index entries that describe the policy behind the expert actions."""
+        """Return the fields of the task's index entries that describe its expert."""
         expert = self.expert
         return {
             "expert_return": None if expert is None else expert.return_greedy,
@@ -210,7 +209,7 @@ class Provenance:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """Return the object to write, without what was not recorded."""
+        """Return the JSON object of a task, without fields that are None."""
         content = _recorded(asdict(self))
         for name in {"expert", "filter", "nearest_test", "references", "suite"} & content.keys():
             content[name] = _recorded(content[name])
@@ -221,7 +220,7 @@ class Provenance:
 
     @classmethod
     def from_json(cls, content: Any) -> Provenance:
-        """Parse one task's object.
+        """Parse the JSON object of a task.
 
         Raises:
             IndexFormatError: without the file, which the caller adds.
@@ -248,14 +247,14 @@ def _recorded(content: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _EgoScale:
-    """The hyper-parameters that other parts read."""
+    """Hyper-parameters of the ego that this package reads."""
 
     total_steps: int
     environments: int
 
 
 class _NoiseSetting(msgspec.Struct):
-    """The settings of noise schedules that are known; others are kept as they are."""
+    """Known settings of noise schedules; unknown ones are kept unchanged."""
 
     histories: _Positive | None = None
     episodes: _Positive | None = None
@@ -267,10 +266,10 @@ class _NoiseSetting(msgspec.Struct):
 
 
 def _check_noise(noise: _NoiseSetting | None) -> None:
-    """Check that every range is one.
+    """Check that both ends of every range are in order.
 
     Raises:
-        IndexFormatError: names the range.
+        IndexFormatError: if a range is not of the form [least, most].
     """
     for name, value in () if noise is None else msgspec.structs.asdict(noise).items():
         if isinstance(value, tuple) and value[0] > value[1]:
@@ -278,14 +277,14 @@ def _check_noise(noise: _NoiseSetting | None) -> None:
 
 
 class _TeammateSetting(msgspec.Struct, forbid_unknown_fields=True):
-    """How a teammate played. The task defines the teammate itself, so other fields are refused."""
+    """Agent slot and noise source of a teammate. The task defines the teammate itself, so other fields are refused."""
 
     slot: Literal[1]
     noise: str | None = None
 
 
 class ProvenanceByTask(Mapping[str, Provenance]):
-    """Read-only mapping from the id of each task of a release to how its histories were made.
+    """Read-only mapping of task ids to their `Provenance`.
 
     Args:
         records: task id -> record.
@@ -308,10 +307,10 @@ class ProvenanceByTask(Mapping[str, Provenance]):
 
 
 def read_provenance(path: Path) -> dict[str, Provenance]:
-    """Read how the histories of each task were made; task_id -> provenance.
+    """Read meta/provenance.json: task_id -> provenance.
 
     Raises:
-        IndexFormatError: names the file, and the task where one is malformed.
+        IndexFormatError: if the file or the object of a task is malformed.
     """
     text = read_text(path)
     try:

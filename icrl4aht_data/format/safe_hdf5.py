@@ -1,7 +1,7 @@
-"""Inspecting untrusted HDF5 files: libhdf5 follows links to other files, loads plugins and trusts sizes.
+"""Safe reading of untrusted HDF5 files, because libhdf5 follows links to other files, loads plugins and trusts sizes.
 
-Every check here comes before the call of libhdf5 that it protects. Rejected content raises ValueError, damaged content
-any error of h5py; callers add the file's name.
+Each check runs before the libhdf5 call that it protects. Rejected content raises ValueError; damaged content may raise
+any error of h5py. Callers add the file's name.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 from icrl4aht_data.format.chunks import DEFLATE_RATIO, decode_chunk
 from icrl4aht_data.utils.system import new_array
 
-_low: Any = h5py  # its types do not declare the low-level interface
+_low: Any = h5py  # h5py's type stubs lack the low-level interface
 h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z
 
 OLDEST_HDF5 = (1, 10, 5)
-"""The first libhdf5 that reports the positions of chunks."""
+"""Oldest version of libhdf5 that reports the positions of chunks."""
 
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
@@ -30,20 +30,20 @@ _ATTRIBUTES = 16
 
 
 def exists(group: Any, path: str) -> bool:
-    """Whether the file's own links lead to something at a path.
+    """Return whether the file has a group or dataset at a path.
 
     Raises:
-        ValueError: if a link on the way may lead out of the file.
+        ValueError: if a link on the path may lead out of the file.
     """
     return _find(group, path) is not None
 
 
 def member(group: Any, path: str) -> Any:
-    """The group or dataset at a path.
+    """Return the group or dataset at a path.
 
     Raises:
-        ValueError: if a link on the way may lead out of the file.
-        KeyError: if there is none.
+        ValueError: if a link on the path may lead out of the file.
+        KeyError: if the path does not exist.
     """
     found = _find(group, path)
     if found is None:
@@ -63,10 +63,10 @@ def _find(group: Any, path: str) -> Any:
 
 
 def attributes(file: h5py.File) -> dict[str, Any]:
-    """The file's attributes, if they are few and each is one number or text.
+    """Return the file's attributes.
 
     Raises:
-        ValueError: if they are not.
+        ValueError: if there are too many, or one is not a single number or text.
     """
     found = {}
     for number, name in enumerate(file.attrs):
@@ -78,10 +78,10 @@ def attributes(file: h5py.File) -> dict[str, Any]:
 
 
 def filters(dataset: Any) -> list[int]:
-    """Ids of a dataset's filters, if all its values are in this file and are numbers or arrays of numbers.
+    """Return the ids of a dataset's filters.
 
     Raises:
-        ValueError: if they are not, or it is not a dataset.
+        ValueError: if it is not a dataset of numbers, or of small arrays of numbers, stored in this file.
     """
     if not isinstance(dataset, h5py.Dataset):
         raise ValueError(f"{dataset.name}: not a dataset")
@@ -95,18 +95,18 @@ def filters(dataset: Any) -> list[int]:
 
 
 def _type_class(what: Any) -> int:
-    """The class of an object's type, or of the elements of an array type."""
+    """Return the HDF5 type class of an object, or of its elements if it has an array type."""
     kind = what.get_type()
     return kind.get_super().get_class() if kind.get_class() == h5t.ARRAY else kind.get_class()
 
 
 def read_dataset(dataset: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """A dataset of that shape, with chunks inflated here: libhdf5 would inflate one to any length.
+    """Return a dataset's values, inflated without libhdf5, which would inflate a chunk to any length.
 
     Raises:
-        ValueError: if it has another shape, filters other than shuffle and deflate, or more rows than its bytes can
-            contain.
-        OptionError: if it does not fit into memory.
+        ValueError: if the dataset has another shape than `shape`, filters other than shuffle and deflate, or more
+            values than its stored bytes can contain.
+        OptionError: if the values do not fit into memory.
     """
     used = filters(dataset)
     if used not in ([], [DEFLATE], [SHUFFLE, DEFLATE]):

@@ -1,4 +1,4 @@
-"""The files, arrays and index entries of a release: the definitions that reader, writer, verifier and card share.
+"""Definitions of the files, arrays and index entries of a release, shared by reader, writer, verifier and card.
 
     meta/info.json          versions, kind, environment, totals
     meta/histories.jsonl    one line per learning history: `Entry`
@@ -29,10 +29,10 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
 FORMAT_VERSION = 4
-"""Version of the file format that is written."""
+"""Format version that this package writes."""
 
 READABLE_VERSIONS = (FORMAT_VERSION,)
-"""Versions that are read; others raise `FormatTooOldError` or `FormatTooNewError`."""
+"""Format versions that this package reads; others raise `FormatTooOldError` or `FormatTooNewError`."""
 
 MANIFEST = "MANIFEST.sha256"
 INFO, HISTORIES, TASKS, PROVENANCE = (
@@ -40,39 +40,39 @@ INFO, HISTORIES, TASKS, PROVENANCE = (
 )
 
 TEAMMATES = "teammates"
-"""The folder of learned teammates."""
+"""Folder of the checkpoints of learned teammates."""
 
 EXPERTS = "experts"
-"""The folder of the egos' checkpoints whose greedy actions are the labels; a release may be without it."""
+"""Folder of the checkpoints of experts, whose greedy actions are the labels; optional."""
 
 RELEASE_CARD, CARD_TABLES = "README.md", "card.json"
-"""The card, and its tables that are too long for people."""
+"""Paths of the dataset card and of its long tables."""
 
 SOURCE_CARD = "meta/source_card.md"
-"""Cards of the releases that a release was combined from, or its own earlier card if this package did not make it."""
+"""Path of the cards of the combined releases, or of the earlier card that `release build` replaced."""
 
 PARQUET_INDEX = "index"
-"""The folder of the index as Parquet files, `index/<layout>/<split>.parquet`, in a release built for publication."""
+"""Folder of the index as Parquet files, `index/<layout>/<split>.parquet`, in a release built for publication."""
 
 PARQUET_EPISODES = "episodes"
-"""The folder of the episodes as Parquet files, `episodes/<layout>/<split>-00000-of-00001.parquet`: a copy of the
-histories for other tools, in a release built for publication that has state records."""
+"""Folder of the episodes as Parquet files, `episodes/<layout>/<split>-00000-of-00001.parquet`, a copy of the histories
+for other tools; only in a release with state records that is built for publication."""
 
 Kind = Literal["full", "lite", "observations"]
 KINDS: tuple[Kind, ...] = ("full", "lite")
-"""The kinds of release with state records: those that are generated."""
+"""Kinds of release with state records."""
 
 OBSERVATIONS: Kind = "observations"
-"""The kind without state records: observations do not determine the state, so nothing can be replayed or drawn."""
+"""Kind of release without state records, whose steps can be neither replayed nor drawn."""
 
 ALL_KINDS: tuple[Kind, ...] = (*KINDS, OBSERVATIONS)
 
 CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4"), ("hash", "u1", (16,))])
-"""One row of a chunk table: position and size of the stored bytes, how many of the chunk's rows belong to the history
-(the last chunk is padded), and checksum and hash of the stored bytes, see `chunks.check_chunk`. The bytes between the
-chunks follow in rows with `rows` = 0, so that the table covers every byte of a shard exactly once. Rows are ordered by
-history, then by `FIELDS`, then by chunk. In the file a history's chunks are ordered by time, so that a window of steps
-is one range of bytes, see `shard_writer.file_order`."""
+"""One row of a chunk table: offset and size of the stored bytes, number of rows that belong to the history (the last
+chunk is padded), CRC-32 and hash of the stored bytes, see `chunks.check_chunk`. Rows are ordered by history, field
+and chunk; rows for the HDF5 metadata between the chunks follow, with `rows` = 0, so the table covers every byte of the
+shard once. In the shard, the chunks of a history are ordered by time, so a window of steps is one byte range, see
+`shard_writer.file_order`."""
 
 
 @dataclass(frozen=True)
@@ -81,15 +81,15 @@ class Field:
 
     Args:
         name: the HDF5 dataset's name.
-        dtype: what the reader returns, and what a `full` shard stores (paper, App. D.1).
-        compact: what a `lite` shard stores; the writer checks that it is lossless.
+        dtype: dtype that the reader returns and a `full` shard stores (paper, App. D.1).
+        compact: dtype that a `lite` shard stores; the writer checks that it is lossless.
         axis: "T" for one row per step, "E" for one row per episode.
         row: content of a row: "scalar", "state" (S bytes) or "obs" (5 x 5 x C bytes). A state or an observation is one
             HDF5 element of array type, so that the shuffle filter groups equal positions over time; h5py shows them as
             (T, S) and (T, 5, 5, C).
         chunk: rows per chunk.
-        optional: the kinds of release in which a history may be without it; its index entry says so.
-        absent: the kinds of release that never have it.
+        optional: kinds of release in which a history may lack the field, as its index entry says.
+        absent: kinds of release that never contain the field.
     """
 
     name: str
@@ -102,13 +102,13 @@ class Field:
     absent: tuple[Kind, ...] = ()
 
     def element(self, layout: Layout, kind: Kind) -> np.dtype:
-        """Return the stored element's dtype: a scalar, the S bytes of a state record, or 5 x 5 x C bytes."""
+        """Return the dtype of a stored element: a scalar, a state record (S,) or an observation (5, 5, C)."""
         if self.row == "scalar":
             return np.dtype(self.compact if kind == "lite" else self.dtype)
         return np.dtype(("u1", (record_size(layout),) if self.row == "state" else layout.obs_shape))
 
     def held(self, layout: Layout) -> np.dtype:
-        """Return the dtype of an element in the memory of samplers: the compact one for every kind of release."""
+        """Return the dtype of an element in a sampler's memory: the compact one for every kind of release."""
         return self.element(layout, "lite")
 
 
@@ -126,29 +126,26 @@ FIELDS: dict[str, Field] = {
         Field("obs", "uint8", "uint8", "T", "obs", 200, absent=("lite",)),
     )
 }
-"""Every field, in file order. `episode_end_state` is the state after each episode's last kept step."""
+"""All fields by name, in file order. `episode_end_state` is the state after an episode's last kept step."""
 
 ACTION_FIELDS = ("actions", "teammate_actions", "expert_actions", "oracle_actions")
 
 
 def held_fields(kind: Kind) -> tuple[Field, ...]:
-    """Return the fields that batches and converted releases are made of.
-
-    All stored ones, except `obs` where it can be rendered from the state records.
-    """
+    """Return the stored fields of a kind of release, without `obs` if it can be rendered from state records."""
     stored = kind if kind == OBSERVATIONS else "lite"
     return tuple(field for field in FIELDS.values() if stored not in field.absent)
 
 
 def record_field(kind: Kind) -> Field:
-    """Return the field that determines what the ego saw: the state record, or the observation itself."""
+    """Return the field with the state records, or with the observations if a release has no states."""
     return FIELDS["state" if kind in KINDS else "obs"]
 
 
 LONGEST = 2**40
-"""Every history has fewer steps than this, so that sums of steps fit into 64 bits."""
+"""Upper limit of the steps of a history, so that sums of steps fit into 64 bits."""
 
-_NAME_LENGTH = 512  # characters: a name column is as wide as its longest name
+_NAME_LENGTH = 512  # characters; limited because a name column is as wide as its longest name
 _FINITE = 1e15  # sums of numbers below this stay finite
 
 _Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -162,7 +159,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
 
     Args:
         history_id: position of the line in the index.
-        task_id: task whose learner made the history, see `benchmark.tasks`.
+        task_id: id of the history's task, see `benchmark.tasks`.
         env_idx: environment stream within the learner's parallel rollout, or number of a noise history.
         T: number of steps.
         obs_shape: (5, 5, C) of one observation.
@@ -175,21 +172,20 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         h5_group: HDF5 group of the arrays.
         has_teammate_actions: whether the history has `teammate_actions`.
         has_expert_actions: whether the history has `expert_actions`.
-        h5_row: row in the group's stacked arrays; None where the group contains this history alone.
+        h5_row: row in the group's stacked arrays; None if the group contains only this history.
         shard: path of the shard in the release.
-        seed: the learner's seed; -1 where the task is unknown.
-        episodes: number of finished episodes, as many as there are dones.
+        seed: the learner's seed; -1 if the task is unknown.
+        episodes: number of finished episodes.
         score: end + (end - start), see `curve_ends` (paper, App. F.1).
         return_start: mean return of the first episodes.
         return_end: mean return of the last episodes.
         return_mean: mean return of all episodes.
         source: how the history was made: a name in `facts.SOURCES`, or another one.
-        expert_return: mean return of 200 episodes of 100 steps of the policy that the expert actions come from, acting
-            greedily with the task's teammate, or of a script in `ExpertLabels.episodes`; None where it was not
-            measured. All histories of a task agree in this and the next two fields.
-        expert_return_sampled: the mean return with sampled actions.
-        expert_step: environment steps that the policy was trained for; None where it is unknown, or for a script.
-        learner: which of the task's independent learners made the history, from 0.
+        expert_return: mean return of the expert's greedy actions with the task's teammate, over 200 episodes of 100
+            steps (a script: `ExpertLabels.episodes`); None if not measured. Equal for all histories of a task.
+        expert_return_sampled: mean return of the expert's sampled actions.
+        expert_step: environment steps that the expert was trained for; None for a script or if unknown.
+        learner: number of the independent learner that made the history, from 0.
         has_oracle_actions: whether the release stores `oracle_actions` of the history; see `stored_field`.
     """
 
@@ -223,11 +219,11 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     has_oracle_actions: bool = False
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
-        """Return the fields that this history's shard stores."""
+        """Return the fields that are stored for this history in a release of a kind."""
         return tuple(field for field in FIELDS.values() if kind not in field.absent and self._stores(field))
 
     def has(self, field: Field) -> bool:
-        """Return whether the history has a field that its kind of release may have, see `Field.optional`."""
+        """Return whether the history has an optional field, see `Field.optional`; True for other fields."""
         return self._stores(self.stored_field(field))
 
     def stored_field(self, field: Field) -> Field:
@@ -250,12 +246,12 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return -(-self.rows(field) // field.chunk)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the object of the index line."""
+        """Return the JSON object of the index line."""
         return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)}
 
 
 ENTRY_HINTS: dict[str, Any] = get_type_hints(Entry)
-"""Type of every field of an index line, without bounds."""
+"""Field of an index line -> type without bounds."""
 
 JSON_TYPES: dict[str, set[type]] = {
     name: {
@@ -269,16 +265,16 @@ JSON_TYPES: dict[str, set[type]] = {
     }[hint]
     for name, hint in ENTRY_HINTS.items()
 }
-"""The types that a JSON parser may return for each field of an index line."""
+"""Field of an index line -> types that a JSON parser may return for it."""
 
 _BOUNDED = get_type_hints(Entry, include_extras=True)
 
 
 def check_value(name: str, value: Any) -> None:
-    """Check one field of an index line: its type and bounds, and that names are printable.
+    """Check the type and bounds of an index field, and that a name is printable.
 
     Raises:
-        IndexFormatError: names the field.
+        IndexFormatError: if the value is invalid; with the field's name.
     """
     try:
         msgspec.convert(value, _BOUNDED[name])
@@ -289,47 +285,46 @@ def check_value(name: str, value: Any) -> None:
 
 
 def check_name(text: str) -> None:
-    """Check that a text can name something.
+    """Check that a name is short and printable.
 
     Raises:
-        IndexFormatError: if it is too long, or has characters that terminals interpret or UTF-8 does not encode.
+        IndexFormatError: if it is too long, or has control characters or ones that UTF-8 cannot encode.
     """
     if len(text) > _NAME_LENGTH or not text.isprintable():
         raise IndexFormatError(f"expected at most {_NAME_LENGTH} printable characters: {text[:100]!r}")
 
 
 def episode_ends(steps: int, kept_steps: int) -> np.ndarray:
-    """Return bool (steps,): True on the last step of every episode of `kept_steps` steps."""
+    """Return bool (steps,), True on the last step of each episode of `kept_steps` steps."""
     return np.arange(steps) % kept_steps == kept_steps - 1
 
 
 def episode_returns(rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
-    """Return float64 (E,), the sum of rewards (T,) of each episode; `dones` (T,) marks last steps."""
+    """Return the return of each episode, float64 (E,), from `rewards` (T,) and `dones` (T,), True on last steps."""
     ends = np.flatnonzero(dones) + 1
     return np.diff(np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)[ends - 1]]))
 
 
 def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the first and of the last w = max(5, floor(0.1 N)) of N episodes (paper, App. F.1).
+    """Return the mean returns of the first and the last w = max(5, floor(0.1 N)) of N episodes (paper, App. F.1).
 
     Args:
         returns: (B, N), episode returns.
 
     Returns:
-        float64 (B,) twice: start and end.
+        The means at the start and at the end, float64 (B,) each.
     """
     window = max(5, returns.shape[-1] // 10)
     return returns[..., :window].mean(axis=-1), returns[..., -window:].mean(axis=-1)
 
 
 def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
-    """Return whether the policy behind expert actions earns less than half of what the ego earned at the end.
+    """Return whether an expert earns less than half of the ego's return at the end of its history.
 
-    Where the end is negative, labels are weak if they earn less than one and a half times it.
+    If the ego's return is negative, the labels are weak below 1.5 times that return.
 
     Args:
-        expert_return: the policy's greedy return, a number or float64 (N,); None or NaN, which are not weak, where it
-            was not measured.
+        expert_return: the expert's greedy return, a number or float64 (N,); None or NaN (not measured) is never weak.
         return_end: mean return of the history's last episodes, of the same shape.
 
     Returns:
@@ -339,6 +334,6 @@ def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
 
 
 def stream_score(returns: np.ndarray) -> np.ndarray:
-    """Return end + (end - start) of learning curves (B, N), float64 (B,) (paper, App. F.1)."""
+    """Return the score end + (end - start) of learning curves (B, N), float64 (B,) (paper, App. F.1)."""
     start, end = curve_ends(returns)
     return end + (end - start)

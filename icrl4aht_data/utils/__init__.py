@@ -1,1 +1,1 @@
-"""Files, paths, hashes, threads, memory, the cache folder and checks of options."""
+"""Utilities for files, hashes, threads, memory, options, plugins and progress bars."""

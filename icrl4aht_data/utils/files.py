@@ -1,6 +1,6 @@
-"""Files and folders: text and JSON, atomic writes, locks between processes, safe paths, full disks.
+"""Utilities for files: text and JSON, atomic writes, locks between processes, safe paths, full disks.
 
-Sizes are checked before a file is read: it may be a pipe, which never ends, or a sparse file of a terabyte.
+Sizes are checked before reading, because a file may be a pipe, which never ends, or a sparse file of a terabyte.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from filelock import FileLock
 from icrl4aht_data.errors import DiskFullError, IndexFormatError, OptionError, UnsafePathError
 
 TEXT_BYTES = 64 * 2**20
-"""Most bytes of a file that is read at once: six times the largest, the provenance of ten thousand tasks."""
+"""Maximum bytes of a text file: six times the provenance of ten thousand tasks, our largest one."""
 
 LINE_BYTES = 2**20
-"""Most bytes of a line."""
+"""Maximum bytes of a line."""
 
-_DEPTH = 64  # nesting of JSON that is accepted, well below the depth of Python's stack
+_DEPTH = 64  # maximum nesting of JSON, well below the depth of Python's stack
 
 
 def plain_size(path: Path, most: int) -> int:
-    """Size in bytes of a regular file.
+    """Return the size in bytes of a regular file.
 
     Raises:
         IndexFormatError: if it is missing, not a regular file, or larger than `most`.
@@ -39,14 +39,14 @@ def plain_size(path: Path, most: int) -> int:
     with wrap_read_errors(path):
         status = path.stat()
     if not stat.S_ISREG(status.st_mode):
-        raise IndexFormatError(f"{path}: not a plain file")
+        raise IndexFormatError(f"{path}: not a regular file")
     if status.st_size > most:
         raise IndexFormatError(f"{path}: expected at most {most:,} bytes, found {status.st_size:,}")
     return status.st_size
 
 
 def read_text(path: Path) -> str:
-    """A text file's content.
+    """Return the content of a text file.
 
     Raises:
         IndexFormatError: if it is missing, unreadable, too large or not UTF-8.
@@ -57,7 +57,7 @@ def read_text(path: Path) -> str:
 
 
 def read_lines(path: Path) -> Iterator[str]:
-    """The lines of a text file of any size, without their newlines.
+    """Yield the lines of a text file of any size, without newlines.
 
     Raises:
         IndexFormatError: if the file is missing, unreadable or not UTF-8, or a line is too long.
@@ -74,7 +74,7 @@ def read_lines(path: Path) -> Iterator[str]:
 
 @contextmanager
 def wrap_read_errors(path: Path) -> Iterator[None]:
-    """Turn errors of reading a file into ones that name it.
+    """Raise errors of reading a file as `IndexFormatError` with the file's name.
 
     Raises:
         IndexFormatError: if the file is missing, cannot be read, or is not UTF-8.
@@ -90,14 +90,14 @@ def wrap_read_errors(path: Path) -> Iterator[None]:
 
 
 def parse_json(text: str) -> Any:
-    """A JSON value.
+    """Parse a JSON text.
 
     Raises:
         IndexFormatError: without file and line, which the caller adds.
     """
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:  # also for too many digits or levels
+    except (ValueError, RecursionError) as error:  # raised for too many digits or levels, too
         raise IndexFormatError(f"not JSON: {error}") from error
     level = [value]
     for _ in range(_DEPTH):
@@ -114,18 +114,18 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def json_hash(content: Any) -> str:
-    """A hash of settings: the first 16 hexadecimal digits of SHA-256 of their JSON, keys sorted."""
+    """Return a hash of settings: the first 16 hexadecimal digits of the SHA-256 of their JSON with sorted keys."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def has_content(path: Path, content: bytes) -> bool:
-    """Whether a file exists with exactly this content."""
+    """Return whether a file exists with exactly this content."""
     return path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content
 
 
 @contextmanager
 def add_filename(path: Path) -> Iterator[None]:
-    """Add the file's name to errors of the disk, which have none when they come from an open file."""
+    """Add the file's name to an OSError without one, which operations on open files raise."""
     try:
         yield
     except OSError as error:
@@ -135,12 +135,12 @@ def add_filename(path: Path) -> Iterator[None]:
 
 
 def allocate(stream: BinaryIO, size: int) -> None:
-    """Extend a new file to `size` bytes, for which the disk really has room.
+    """Extend a new file to `size` bytes and allocate them on the disk.
 
-    A sparse file would kill a process by a signal when it writes to a map of the file and the disk is full.
+    On a full disk, writing to the memory map of a sparse file would kill the process by a signal.
 
     Raises:
-        OSError: if there is no room.
+        OSError: if the disk is full.
     """
     stream.flush()
     try:
@@ -148,18 +148,18 @@ def allocate(stream: BinaryIO, size: int) -> None:
     except (AttributeError, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL):
             raise
-        for start in range(stream.tell(), size, LINE_BYTES):  # neither the system nor its C library can allocate
+        for start in range(stream.tell(), size, LINE_BYTES):  # the system cannot allocate disk space
             stream.write(bytes(min(LINE_BYTES, size - start)))
         stream.flush()
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's content, or a folder's names, are on the disk.
+    """Wait until the content of a file or the entries of a folder are on the disk.
 
     Raises:
         OSError: if they cannot be written.
     """
-    if path.is_dir() and os.name == "nt":  # folders cannot be opened there
+    if path.is_dir() and os.name == "nt":  # Windows cannot open folders
         return
     number = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
@@ -170,16 +170,15 @@ def sync(path: Path) -> None:
 
 
 def final_name(name: str) -> str:
-    """Path, in a folder, that a temporary file of `atomic_write` would have got; other paths unchanged."""
+    """Return the final path of a temporary file of `atomic_write`; other paths are unchanged."""
     return re.sub(r"(^|/)\.([^/]+)\.partial$", r"\1\2", name)
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """A temporary path to write to. At the end the file is synced to disk and renamed to `path`; an error changes
-    nothing."""
+    """Yield a temporary path to write to, then sync the file and rename it to `path`. An error changes nothing."""
     partial = path.with_name(f".{path.name}.partial")
-    partial.unlink(missing_ok=True)  # writing would follow a link that somebody put there
+    partial.unlink(missing_ok=True)  # writing would follow a symbolic link
     try:
         with add_filename(path):
             yield partial
@@ -191,17 +190,17 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None) -> None:
-    """Check that a command may write a file, or files into a folder: what exists is replaced with `overwrite` only.
+    """Check that a command may write a file, or files into a folder.
 
     Folders and links are never replaced.
 
     Args:
-        path: the file to write; with `names` the folder.
-        overwrite: replace these files. Other files of a folder stay.
+        path: the file to write; with `names`, the folder.
+        overwrite: replace existing files. Other files in a folder are kept.
         names: names of the files to write into the folder.
 
     Raises:
-        OptionError: names the file or folder that may not be written.
+        OptionError: if a file exists without `overwrite`, or a folder or link is in the way.
     """
     if names is not None and os.path.lexists(path):
         if not path.is_dir():
@@ -216,15 +215,15 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
 
 
 def check_own_folder(folder: Path, names: Collection[str], what: str) -> None:
-    """Check that a folder may receive files with these names: it is missing, or has no others.
+    """Check that a folder is missing or contains no files other than those to write.
 
     Args:
         folder: the folder to write to.
-        names: names of files and folders that the writer makes in it.
-        what: what it holds then, such as "a run", for the message.
+        names: names of the files and folders to write.
+        what: the expected content in words, such as "a run", for the message.
 
     Raises:
-        OptionError: if it is no folder, or has files with other names; lists some of them.
+        OptionError: if it is not a folder or has other files; lists some of them.
     """
     if os.path.lexists(folder) and not folder.is_dir():
         raise OptionError(f"{folder}: a file is where a folder is needed; give another folder")
@@ -242,18 +241,18 @@ T = TypeVar("T")
 
 @contextmanager
 def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
-    """Hold a lock between processes and threads. Its file is made, with the folder for it, and removed at the end.
+    """Hold a lock between processes and threads. Creates the lock file and its folder, and removes the file at the end.
 
-    The file is removed while the lock is still held. A process that has opened it before and now gets its lock would
-    hold the lock of a file that nobody else can find: FileLock (3.24 and later) notices that and opens the path again.
+    The file is removed while the lock is held. A waiting process may then lock the deleted file: FileLock (3.24 and
+    later) detects that and opens the path again.
 
     Args:
-        path: the lock's file.
-        wait: until another process releases the lock, instead of raising.
+        path: the lock file.
+        wait: wait until another process releases the lock, instead of raising.
 
     Raises:
         filelock.Timeout: if another process holds the lock and `wait` is False.
-        OSError: if the file cannot be made.
+        OSError: if the file cannot be created.
     """
     lock = FileLock(path, timeout=-1 if wait else 0)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -261,26 +260,26 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
     try:
         yield
     finally:
-        with suppress(OSError):  # Windows removes no open file; there `release` removes it
+        with suppress(OSError):  # Windows cannot remove an open file; there, `release` removes it
             path.unlink()
         lock.release()
 
 
 def lock_path(folder: Path) -> Path:
-    """Path of a folder's lock: next to the folder, so that the folder can be renamed or removed meanwhile."""
+    """Return the path of a folder's lock file, next to the folder, which can be renamed or removed while locked."""
     return folder.with_name(f".{folder.name}.lock")
 
 
 LARGEST = 4 * 2**30
-"""Most bytes of a release's file that is not a shard."""
+"""Maximum bytes of a file of a release, except shards."""
 
 _WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _RESERVED = re.compile(r'[\\:*?"<>|]')
-_PART_BYTES = 200  # between two slashes; leaves room for the longer names of temporary files
+_PART_BYTES = 200  # bytes of a path component; leaves room for the longer names of temporary files
 
 
 def files_below(folder: Path) -> Iterator[str]:
-    """Names of everything in a folder, at any depth, except folders; symbolic links are not followed."""
+    """Yield the relative paths of all files below a folder; symbolic links are not followed."""
     folders = [""]
     while folders:
         prefix = folders.pop()
@@ -299,7 +298,7 @@ def files_below(folder: Path) -> Iterator[str]:
 
 
 def is_inside(name: str) -> bool:
-    """Whether a relative path names a file below its root on every system: no "..", drive, backslash, control code."""
+    """Return whether a relative path is safe on every system: no "..", drive, backslash or control character."""
     if len(name) >= 1024 or not name.isprintable() or _RESERVED.search(name):
         return False
     return all(
@@ -309,13 +308,13 @@ def is_inside(name: str) -> bool:
 
 
 def resolve_inside(folder: Path, name: str) -> Path:
-    """The path of a release's file, checked to stay in the release and to be a file or folder if it exists.
+    """Return the path of a release's file after checking that it is inside the release.
 
-    A snapshot folder of the Hub's cache contains links to blobs outside of it; these are allowed.
+    Links from a snapshot folder of the Hub's cache to its blobs are allowed.
 
     Raises:
-        UnsafePathError: names the folder and the file.
-        IndexFormatError: if a folder on the way cannot be read.
+        UnsafePathError: if the path leads out of the release, or to neither a file nor a folder.
+        IndexFormatError: if a folder on the path cannot be read.
     """
     path = folder / name
     if not is_inside(name):
@@ -333,7 +332,7 @@ def resolve_inside(folder: Path, name: str) -> Path:
     except PermissionError as error:
         reason = f"cannot be read: {error.strerror}; check the permissions of its folder"
         raise IndexFormatError(f"{path}: {reason}") from error
-    except (OSError, RuntimeError) as error:  # circular links, or names that this disk does not accept
+    except (OSError, RuntimeError) as error:  # circular links, or names that this file system does not accept
         raise UnsafePathError(f"{path}: cannot be followed: {error}") from error
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise UnsafePathError(f"{path}: neither a file nor a folder; do not use this release")
@@ -341,14 +340,14 @@ def resolve_inside(folder: Path, name: str) -> Path:
 
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Error numbers of a full disk, and of a used-up quota."""
+"""Error numbers of a full disk and of an exceeded quota."""
 
 NO_ROOM = (*FULL, errno.EFBIG)
-"""Error numbers of a full disk, of a used-up quota, and of a limit on the size of files."""
+"""Error numbers of a full disk, an exceeded quota, and an exceeded limit on file sizes."""
 
 
 def describe_disk(path: Path) -> str:
-    """The disk that a path is on, which need not exist, and its free space, in words."""
+    """Return a text with the free space of the disk of a path, which need not exist."""
     folder = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists()).resolve()
     disk = next(parent for parent in (folder, *folder.parents) if parent.is_mount() or parent == parent.parent)
     usage = shutil.disk_usage(folder)
@@ -357,10 +356,10 @@ def describe_disk(path: Path) -> str:
 
 @contextmanager
 def explain_full_disk(target: Path) -> Iterator[None]:
-    """Raise errors of a full disk as ones that name the file or folder which is written, and the disk.
+    """Raise an OSError of a full disk as `DiskFullError`, with the file or folder, the disk and its free space.
 
     Raises:
-        DiskFullError: instead of an OSError that says so.
+        DiskFullError: if the disk is full.
     """
     try:
         yield

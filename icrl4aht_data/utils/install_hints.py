@@ -1,9 +1,9 @@
-"""How to install what is missing. pip adds an extra to the installed copy, wherever that came from."""
+"""Commands that install missing optional packages. pip adds an extra to the installed copy, wherever it came from."""
 
 from __future__ import annotations
 
 PACKAGE = "icrl4aht-data"
-"""Name of the distribution, which has the packages icrl4aht_data, icrl4aht_generation and icrl4aht_baselines."""
+"""Name of the distribution that contains icrl4aht_data, icrl4aht_generation and icrl4aht_baselines."""
 
 EXTRAS = {
     **dict.fromkeys(("jax", "flax", "optax", "jaxtyping", "safetensors", "jinja2"), "baselines"),
@@ -18,7 +18,7 @@ EXTRAS = {
 """Optional package -> the extra that installs it."""
 
 RESTORE = f"pip install --force-reinstall --no-deps {PACKAGE}, or in a checkout git checkout ."
-"""How to restore files of this package."""
+"""Command that restores missing files of this package."""
 
 
 def install_command(*extras: str) -> str:
@@ -27,7 +27,7 @@ def install_command(*extras: str) -> str:
 
 
 def missing_library(module: str) -> str | None:
-    """Return a message that says how to install a missing module of another library; None if no extra has it."""
+    """Return a message that says how to install a missing module; None if no extra installs it."""
     top = module.partition(".")[0]
     extra = EXTRAS.get({"PIL": "pillow"}.get(top, top.lower()))
     return f"this needs {top}, which is not installed: {install_command(extra)}" if extra else None

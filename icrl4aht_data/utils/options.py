@@ -1,8 +1,7 @@
-"""Options: classes whose fields state types, bounds and help texts once, and checks of single arguments.
+"""Option classes, whose annotations give types, bounds and help texts, and checks of single arguments.
 
-A class of options is a dataclass that checks itself. The command line (`icrl4aht_data.commands.dataclass_options`),
-TOML and JSON files and Python code all meet the same bounds. A module that defines one imports no JAX, so that `--help`
-stays fast.
+An option class is a dataclass that checks itself, so the command line (`icrl4aht_data.commands.dataclass_options`),
+TOML and JSON files and Python code have the same bounds. Its module does not import JAX, to keep `--help` fast.
 
     @dataclass(frozen=True)
     class Options:
@@ -39,12 +38,12 @@ Options = TypeVar("Options")
 
 
 class Option(NamedTuple):
-    """Annotation of a field that is an option of the command line.
+    """Annotation that makes a field an option of the command line.
 
     Attributes:
         help: one sentence.
-        flags: further names of the option, such as "--ta"; the first is the field's name with dashes.
-        default: text that is shown as its default, for a default that says nothing, such as None.
+        flags: additional names of the option, such as "--ta", besides the field's name with dashes.
+        default: text to show in place of an uninformative default, such as None.
     """
 
     help: str
@@ -54,7 +53,7 @@ class Option(NamedTuple):
 
 @cache
 def option_hints(kind: type) -> dict[str, Any]:
-    """Return the fields of a dataclass that are options: name -> annotation."""
+    """Return field name -> annotation, for the fields of a dataclass that are options."""
     hints = get_type_hints(kind, include_extras=True)
     return {name: hint for name, hint in hints.items() if any(isinstance(part, Option) for part in get_args(hint))}
 
@@ -63,8 +62,8 @@ def check_options(options: Any) -> None:
     """Check the values of a dataclass against its annotations; lists become tuples.
 
     Raises:
-        OptionError: names the field, its value and what was expected.
-        UnknownNameError: for a value that is not among the choices; lists them.
+        OptionError: if a value has another type or is out of bounds.
+        UnknownNameError: if a value is not among the choices; lists them.
     """
     for name, hint in option_hints(type(options)).items():
         value = getattr(options, name)
@@ -74,17 +73,17 @@ def check_options(options: Any) -> None:
 
 
 def convert_option(name: str, value: Any, hint: Any, strict: bool = True) -> Any:
-    """Return a value as its annotation says.
+    """Convert a value to the type of its annotation, and check its bounds.
 
     Args:
         name: name of the field, for messages.
         value: the value.
         hint: the annotation.
-        strict: refuse texts for numbers; False for the command line.
+        strict: refuse strings for numbers; False for the command line.
 
     Raises:
-        OptionError: if the value does not fit.
-        UnknownNameError: if it is not among the choices.
+        OptionError: if the value has another type or is out of bounds.
+        UnknownNameError: if the value is not among the choices.
     """
     choices = option_choices(hint)
     if choices and value is not None and value not in choices:
@@ -99,7 +98,7 @@ def convert_option(name: str, value: Any, hint: Any, strict: bool = True) -> Any
 
 
 def annotation_parts(hint: Any) -> Iterator[Any]:
-    """Yield an annotation and everything that it is composed of: types, bounds, help."""
+    """Yield an annotation and, recursively, its parts: types, bounds, help."""
     yield hint
     for part in get_args(hint):
         yield from annotation_parts(part)
@@ -111,16 +110,16 @@ def option_choices(hint: Any) -> tuple[Any, ...]:
 
 
 def replace_options(options: Options, values: Mapping[str, Any], where: str = "") -> Options:
-    """Return a copy of a dataclass with other values for some fields, at any depth of nested dataclasses.
+    """Return a copy of a dataclass with some fields replaced, including those of nested dataclasses.
 
     Args:
         options: an instance.
-        values: field -> value, as in JSON or TOML; for a nested dataclass a mapping.
-        where: name of the instance with a dot, such as "ego.", for messages.
+        values: field -> value, as in JSON or TOML; a mapping for a nested dataclass.
+        where: prefix of field names in messages, such as "ego.".
 
     Raises:
-        OptionError: from the dataclass's own checks, or if a value is no mapping where one is expected.
-        UnknownNameError: for a field that does not exist.
+        OptionError: if a check of the dataclass fails, or the value for a nested dataclass is not a mapping.
+        UnknownNameError: if a field does not exist.
     """
     instance: Any = options
     known = [field.name for field in dataclasses.fields(instance)]
@@ -140,10 +139,10 @@ def replace_options(options: Options, values: Mapping[str, Any], where: str = ""
 
 
 def check_int(name: str, value: Any, least: int) -> int:
-    """The value as an int, checked to be an integer from `least` to 2**63 - 1.
+    """Return the value as an int after checking that it is an integer from `least` to 2**63 - 1.
 
     Raises:
-        OptionError: names the option.
+        OptionError: if it is not; with the option's name.
     """
     try:
         if isinstance(value, bool):
@@ -157,16 +156,16 @@ def check_int(name: str, value: Any, least: int) -> int:
 
 
 def check_position(sequence: str, position: Any, count: int) -> int:
-    """The position of an item as an int, checked to be an integer from -count to count - 1.
+    """Return a position as an int after checking that it is an integer from -count to count - 1.
 
     Args:
-        sequence: the sequence in words, for the message.
-        position: from 0, or from the end if negative.
+        sequence: name of the sequence, for the message.
+        position: the position, counted from 0, or from the end if negative.
         count: number of items.
 
     Raises:
-        PositionTypeError: for anything but an integer.
-        PositionError: for a position that the sequence does not have.
+        PositionTypeError: if the position is not an integer.
+        PositionError: if the position is out of range.
     """
     try:
         if isinstance(position, bool):

@@ -1,6 +1,6 @@
-"""Objects that other installed packages register by entry points: known by name, imported when they are needed.
+"""Plugins: objects that other installed packages register as entry points, imported on first use.
 
-A package names its objects in its pyproject.toml, here a layout:
+A package registers an object in its pyproject.toml, for example a layout:
 
     [project.entry-points."icrl4aht.layouts"]
     open_kitchen = "my_package.layouts:OPEN_KITCHEN"
@@ -18,17 +18,17 @@ from icrl4aht_data.errors import PluginError
 from icrl4aht_data.utils.install_hints import PACKAGE
 
 METHOD_GROUP = "icrl4aht.methods"
-"""Group of methods, which `baselines` knows and `doctor` lists."""
+"""Entry-point group of training methods, which `doctor` lists."""
 
 
 class Plugins:
-    """The objects that installed packages register in one group of entry points.
+    """Objects that installed packages register in one group of entry points.
 
-    The metadata of the packages is read on first use, once per process, and takes milliseconds.
+    Package metadata is read on first use, once per process, which takes milliseconds.
 
     Args:
         group: name of the group, such as "icrl4aht.layouts".
-        own: names that this package has itself, which others may not register.
+        own: names that this package uses itself, which other packages may not register.
     """
 
     def __init__(self, group: str, own: Iterable[str]) -> None:
@@ -37,11 +37,11 @@ class Plugins:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The registered names, sorted; nothing is imported.
+        """Sorted registered names; nothing is imported.
 
         Raises:
-            PluginError: for a name that this package has itself, or that two packages register, or that has characters
-                other than letters, digits, "_" and "-"; names the packages.
+            PluginError: if this package or two others use the same name, or a name has characters other than letters,
+                digits, "_" and "-".
         """
         return tuple(self._found)
 
@@ -55,19 +55,19 @@ class Plugins:
         return {name: _package(point) for name, point in self._found.items()}
 
     def load(self, name: str, kind: Any) -> Any:
-        """Return a registered object, which is imported on the first call.
+        """Return a registered object; the first call imports it.
 
         Args:
             name: one of `names`.
-            kind: the class that it has to have, or `Callable`.
+            kind: the expected class, or `Callable`.
 
         Raises:
-            PluginError: if it cannot be imported, or is of another kind; names the package and the entry point.
+            PluginError: if it cannot be imported or has another class; with the package and the entry point.
         """
         if name not in self._loaded:
             try:
                 loaded = self._found[name].load()
-            except Exception as error:  # anything may go wrong in another package
+            except Exception as error:  # importing another package may raise any exception
                 reason = f"cannot be imported ({type(error).__name__}: {error}): correct the package, or uninstall it"
                 raise self.error(name, reason) from error
             if not isinstance(loaded, kind):
@@ -76,7 +76,7 @@ class Plugins:
         return self._loaded[name]
 
     def error(self, name: str, problem: str) -> PluginError:
-        """Return the error for a problem with a registered object; it names the package and the entry point."""
+        """Return a `PluginError` with the package and the entry point of a registered object."""
         point = self._found[name]
         return PluginError(f"package {_package(point)}, entry point {self.group}: {name} = {point.value}: {problem}")
 

@@ -1,4 +1,4 @@
-"""Progress of long work: bars on a terminal, and a plain line a minute where the output is a file or a pipe."""
+"""Progress display: bars on a terminal, and one plain line a minute in a file or pipe."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 from rich.text import Text
 
 FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 60.0
-"""Time before the first plain line, and between two lines."""
+"""Seconds before the first plain line and between lines."""
 
 
 @contextmanager
 def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -> Iterator[Callable[..., None]]:
     """Show progress on stderr; yield a function `show(name, done, total, note="")` with one bar for each name.
 
-    Any thread may call it. A `total` of None is an unknown one.
+    Any thread may call `show`. A `total` of None means unknown.
 
     Args:
         quiet: show nothing.
-        unit: what plain lines count, such as "steps".
-        of_bytes: the numbers are bytes: show sizes and speed.
+        unit: unit of the numbers in plain lines, such as "steps".
+        of_bytes: whether the numbers are bytes; shows sizes and speed.
     """
     console = Console(stderr=True)
     if quiet:
@@ -64,16 +64,15 @@ def counted(show: Callable[..., None], name: str, total: int) -> Callable[[int],
 
 
 class PlainLines:
-    """Bars as text: what is done, how far it is, how fast, and the time left.
+    """Progress as plain lines: amount done, percentage, speed, and time left.
 
-    The speed is the mean since a bar's first move: it falls while nothing moves, and what a resumed run had finished
-    before does not count.
+    The speed is the mean since the first update, so the work that a resumed run had finished before does not count.
 
     Args:
-        console: where to print.
-        unit: what the numbers count; for bytes see `progress_bars`.
-        of_bytes: the numbers are bytes.
-        clock: returns the time in seconds.
+        console: console to print to.
+        unit: unit of the numbers.
+        of_bytes: whether the numbers are bytes, see `progress_bars`.
+        clock: function that returns the time in seconds.
     """
 
     def __init__(
@@ -82,10 +81,10 @@ class PlainLines:
         self._console, self._unit, self._of_bytes, self._clock = console, unit, of_bytes, clock
         self._bars: dict[str, tuple[float, float | None, str]] = {}
         self._starts: dict[str, float] = {}
-        self._first_moves: dict[str, tuple[float, float]] = {}  # time, and what was done then
+        self._first_moves: dict[str, tuple[float, float]] = {}  # name -> time and amount done at the first update
 
     def show(self, name: str, done: float, total: float | None, note: str = "") -> None:
-        """Change a bar."""
+        """Update the amount, total and note of a bar."""
         now = self._clock()
         self._starts.setdefault(name, now)
         if done:
@@ -120,7 +119,7 @@ class PlainLines:
 
 @contextmanager
 def _printed_lines(lines: PlainLines) -> Iterator[PlainLines]:
-    """Print the lines at intervals, by a thread of their own, so that they also appear while a step takes long."""
+    """Print the lines at intervals from a separate thread, so that they also appear during a long step."""
     stopped = threading.Event()
 
     def print_repeatedly() -> None:
@@ -139,7 +138,7 @@ def _printed_lines(lines: PlainLines) -> Iterator[PlainLines]:
 
 
 def _duration(seconds: float) -> str:
-    """A duration in words: "40 s", "5 min", "1 h 20 min"."""
+    """Return a duration as text, such as "40 s", "5 min" or "1 h 20 min"."""
     minutes = round(seconds / 60)
     if seconds < 60:
         return f"{seconds:.0f} s"

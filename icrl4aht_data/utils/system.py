@@ -1,8 +1,8 @@
-"""The machine: free memory, a pool of threads, and the folders for cached arrays and fetched releases.
+"""Free memory, a pool of threads, and the folders for cached arrays and fetched releases.
 
 The cache folder is $ICRL4AHT_CACHE_DIR, else the user's cache folder (`platformdirs`); its size limit is
-$ICRL4AHT_CACHE_BYTES (100 GB by default). It is never the release folder: a release contains what its manifest lists
-and nothing else, and is often read-only. Deleting the folder costs nothing but time.
+$ICRL4AHT_CACHE_BYTES (100 GB by default). Release folders are not used as caches: they contain only files of the
+manifest, and are often read-only. Deleting the cache folder is always safe.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _CGROUPS = (  # limit and use of a control group, versions 2 and 1
 
 
 def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray:
-    """An uninitialised array, if enough memory is free.
+    """Return an uninitialised array, if enough memory is free.
 
     Raises:
-        OptionError: if not; names what is too large.
+        OptionError: if memory is short; with the array's name and size.
     """
     size = array_bytes(shape, dtype)
     if fits(size):
@@ -41,12 +41,12 @@ def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray
 
 
 def array_bytes(shape: tuple[int, ...], dtype: DTypeLike) -> int:
-    """Bytes of an array."""
+    """Return the size of an array in bytes."""
     return math.prod(shape) * np.dtype(dtype).itemsize
 
 
 def fits(size: int) -> bool:
-    """Whether so many bytes of memory are free; a few are taken to be."""
+    """Return whether so much memory is free; True without a check for small sizes."""
     return size < _PLENTY or size <= free_memory()
 
 
@@ -57,16 +57,16 @@ def gigabytes(size: int) -> str:
 
 
 def free_memory() -> int:
-    """Bytes that this process may still allocate on this machine, in its control group, and by its own limit."""
+    """Return the bytes that this process can still allocate, by the machine's, control group's and process's limits."""
     free = []
     with suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 free.append(int(line.split()[1]) * 1024)
     for limit, used in _CGROUPS:
-        with suppress(OSError, ValueError):  # there is no such group, or its limit is "max"
+        with suppress(OSError, ValueError):  # the control group is missing, or its limit is "max"
             free.append(int(Path(limit).read_text()) - int(Path(used).read_text()))
-    with suppress(ImportError, OSError, ValueError):  # no such limits on this system
+    with suppress(ImportError, OSError, ValueError):  # Windows has no process limits
         import resource
 
         limit, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -85,23 +85,23 @@ _pool: ThreadPoolExecutor | None = None
 
 
 def usable_cores() -> int:
-    """Number of cores that this process may run on."""
+    """Return the number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
-    except AttributeError:  # the system has no affinities
+    except AttributeError:  # the system does not support CPU affinity
         return os.cpu_count() or 1
 
 
 def in_slices(work: Callable[[int, int], None], n: int, threads: int, least: int = 1) -> None:
-    """Call `work(start, stop)` for slices that cover 0..n, on up to `threads` threads.
+    """Call `work(start, stop)` on slices that cover 0..n, on up to `threads` threads including the caller's.
 
-    The caller's thread works too. If slices raise, one of the errors is raised here after all slices have ended.
+    If slices raise, one of the errors is raised after all slices have ended.
 
     Args:
-        work: handles the range from `start` to `stop`.
+        work: function that processes the range from `start` to `stop`.
         n: length of the complete range.
-        threads: at most this many slices.
-        least: shortest slice that is worth a thread.
+        threads: maximum number of slices.
+        least: minimum length of a slice.
     """
     parts = max(1, min(threads, n // max(least, 1)))
     edges = [n * part // parts for part in range(parts + 1)]
@@ -127,34 +127,35 @@ def _forget_pool() -> None:
     _pool = None
 
 
-if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
+if hasattr(os, "register_at_fork"):  # threads do not survive a fork
     os.register_at_fork(after_in_child=_forget_pool)
 
 
 _DEFAULT_LIMIT = 100 * 10**9
 
 CACHE_VARIABLES = ("ICRL4AHT_CACHE_DIR", "XDG_CACHE_HOME")
-"""Environment variables that set the cache folder; below the second one it is called icrl4aht."""
+"""Environment variables that set the cache folder: the first directly, the second as the parent of `icrl4aht`."""
 
 DATA_VARIABLES = ("ICRL4AHT_DATA_DIR", "XDG_DATA_HOME")
-"""Environment variables that set the data folder; below the second one it is called icrl4aht."""
+"""Environment variables that set the data folder: the first directly, the second as the parent of `icrl4aht`."""
 
 
 def cache_folder() -> Path:
-    """The folder of cached arrays, read from the environment at each call; ~/.cache/icrl4aht by default on Linux."""
+    """Return the folder of cached arrays; ~/.cache/icrl4aht by default on Linux. Reads the environment at each call."""
     own = os.environ.get(CACHE_VARIABLES[0])
     return Path(own).expanduser() if own else platformdirs.user_cache_path("icrl4aht", appauthor=False)
 
 
 def data_folder() -> Path:
-    """The folder of fetched releases, read from the environment at each call; ~/.local/share/icrl4aht by default on
-    Linux. It is not a cache: nothing in it is removed."""
+    """Return the folder of fetched releases; ~/.local/share/icrl4aht by default on Linux.
+
+    Reads the environment at each call. Unlike in the cache folder, nothing is removed automatically."""
     own = os.environ.get(DATA_VARIABLES[0])
     return Path(own).expanduser() if own else platformdirs.user_data_path("icrl4aht", appauthor=False)
 
 
 def cache_limit() -> int:
-    """Most bytes that the cache folder may contain.
+    """Return the maximum size of the cache folder in bytes.
 
     Raises:
         OptionError: if the environment variable is not a number of bytes.

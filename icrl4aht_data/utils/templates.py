@@ -1,4 +1,4 @@
-"""The project's `cards` folder: finding its files, filling templates, Markdown tables."""
+"""Files and templates of the `cards` folder, and Markdown tables."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ _PACKAGE = Path(__file__).parent.parent
 
 
 def card_file(name: str, package: Path = _PACKAGE) -> Path:
-    """Path of a template, table, licence or citation.
+    """Return the path of a template, table, licence or citation.
 
-    An installed package contains the folder `cards`. In a checkout it is next to the package, and LICENSE and
-    CITATION.cff are in the checkout's root.
+    An installed package contains the folder `cards`. In a checkout, `cards` is next to the package, and LICENSE and
+    CITATION.cff are in the root.
 
     Args:
         name: file name.
-        package: the folder of the package.
+        package: folder of the package.
 
     Raises:
-        OptionError: if there is no such file.
+        OptionError: if the file is missing.
     """
     for folder in (package / "cards", package.parent / "cards", package.parent):
         if (folder / name).is_file():
@@ -32,7 +32,7 @@ def card_file(name: str, package: Path = _PACKAGE) -> Path:
 
 
 def fill_template(template: str, **values: str) -> str:
-    """The text of a template in the folder `cards`, with every $name replaced.
+    """Return the text of a template in the folder `cards`, with every $name replaced.
 
     Raises:
         KeyError: if a value is missing.
@@ -41,7 +41,7 @@ def fill_template(template: str, **values: str) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], right: int = 0) -> str:
-    """A Markdown table; its last `right` columns are aligned to the right."""
+    """Return a Markdown table whose last `right` columns are right-aligned."""
     rule = "|" + "---|" * (len(header) - right) + "---:|" * right
     lines = [f"| {' | '.join(cells)} |" for cells in (header, *rows)]
     return "\n".join([lines[0], rule, *lines[1:]])

@@ -1,4 +1,4 @@
-"""Text for people: numbers with nouns, and tables of facts as HTML for notebooks."""
+"""Formatting of numbers with nouns, and of HTML tables for notebooks."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from html import escape
 
 
 def counted_noun(number: int, noun: str, plural: str | None = None) -> str:
-    """A number with a noun in the singular or plural; by default the plural has an s."""
+    """Return a number with its noun in the singular or plural; the default plural adds an s."""
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
 
 
 def counted_histories(number: int) -> str:
-    """A number of histories in words."""
+    """Return a number of histories as text, such as "1 history" or "2,000 histories"."""
     return counted_noun(number, "history", "histories")
 
 
@@ -24,11 +24,11 @@ def facts_html(title: str, facts: Mapping[str, str], figure: str = "") -> str:
 
     Args:
         title: text of the first line.
-        facts: name -> value, one row each.
-        figure: HTML between the title and the table, such as `plotting.curve_svg` returns.
+        facts: name -> value, one table row each.
+        figure: HTML between the title and the table, for example from `plotting.curve_svg`.
     """
     cell = "text-align:left;vertical-align:top;padding:1px 12px 1px 0"
-    table = "margin:4px 0;table-layout:auto"  # notebooks would centre it
+    table = "margin:4px 0;table-layout:auto"  # notebooks centre tables by default
     rows = "".join(
         f'<tr><th scope="row" style="{cell};white-space:nowrap">{escape(name)}</th>'
         f'<td style="{cell}">{escape(value)}</td></tr>'

@@ -107,7 +107,7 @@ def test_a_hostile_checkpoint(tmp_path, policy, weights, message):
 
 def test_a_pipe_for_a_checkpoint(tmp_path):
     os.mkfifo(tmp_path / POLICY_CARD)
-    with pytest.raises(OptionError, match="not a plain file"):
+    with pytest.raises(OptionError, match="not a regular file"):
         load_policy(tmp_path)
 
 

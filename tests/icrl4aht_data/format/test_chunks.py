@@ -74,7 +74,7 @@ def read_window(root: Path, mode: CacheMode) -> np.ndarray:
 def test_bytes_behind_the_deflate_stream_are_refused(tail):
     data = encode_chunk(np.arange(12, dtype=np.uint8).reshape(4, 3), 4, 3)
     assert decode_chunk(data, 12, 3) == bytes(range(12))
-    with pytest.raises(ValueError, match=f"{len(tail)} bytes behind the end of the deflate stream"):
+    with pytest.raises(ValueError, match=f"{len(tail)} bytes after the end of the deflate stream"):
         decode_chunk(data + tail, 12, 3)
 
 
