@@ -1,4 +1,4 @@
-"""The demo, with a tiny model on few histories; the slow test also plays and uses the bundled release."""
+"""The demo with a tiny model on few histories; the slow test runs it on the bundled release."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ EARNED = {"stay": 0.0, "random": 2.0, "oracle": 50.0}
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Random play of both sources."""
+    """Return a release of random play with both sources."""
     root = tmp_path_factory.mktemp("demo") / "release"
     random_release(root, layouts=("demo_wide",), streams=2, length=100, sources=("noise", "ppo"))
     return root
 
 
 def evaluate_without_playing(agent, make, tasks, protocol, *, seeds, out, details):
-    """Write results: the model earns 10 more than `random` with H4, and as much as `random` with H2."""
+    """Write results in which the model earns 10 more than `random` with H4 and equally much with H2."""
     settings = {"agent": agent, "seeds": list(seeds), "protocol": asdict(protocol), "code_version": "0"}
     settings |= {"details": details} if details else {}
     results = []
@@ -57,8 +57,8 @@ def evaluate_without_playing(agent, make, tasks, protocol, *, seeds, out, detail
     return results
 
 
-def test_an_agent_leads_if_it_earns_surely_more_than_both():
-    """Four pairs of a task and a seed, six episodes each, that differ by up to 1 from the agent's mean."""
+def test_an_agent_leads_if_its_gain_over_both_is_significant():
+    """Four pairs of task and seed with six episodes each deviate by up to 1 from the agent's mean."""
 
     def returns(**means: float) -> dict[str, np.ndarray]:
         spread = np.linspace(-1, 1, 4)[:, None] * np.ones((4, 6))
@@ -74,14 +74,14 @@ def test_an_agent_leads_if_it_earns_surely_more_than_both():
 
 
 def run(out: Path, settings: demo.DemoSettings) -> tuple[str, Path]:
-    """Text and report of a demo."""
+    """Run a demo; return its output and report."""
     text = StringIO()
     page = demo.run_demo(out, Console(file=text, width=300), settings)
     return text.getvalue(), page
 
 
-def test_every_step_is_taken(release, tmp_path, monkeypatch):
-    """All steps; the model is trained, and not played."""
+def test_the_demo_runs_every_step(release, tmp_path, monkeypatch):
+    """The model is trained; its evaluation is replaced by invented results."""
     monkeypatch.setattr(demo, "evaluate", evaluate_without_playing)
     monkeypatch.setattr(gifs, "save_episodes", lambda *arguments, **named: ())
     text, page = run(tmp_path, replace(SETTINGS, root=release))

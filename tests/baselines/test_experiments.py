@@ -1,4 +1,4 @@
-"""Experiments: trained, evaluated, reported; finished work is kept; held-out teammates."""
+"""Experiments: training, evaluation, reports, resume and held-out teammates."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ SMALL = ExperimentPlan(train=TRAIN, model=MODEL, methods=("ad",), families=("H4"
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Random play long enough for K = 500."""
+    """Return a release of random play long enough for K = 500."""
     root = tmp_path_factory.mktemp("experiments") / "release"
     random_release(root, layouts=("demo_wide", "cramped_up"), teammates=1, streams=2, episodes=6, length=100)
     return root
@@ -69,7 +69,7 @@ def test_the_settings_are_the_papers():
 
 
 def test_models_are_evaluated_on_validation_tasks_of_their_own_layout(release, tmp_path, monkeypatch):
-    """The layout track tests on other layouts; its validation tasks are on those of the training."""
+    """In the layout track, validation tasks use the training layouts, test tasks use others."""
     entry = {"kind": "heuristic", "family": "utility_greedy", "theta_id": 7, "base_seed": 1, "theta": {}}
     tasks = {track: [make_task(track, "validation", name, entry, 0) for name in names] for track, names in (
         ("teammate", ("demo_wide", "demo_simple")), ("layout", ("cramped_up",)))}  # fmt: skip
@@ -91,8 +91,8 @@ def test_models_are_evaluated_on_validation_tasks_of_their_own_layout(release, t
         run_experiment("heldout-rl", plan, tmp_path)
 
 
-def test_a_sweep_over_contexts_acts_exactly_unless_told_otherwise(release, tmp_path, monkeypatch):
-    """Cached acting has down to 4/5 K steps."""
+def test_a_sweep_over_contexts_acts_exactly_by_default(release, tmp_path, monkeypatch):
+    """Cached acting drops to 4/5 K steps and would blur the comparison of K."""
     chosen = []
     monkeypatch.setattr(experiments, "train", lambda *arguments, **options: None)
 
@@ -113,7 +113,7 @@ def test_a_sweep_over_contexts_acts_exactly_unless_told_otherwise(release, tmp_p
 
 
 def interrupt_after(what: str):
-    """Returns a progress callback that raises when this part is done."""
+    """Return a progress callback that raises when the given part is done."""
 
     def progress(task: str, done: int, total: int) -> None:
         if what in task and done == total:
@@ -124,7 +124,7 @@ def interrupt_after(what: str):
 
 @pytest.fixture(scope="module")
 def swept(release, tmp_path_factory) -> tuple[Path, ExperimentPlan]:
-    """An experiment that was interrupted twice, then run to its end."""
+    """Return an experiment that was interrupted twice and then completed."""
     out = tmp_path_factory.mktemp("swept")
     plan = dataclasses.replace(SMALL, root=str(release), values=("K250",))
     for what in ("K250 on demo_wide: training steps", "K250 on demo_wide: episodes"):
@@ -168,7 +168,7 @@ def test_finished_work_is_kept(swept, monkeypatch):
 
 @pytest.fixture(scope="module")
 def ablated(release, tmp_path_factory) -> Path:
-    """DPT with all of its options."""
+    """Return an experiment with DPT and all of its options."""
     out = tmp_path_factory.mktemp("ablated")
     plan = dataclasses.replace(
         SMALL,
@@ -218,7 +218,7 @@ def test_the_page_shows_the_reported_agent(ablated, tmp_path):
         assert f"{folder} {why}" in pair.caption
 
 
-def test_impossible_trainings_fail_before_any_work(release, tmp_path):
+def test_invalid_trainings_fail_before_the_first_run(release, tmp_path):
     random_release(tmp_path / "plain", layouts=("demo_wide",), teammates=1, streams=2, episodes=6, labels=False)
     plan = dataclasses.replace(SMALL, root=str(tmp_path / "plain"), methods=("ad", "dpt"))
     with pytest.raises(LabelsMissingError, match=r"dpt none on demo_wide: labels = expert: .* leave it out, by"):
@@ -249,7 +249,7 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
         "filters": {"teammate_family": ("rl",), "algorithm": ("fcp", "brdiv")},
         "acting": None,
         "save_minutes": 0.5,
-        "batch_size": 8,  # the default of a CPU; the given one takes precedence
+        "batch_size": 8,  # the CPU's default; a given value overrides it
         "layouts": ("cramped_up",),
         "values": ("ta",),
         "train": {"steps": 1, "batch_size": 2, "warmup": 0.5},
@@ -290,13 +290,13 @@ def test_a_size_applies_to_all_entries_and_sweeps_vary_it(release, tmp_path, mon
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory) -> Path:
-    """One untrained checkpoint, held out on cramped_up."""
+    """Write a suite of one untrained checkpoint that is held out on cramped_up."""
     root = tmp_path_factory.mktemp("suite")
     layout = get_layout("cramped_up")
     network = ActorCritic(Widths((4,), (4,), 8, 8, 8))
     where = "cramped_up/fcp/m0/c0"
     shapes = jax.eval_shape(lambda: network.untrained(jax.random.key(0), layout.channels))
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # without compiling the initialisation
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)  # skips compiling the initialisation
     save_policy(root / where, network, zeros, {"seed": 0})
     entry = {"kind": "rl", "family": "fcp", "theta_id": 0, "base_seed": 0}
     entry["theta"] = {"checkpoint": where, "sha256": file_hash(root / where / POLICY_WEIGHTS)}
@@ -335,7 +335,7 @@ def test_suites_without_held_out_teammates(release, suite, tmp_path):
         held_out_tasks(None, "cramped_up", str(release))
 
 
-def test_teammates_that_were_trained_with_are_refused(suite, tmp_path):
+def test_training_teammates_are_refused_as_held_out(suite, tmp_path):
     random_release(tmp_path, layouts=("cramped_up",), teammates=1, streams=2, episodes=2)
     (task,) = read_tasks(suite / "manifests" / "layout_heldout.jsonl")
     met = make_task("layout", "train", "cramped_up", task.teammate, 0)
@@ -345,7 +345,7 @@ def test_teammates_that_were_trained_with_are_refused(suite, tmp_path):
         held_out_tasks(suite, "cramped_up", str(tmp_path))
 
 
-def test_impossible_plans(release, tmp_path):
+def test_invalid_plans(release, tmp_path):
     def fails(error, match, name="ablate ta", **changes):
         with pytest.raises(error, match=match):
             run_experiment(name, dataclasses.replace(SMALL, **{"root": str(release), **changes}), tmp_path)

@@ -1,4 +1,4 @@
-"""What users import from the package."""
+"""Public imports of the package."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_other_names():
 
 
 def test_the_test_tasks_of_a_track():
-    from icrl4aht_baselines import test_tasks as tasks_of  # pytest would collect a function of its real name
+    from icrl4aht_baselines import test_tasks as tasks_of  # pytest would collect `test_tasks` as a test
 
     sizes = [
         len(tasks_of(track, layout))

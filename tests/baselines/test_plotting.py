@@ -1,4 +1,4 @@
-"""Figures of training and evaluation: few panels, one legend, and one axis of returns."""
+"""Figures of training and evaluation: few panels, one legend, shared return axes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.helpers.evaluated import evaluated_run
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures that were drawn, instead of files."""
+    """Collect the drawn figures instead of writing files."""
     figures = []
     monkeypatch.setattr(plotting, "save_figure", lambda figure, path: figures.append(figure))
     return figures

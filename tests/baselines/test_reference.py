@@ -1,4 +1,4 @@
-"""Reference models: their recipes, the steps that lead to them, and resuming."""
+"""Reference models: recipes, the steps of building them, and resume."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_recipes_are_valid_settings(name):
 
 
 def test_recipes_make_the_bundled_models():
-    """The settings of the bundled models' runs, except for paths and what came after them."""
+    """Recipes equal the settings stored with the bundled models, except paths and newer options."""
     names = {
         "rl2": "rl2-reference",
         "ad-student": "ad-reference",
@@ -90,7 +90,7 @@ def test_unknown_names(tmp_path):
 
 @pytest.fixture
 def steps(tmp_path, monkeypatch) -> list[tuple[str, ...]]:
-    """The steps that are taken: trainings, recordings and combinations, none of which does anything."""
+    """Replace training, recording and combining by stubs; return the list of calls."""
     taken: list[tuple[str, ...]] = []
 
     def note(what: str, *names: Any) -> None:
@@ -121,7 +121,7 @@ def steps(tmp_path, monkeypatch) -> list[tuple[str, ...]]:
     return taken
 
 
-def test_the_steps_to_ad_reference(steps, tmp_path):
+def test_steps_of_building_ad_reference(steps, tmp_path):
     found = make_reference("ad-student", "layout", tmp_path, print, evaluates=False)
     assert found == ReferenceOutcome("ad-student", "layout", tmp_path / "ad-student-layout", {})
     rate = f"{RECIPES['rl2'].train.get('learning_rate', TrainOptions.learning_rate):g}"
@@ -130,7 +130,7 @@ def test_the_steps_to_ad_reference(steps, tmp_path):
         play,
         ("collect", "rl2-layout", "40", "student-layout", "None"),
         ("train", "ad-student-layout-first", "0.002", "None"),
-        play,  # finished: this one only looks for the checkpoint
+        play,  # finished: this stub only looks for the checkpoint
         ("collect", "ad-student-layout-first", "20", "ad-student-layout-own", "rl2-layout"),
         ("combine", "ad-student-layout-mixed", "student-layout", "ad-student-layout-own"),
         ("train", "ad-student-layout", "0.001", "ad-student-layout-first"),
@@ -163,7 +163,7 @@ def test_times_of_parts(tmp_path):
 
 
 def test_one_track_of_a_bundled_model_is_replaced(tmp_path, monkeypatch):
-    """The other one stays and is evaluated again, for the card; a new model needs all tracks."""
+    """The other track is kept and evaluated again for the card; a new model needs all tracks."""
     made, copied, cards = [], [], []
 
     def make(name: str, track: str, *given: Any, **options: Any) -> ReferenceOutcome:
@@ -225,7 +225,7 @@ def test_a_finished_run_is_only_evaluated(tmp_path, monkeypatch):
 
 @pytest.fixture
 def small(monkeypatch, tmp_path) -> Path:
-    """Recipes that take seconds, and the bundled release in place of the rebuilt one."""
+    """Use recipes that take seconds and the bundled release instead of a rebuilt one."""
     for name, recipe in RECIPES.items():
         sizes: dict[str, Any] = TINY if recipe.data else {"steps": 1, "batch_size": 8}
         model = MODEL if recipe.data else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
@@ -242,7 +242,7 @@ def small(monkeypatch, tmp_path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_model_of_histories_of_rl2_and_of_its_own(small):
+def test_a_model_of_rl2_histories_and_its_own(small):
     found = make_reference("ad-student", "layout", small, lambda *shown: None, evaluates=False)
     assert found.run == small / "ad-student-layout" and found.results == {}
     made = {path.name for path in small.iterdir() if path.is_dir() and not path.name.startswith(".")}

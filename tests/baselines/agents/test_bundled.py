@@ -1,4 +1,4 @@
-"""Bundled models: copies of runs, found by name, and listed."""
+"""Bundled models: copied from runs, loaded by name and listed."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def models(run, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_a_bundled_model_is_the_run(run, models):
+def test_bundling_copies_the_parameters_of_the_run(run, models):
     one, two = read_trained(run), read_trained(models / "ad-tiny" / "teammate")
     jax.tree.map(np.testing.assert_array_equal, one.params, two.params)
     assert (one.step, one.context, one.layouts, one.trained_on) == (two.step, two.context, two.layouts, two.trained_on)
@@ -61,7 +61,7 @@ def test_a_bundled_model_is_the_run(run, models):
         assert copied.size == drawn.size and copied.mode == "P"
 
 
-def test_it_plays_as_the_run_does(run, models, tmp_path):
+def test_a_bundled_model_earns_what_its_run_earns(run, models, tmp_path):
     task, protocol = published_task("demo_wide", "H4/t0"), get_protocol("seeded", 2)
     found = []
     for name in (str(run), "ad-tiny"):
@@ -74,7 +74,7 @@ def test_it_plays_as_the_run_does(run, models, tmp_path):
     assert found[1].settings["details"]["trained_on"] == {"teammate": read_trained(run).trained_on}
 
 
-def test_a_bundled_model_plays_in_its_own_way(run, tmp_path, monkeypatch):
+def test_a_bundled_model_keeps_its_play_mode(run, tmp_path, monkeypatch):
     bundle_run(run, "ad-drawn", "teammate", tmp_path, sampled=True)
     monkeypatch.setattr(bundled.bundled_models, "__defaults__", (tmp_path,))
     by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", greedy=True)
@@ -88,8 +88,8 @@ def test_a_bundled_model_plays_in_its_own_way(run, tmp_path, monkeypatch):
     assert result.output.endswith("(source noise), draws its actions\n")
 
 
-def test_marks_are_those_of_the_model_of_the_track():
-    """The model of one track was trained with H2, that of the other was not."""
+def test_overlap_marks_depend_on_the_track():
+    """Only one track's model was trained with H2."""
     entries = {
         "teammate": [{"layout": "demo_wide", "family": "H1"}],
         "layout": [{"layout": "cramped_up", "family": "H2"}],
@@ -103,7 +103,7 @@ def test_marks_are_those_of_the_model_of_the_track():
     assert run.overlaps([ResultCell("cramped_down", "H2")]) == ("family",)
 
 
-def test_layouts_of_other_tracks(models):
+def test_layouts_outside_the_track_are_refused(models):
     message = "ad-tiny: has no model of track layout, whose layout is cramped_down; it has teammate: choose tasks"
     with pytest.raises(OptionError, match=message):
         find_agent("ad-tiny").make(get_layout("cramped_down"))
@@ -161,7 +161,7 @@ def test_models_command(models):
 
 
 class TestPlayMode:
-    def test_other_ways_have_other_names(self, run):
+    def test_play_modes_change_the_agents_name(self, run):
         assert find_agent(run, greedy=False, forget=True).name == "AD+mlp (sampled) (forgets)"
         with pytest.raises(UnknownNameError, match=r"unknown acting 'exat'.*Did you mean 'exact'"):
             find_agent(run, acting="exat")  # type: ignore[arg-type]
@@ -172,8 +172,8 @@ class TestPlayMode:
         assert PlayMode().details == {"acting": "cached"}
 
     @pytest.mark.slow
-    def test_a_model_that_forgets_plays_each_episode_as_its_first(self, run):
-        """With its memory cleared, what came before an episode changes nothing."""
+    def test_cleared_memory_makes_episodes_independent(self, run):
+        """A model whose memory is cleared ignores earlier episodes."""
         agent = find_agent(run, greedy=False, forget=True)
         policy = agent.make(get_layout("demo_wide"))
         rng = np.random.default_rng(0)

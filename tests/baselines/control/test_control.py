@@ -1,4 +1,4 @@
-"""The positive control: its small worlds, its sources, its checks."""
+"""The positive control: small environments, sources of histories and checks."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def fixed(action: int) -> Policy:
     return Policy((), lambda params, key: (), lambda params, carry, view, key: (jnp.int32(action), carry), "ego_input")
 
 
-def test_what_the_worlds_reward():
+def test_rewards_of_the_small_environments():
     means = jnp.array([[0.0, 1.0, 0, 0, 0], [1.0, 0.0, 0, 0, 0]])
     actions, rewards = worlds.play_world(worlds.bandit(), fixed(1), means, 0, 6)
     assert actions.tolist() == [[1] * 6] * 2
     assert rewards.tolist() == [[1] * 6, [0] * 6]
     above, corner = worlds.MIDDLE - worlds.SIDE, 0
     _, rewards = worlds.play_world(worlds.dark_room(), fixed(0), jnp.array([above, corner]), 0, 2 * worlds.ROOM_STEPS)
-    episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # it passes the goal and continues to the wall
+    episode = [1] + [0] * (worlds.ROOM_STEPS - 1)  # the agent passes the goal and stops at the wall
     assert rewards.tolist() == [episode * 2, [0] * 2 * worlds.ROOM_STEPS]
     assert worlds.best_return(np.array([above, corner])).tolist() == [10, 7]
 
@@ -49,7 +49,7 @@ def test_sources_learn():
 @pytest.mark.parametrize(
     ("quantity", "code"), [("regret, at most", 0), ("regret, at least", 1), ("gain, at most", 0), ("gain, at least", 1)]
 )
-def test_the_command_fails_with_a_check(tmp_path, monkeypatch, quantity, code):
+def test_the_command_fails_if_a_check_fails(tmp_path, monkeypatch, quantity, code):
     check = control.ControlCheck("bandits", "AD", quantity, 1.0, 2.0, "")
     monkeypatch.setattr(control, "run_control", lambda folder, done: [check])
     result = CliRunner().invoke(cli, ["control", "--out", str(tmp_path)])

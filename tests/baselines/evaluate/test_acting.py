@@ -1,4 +1,4 @@
-"""Trained models as egos of the evaluator, and the commands that make and play them."""
+"""Trained models as egos of the evaluator, and the commands that train and evaluate them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ OPTIONS = TrainOptions(steps=2, batch_size=2, context=30)
 
 @pytest.fixture(scope="module")
 def runs(lite, tmp_path_factory) -> Path:
-    """Run folders `ad` and `dpt` of untrained models, as training would write them."""
+    """Return run folders of two untrained models, `ad` and `dpt`."""
     folder = tmp_path_factory.mktemp("runs")
     for name in ("ad", "dpt"):
         job = prepare(name, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(lite[0])))
@@ -65,7 +65,7 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
 
 @pytest.mark.slow
 def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
-    """A model of one layer has no drift at all: a step's cache is computed from that step alone."""
+    """With one layer, drift is zero: each cached entry depends on one step only."""
     two_layer_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), overcooked_world([WIDE[0].layout]))
     params, found, protocol = random_parameters(two_layer_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
 
@@ -85,7 +85,7 @@ def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
 
 
 def test_the_drift_command(runs, monkeypatch):
-    """The command's plan and table, without playing."""
+    """Check the plan and table of the command; no episode is played."""
 
     def play(method, params, context, tasks, planned, channels):
         assert (context, len(tasks), planned.episodes, channels) == (30, 5, 2, "own")
@@ -135,7 +135,7 @@ class TestBadRuns:
 
 @pytest.mark.slow
 def test_the_train_command(lite, tmp_path, monkeypatch):
-    """Trains from the address of a release."""
+    """Train on a release that is opened by its address."""
     monkeypatch.setitem(SIZES, "tiny", ModelSize(1, 16, 5, heads=2, encoder="words"))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     small = ["--steps", "1", "--batch-size", "2", "--context", "4"]

@@ -1,4 +1,4 @@
-"""One model over several layouts: trained with canonical channels, and played on a layout of another shape."""
+"""Models trained with canonical channels on several layouts and evaluated on a layout of another shape."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ THIRD = get_layout("cramped_down")
 
 @pytest.fixture(scope="module")
 def trained(lite, tmp_path_factory) -> tuple[Path, str]:
-    """The run folder that the command makes for all layouts of a release, and what it prints."""
+    """Train on all layouts of a release; return the run folder and the output."""
     out = tmp_path_factory.mktemp("canonical") / "run"
     sizes = ["--steps", "1", "--batch-size", "4", "--context", "6", "--layers", "1", "--width", "8", "--heads", "2"]
     arguments = ["train", "ad", "--layout", "all", "--root", str(lite[0]), "--out", str(out)]
@@ -64,7 +64,7 @@ def test_the_run(trained):
     assert (run.channels, run.obs_shape, run.layouts) == ("canonical", (5, 5, 46), ("coord_simple", "demo_wide"))
 
 
-def test_it_plays_on_a_third_layout(trained, tmp_path):
+def test_evaluation_on_an_untrained_layout(trained, tmp_path):
     folder, _ = trained
     agent = find_agent(str(folder))
     task = published_task(THIRD.name, "H4/t0")
@@ -77,8 +77,8 @@ def test_it_plays_on_a_third_layout(trained, tmp_path):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_an_ego_of_canonical_channels_sees_them_on_every_layout(layout):
-    """A policy that returns what it sees, in place of an action."""
+def test_jax_egos_get_canonical_channels_on_every_layout(layout):
+    """The policy returns its observation instead of an action."""
     shown = Policy((), lambda params, key: (), lambda params, memory, ego_input, key: (ego_input, memory), "ego_input")
     (record,) = random_records(layout, 1, np.random.default_rng(4))
     own = jnp.asarray(observe(layout, record, 0))
@@ -89,7 +89,7 @@ def test_an_ego_of_canonical_channels_sees_them_on_every_layout(layout):
     assert with_view(shown, layout, "own") is shown
 
 
-def test_an_ego_outside_jax_may_take_canonical_channels():
+def test_host_egos_get_canonical_channels():
     class Agent:
         def reset(self, batch: int) -> None:
             self.batch = batch
@@ -111,8 +111,8 @@ def test_an_ego_outside_jax_may_take_canonical_channels():
         from_host(agent, "union")  # type: ignore[arg-type]
 
 
-def test_every_part_is_rendered_by_its_own_layouts(lite):
-    """A held-out part is on some of the layouts only, here the second one, and batches number those of the model."""
+def test_each_split_is_rendered_with_its_layouts(lite):
+    """The validation part contains only the second layout; batches still use the model's layout numbers."""
     job = prepare("ad", MODEL, dataclasses.replace(OPTIONS, batch_size=8), HistoryOptions(("all",), str(lite[0])))
     names = job.about["histories"]["layouts"]
     view = CompactView("paper", tuple(map(get_layout, names)), canonical=True)
@@ -141,7 +141,7 @@ def test_default_channels(lite, layouts, given, channels, size):
     assert (about["channels"], about["obs_shape"]) == (channels, [5, 5, size])
 
 
-def test_all_layouts_are_those_that_the_filters_leave(lite, tmp_path):
+def test_all_layouts_means_those_that_pass_the_filters(lite, tmp_path):
     random_release(tmp_path, layouts=("asymm_both", "cramped_up"), teammates=1)
     about = prepare("ad", MODEL, OPTIONS, HistoryOptions(("all",), str(tmp_path))).about["histories"]
     assert (about["layouts"], about["channels"]) == (["asymm_both", "cramped_up"], "canonical"), "of one shape, 35"
@@ -154,7 +154,7 @@ def test_all_layouts_are_those_that_the_filters_leave(lite, tmp_path):
 
 
 def test_an_experiment_with_one_model_of_all_layouts(lite, tmp_path, monkeypatch):
-    """Trained once, and tested on the test layout of each; nothing is trained or played here."""
+    """The plan trains one model and tests it on every test layout; nothing is executed."""
     found: dict[str, Any] = {}
     monkeypatch.setattr(
         experiments, "train", lambda method, data, options, folder, about, **rest: found.update(about, folder=folder)

@@ -1,4 +1,4 @@
-"""The evaluator: results depend on the task alone; inputs of egos, results on disk, messages."""
+"""The evaluator: results depend only on the task; inputs of egos, stored results and error messages."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def returns(results):
 
 @pytest.fixture(scope="module")
 def together():
-    """Returns of ten tasks that were evaluated together."""
+    """Returns of ten tasks evaluated in one batch."""
     return returns(evaluate("random", random, SIMPLE + RING, PUBLISHED))
 
 
-def test_a_task_is_the_same_alone_and_among_others(together):
+def test_a_task_earns_the_same_alone_and_in_a_batch(together):
     alone = returns(evaluate("random", random, [RING[3]], PUBLISHED))
     assert alone[RING[3].task_id] == together[RING[3].task_id]
     assert returns(evaluate("random", random, RING[::-1], PUBLISHED)) == {
@@ -66,14 +66,14 @@ def test_an_interrupted_run_resumes_to_the_same_results(together, tmp_path):
     played: list[int] = []
     again = evaluate("random", watched, SIMPLE + RING, PUBLISHED, out=tmp_path, played=played.append)
     assert returns(again) == together
-    assert played == [5 * 4, 5, 5, 5, 5]  # the finished tasks at once, then episode by episode
+    assert played == [5 * 4, 5, 5, 5, 5]  # finished tasks are reported at once, the others episode by episode
     assert started == ["coord_ring"]
     assert len(list((tmp_path / "tasks").iterdir())) == 10
     assert read_result(tmp_path / "tasks" / f"{SIMPLE[0].task_id}.json") == first[0]
 
 
 def test_seeds_and_tasks_differ(together):
-    """Several seeds play in one batch, and each as if it were alone."""
+    """Seeds in one batch do not affect each other."""
     both = returns(evaluate("random", random, SIMPLE, PUBLISHED, seeds=[7, 0]))
     assert all(both[task.task_id][1:] == together[task.task_id] for task in SIMPLE)
     assert any(both[task.task_id][0] != together[task.task_id][0] for task in SIMPLE)
@@ -108,7 +108,7 @@ def test_folders_with_other_files_are_refused(tmp_path):
         ({"tasks": ["demo_wide"]}, "tasks: 'demo_wide': expected tasks, such as those of test_tasks"),
     ],
 )
-def test_impossible_arguments(arguments, message):
+def test_invalid_arguments(arguments, message):
     with pytest.raises((OptionError, UnknownNameError), match=message):
         evaluate(**{"agent": "stay", "make_ego": stay, "tasks": SIMPLE, "protocol": "published"} | arguments)
     with pytest.raises(OptionError, match="agent = 5: expected an object with the methods reset and act"):
@@ -128,7 +128,7 @@ def test_damaged_results_are_named(tmp_path):
         read_run(tmp_path)
 
 
-def test_a_motionless_ego_earns_exactly_the_published_40_with_h4():
+def test_stay_earns_the_published_return_of_40_with_h4():
     for result in evaluate("stay", stay, SIMPLE, PUBLISHED):
         assert result.returns == [[40.0] * 4]
 
@@ -150,7 +150,7 @@ class Watcher:
         return chosen
 
 
-def test_host_agents_see_what_happened():
+def test_host_agents_receive_observations_and_rewards():
     watcher = Watcher()
     protocol = dataclasses.replace(PUBLISHED, episodes=2)
     played = list(play_tasks(from_host(watcher), SIMPLE, protocol))
@@ -193,7 +193,7 @@ def test_invalid_actions_of_host_agents():
     ],
 )
 def test_host_agents_return_one_integer_per_task(actions, message):
-    """The ego acts without the environment, whose compilation takes seconds."""
+    """The environment is not stepped, because compiling it takes seconds."""
     policy, keys = from_host(Watcher(lambda batch: actions))(LAYOUTS["coord_simple"]), jnp.zeros(1, jnp.uint32)
     ego_input = EgoInput(jnp.zeros((1, 5, 5, 40)), *[jnp.zeros(1)] * 4)
     memory = policy.init((), keys)
@@ -211,11 +211,11 @@ def test_invalid_actions_of_jax_agents(action):
 
 
 def test_memory_lasts_for_the_task():
-    """An ego that counts its steps: the count continues over episodes and starts at 0 in each task."""
+    """An ego's step counter continues over episodes and starts at 0 in each task."""
 
     def mine(layout):
         def act(params, count, view, key):
-            return jnp.where(count < 100, 4, 5), count + 1  # stays in the first episode, interacts in the second
+            return jnp.where(count < 100, 4, 5), count + 1  # `stay` in the first episode, `interact` in the second
 
         return Policy((), lambda params, key: jnp.int32(0), act, "observation")
 
@@ -225,7 +225,7 @@ def test_memory_lasts_for_the_task():
     assert (second.actions[..., 0] == 5).all()
 
 
-def test_impossible_teammates_fail_before_any_work(tmp_path):
+def test_unusable_teammates_are_refused_before_evaluation(tmp_path):
     wrong = dataclasses.replace(
         SIMPLE[1], teammate=SIMPLE[1].teammate | {"theta": SIMPLE[1].teammate["theta"] | {"inertia": 2.0}}
     )
@@ -238,7 +238,7 @@ def test_unknown_names():
     with pytest.raises(UnknownNameError, match=r"unknown agent 'rnadom'; valid: .*Did you mean 'random'\?"):
         find_agent("rnadom")
     with pytest.raises(UnknownNameError, match=r"oracle, ad-reference, .*\. A trained model is named by its folder"):
-        find_agent("runs/ad")  # nothing is suggested, since no name is close
+        find_agent("runs/ad")  # no name is close enough to suggest
     with pytest.raises(UnknownNameError, match=r"unknown protocol 'publish'; valid: published, seeded"):
         get_protocol("publish")
 
@@ -292,8 +292,8 @@ def test_commands(tmp_path):
     assert "line 1" in str(result.exception)
 
 
-def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
-    """Results of both splits may share a folder, and are read again without the package's manifests."""
+def test_validation_tasks_are_reported_separately(tmp_path, monkeypatch):
+    """Results of both splits may share a folder; reading them needs no bundled manifest."""
     tasks = [make_task("teammate", "validation", "coord_simple", task.teammate, 5) for task in SIMPLE[:2]]
     write_tasks(tmp_path / "teammate_validation.jsonl", tasks)
     write_tasks(tmp_path / "teammate_test.jsonl", SIMPLE)
@@ -306,7 +306,7 @@ def test_validation_tasks_are_played_and_reported_apart(tmp_path, monkeypatch):
     write_tasks(path("layout", "validation"), [])
     write_tasks(path("layout", "test"), [])
     monkeypatch.setattr("icrl4aht_baselines.evaluate.protocols.manifest_path", path)
-    for name in ("_bundled_by_id", "_instances"):  # what is cached of other manifests would outlast this test
+    for name in ("_bundled_by_id", "_instances"):  # entries cached from other manifests would leak into later tests
         monkeypatch.setattr(results_of_runs, name, getattr(results_of_runs, name).__wrapped__)
     monkeypatch.setattr(
         "icrl4aht_baselines.commands.train_commands.find_ego",

@@ -1,4 +1,4 @@
-"""Encoders of methods: `words` and `mlp` on batches of state records are what the plain observations give."""
+"""The encoders `words` and `mlp` give equal results on state records and on observations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ OPTIONS = dataclasses.replace(TINY, layers=1, dropout=0.0)
 
 @pytest.fixture(scope="module")
 def two_layouts(tmp_path_factory) -> Path:
-    """A release on two layouts with observations of one shape."""
+    """Return a release of two layouts whose observations have one shape."""
     root = tmp_path_factory.mktemp("releases") / "two"
     random_release(root, layouts=("asymm_both", "cramped_up"))
     return root
@@ -50,7 +50,7 @@ def loss_and_gradient(method: Method, params: Any, batch: Any) -> Any:
 
 
 def assert_equal_results(one: Any, two: Any, params: Any) -> None:
-    """Compares losses, logged numbers and gradients, the latter to a share of the largest entry of a parameter."""
+    """Check that losses and metrics agree, and gradients relative to each parameter's largest entry."""
     (loss, log), gradient = one
     (other_loss, other_log), other_gradient = two
     np.testing.assert_allclose(loss, other_loss, rtol=1e-5)
@@ -65,7 +65,7 @@ def assert_equal_results(one: Any, two: Any, params: Any) -> None:
 
 @pytest.mark.parametrize("name", ["ad", pytest.param("dpt", marks=pytest.mark.slow)])
 def test_words_give_the_loss_and_gradient_of_the_paper(lite, name):
-    """The batch of the paper's encoder holds observations, the other one state records."""
+    """The paper's encoder gets observations, `words` gets state records."""
     paper, words = made(name, "paper", plain_view), made(name, "words")
     params = random_parameters(paper)
     jax.tree.map(np.testing.assert_array_equal, params, random_parameters(words))
@@ -84,7 +84,7 @@ def test_entries_give_the_loss_and_gradient_of_observations(lite):
 
 
 def test_words_start_from_the_parameters_of_the_paper():
-    """One checkpoint serves both: names, shapes and initial values agree, and so acting, on plain observations."""
+    """Names, shapes and initial values agree, so one checkpoint serves both encoders."""
     kinds: Any = ("paper", "words", "mlp")
     paper, words, mlp = (encoder.WindowEncoder(8, kind, pointwise=(8,), spatial=(8,)) for kind in kinds)
     obs = jnp.arange(25 * 45).reshape(5, 5, 45) % 3
@@ -96,7 +96,7 @@ def test_words_start_from_the_parameters_of_the_paper():
 
 @pytest.mark.parametrize("collide", [False, True])
 def test_equal_observations_are_in_one_group(monkeypatch, collide):
-    """If observations that differ have one hash, each observation is a group of its own."""
+    """If hashes collide, each observation is its own group."""
     if collide:
         monkeypatch.setattr(encoder, "_hash_words", lambda ids: (jnp.zeros(len(ids), jnp.uint32),) * 2)
     ids = np.random.default_rng(0).integers(0, 300, (4, 25))[[[0, 1, 0, 2], [1, 1, 3, 0]]]
@@ -110,7 +110,7 @@ def test_equal_observations_are_in_one_group(monkeypatch, collide):
 
 @pytest.mark.parametrize("canonical", [False, True])
 @pytest.mark.parametrize("kind", ["paper", "words", "mlp"])
-def test_inputs_of_several_layouts_are_their_observations(two_layouts, kind, canonical):
+def test_inputs_on_several_layouts_equal_the_observations(two_layouts, kind, canonical):
     layouts = tuple(get_layout(name) for name in ("asymm_both", "cramped_up"))
     view = CompactView(kind, layouts, canonical=canonical)
     channels = "canonical" if canonical else "own"

@@ -1,4 +1,4 @@
-"""The models: sizes, dependence of outputs on inputs, equality of training, cached and exact acting."""
+"""The models: sizes, causality, and equal outputs in training, cached and exact acting."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def sizes(method: Method) -> int:
 
 @cache
 def tiny(name: str, **changes: Any) -> tuple[Method, Any]:
-    """Returns a method in the flat world, and parameters, none of them zero."""
+    """Return a method for flat observations, and parameters without zeros."""
     method = get_method(name)(dataclasses.replace(TINY, **changes), FLAT)
     return method, random_parameters(method)
 
 
 def run(method: Method, params: Any, *inputs: Any, **named: Any) -> Any:
-    """The model's output."""
+    """Return the output of the model."""
     return method.model.apply({"params": params}, *inputs, **named)
 
 
@@ -56,7 +56,7 @@ class TestSizes:
         world = overcooked_world([get_layout("coord_simple")])
         assert sizes(get_method(name)(ModelOptions(), world)) == parameters
 
-    def test_impossible_options(self):
+    def test_invalid_model_options(self):
         with pytest.raises(OptionError, match="width = 30: expected a multiple of twice the heads"):
             ModelOptions(width=30)
         with pytest.raises(OptionError, match="dropout = 1"):
@@ -68,7 +68,7 @@ class TestSizes:
 
 
 def reach(f, *inputs) -> list[np.ndarray]:
-    """Returns for each input (T, ..) which outputs (O, ..) of f depend on which of its rows, bool (O, T)."""
+    """Return, for each input (T, ..), which outputs (O, ..) of f depend on which rows, bool (O, T)."""
     jacobians = jax.jit(jax.jacobian(f, argnums=tuple(range(len(inputs)))))(*inputs)
     return [
         np.abs(np.asarray(jacobian).reshape(len(jacobian), -1, len(x), x[0].size)).max(axis=(1, 3)) > 0
@@ -85,7 +85,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize(("name", "positions"), KINDS)
-def test_steps_see_all_that_was_and_nothing_to_come(name, positions):
+def test_outputs_depend_on_past_and_present_steps_only(name, positions):
     method, params = tiny(name, positions=positions)
     steps = batch_steps(ad_batch(rows=1), plain_view)
 
@@ -98,7 +98,7 @@ def test_steps_see_all_that_was_and_nothing_to_come(name, positions):
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_policies_depend_on_the_actions_before(name):
+def test_policies_depend_on_earlier_actions(name):
     method, params = tiny(name)
     steps = batch_steps(ad_batch(rows=1), plain_view)
 
@@ -116,7 +116,7 @@ def test_policies_depend_on_the_actions_before(name):
 
 
 @pytest.mark.parametrize("positions", [pytest.param("none", marks=pytest.mark.slow), "rope"])
-def test_the_answer_of_dpt_depends_on_the_query_and_on_all_of_its_context(positions):
+def test_dpt_outputs_depend_on_the_query_and_context(positions):
     method, params = tiny("dpt", positions=positions)
     batch = dpt_batch(rows=1)
 
@@ -125,14 +125,14 @@ def test_the_answer_of_dpt_depends_on_the_query_and_on_all_of_its_context(positi
         return run(method, params, *batch_transitions(changed, plain_view)).logits[0]
 
     of_obs, of_rewards, of_query = reach(answers, batch.context_obs[0], batch.context_rewards[0], batch.query_obs)
-    seen = np.tril(np.ones((7, 6), bool), k=-1)  # answer j has seen the first j transitions
+    seen = np.tril(np.ones((7, 6), bool), k=-1)  # output j depends on the first j transitions
     assert seen[-1].all()
     np.testing.assert_array_equal(of_obs, seen)
     np.testing.assert_array_equal(of_rewards, seen)
     assert of_query.all()
 
 
-def test_several_queries_are_posed_in_turn():
+def test_several_queries_equal_single_queries():
     method, params = tiny("dpt")
     batch = dpt_batch(rows=2)
     other = batch._replace(query_obs=batch.query_obs[::-1], query_target=1 + batch.query_target)
@@ -157,14 +157,14 @@ def test_several_queries_are_posed_in_turn():
 
 
 def query_mask(context: int) -> np.ndarray:
-    """Mask of [c_1 .. c_K, q_0 .. q_K]: a transition sees those up to itself, query j the first j and itself."""
+    """Mask of [c_1 .. c_K, q_0 .. q_K]: c_i attends to c_1 .. c_i, q_j to c_1 .. c_j and itself."""
     to_context = np.concatenate([np.tri(context), np.tri(context + 1, context, -1)])
     to_queries = np.concatenate([np.zeros((context, context + 1)), np.eye(context + 1)])
     return np.concatenate([to_context, to_queries], axis=1).astype(bool)
 
 
-def test_attention_is_that_of_the_mask(monkeypatch):
-    """Values and gradients, to the rounding of float32; at once and in blocks of rows."""
+def test_attention_equals_masked_attention(monkeypatch):
+    """Values and gradients agree to float32 rounding, with and without blocks of rows."""
     q, k, v, to = np.random.default_rng(0).normal(size=(4, 2, 15, 2, 8)).astype(np.float32)
 
     def of_mask(q, k, v):
@@ -186,7 +186,7 @@ def test_attention_is_that_of_the_mask(monkeypatch):
 
 
 def arrays_in(jaxpr: Any) -> Iterator[Any]:
-    """Yields all intermediate arrays of a computation."""
+    """Yield all intermediate arrays of a computation."""
     for equation in jaxpr.eqns:
         yield from (out.aval for out in equation.outvars)
         for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda leaf: hasattr(leaf, "eqns")):
@@ -195,7 +195,7 @@ def arrays_in(jaxpr: Any) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("name", ["ad", "dpt"])
-def test_long_contexts_make_no_square(name):
+def test_long_contexts_need_no_quadratic_memory(name):
     method, params = tiny(name, layers=1)
     batch = ad_batch(rows=1, length=3072) if name == "ad" else dpt_batch(rows=1, context=3072)
     made = jax.make_jaxpr(jax.grad(lambda p: method.loss(p, p, batch, jax.random.key(0))[0]))(params)
@@ -204,7 +204,7 @@ def test_long_contexts_make_no_square(name):
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_padding_has_no_part_in_the_loss(name):
+def test_padding_does_not_change_the_loss(name):
     method, params = tiny(name, layers=1)
     batch = ad_batch(rows=3)
     lengths = np.array([7, 4, 1])
@@ -257,17 +257,17 @@ def test_next_observations_are_of_the_same_episode_and_follow_the_actions_taken(
         return log(b)["next_obs_loss"]
 
     after_the_end, within = batch.obs.copy(), batch.obs.copy()
-    after_the_end[:, 4] += 100  # follows the done at step 3
+    after_the_end[:, 4] += 100  # the first step after the episode ends at step 3
     within[:, 3] += 100
     assert loss(batch._replace(dones=np.ones_like(batch.dones))) == 0
-    last = batch._replace(dones=np.broadcast_to(np.arange(7) != 2, (2, 7)))  # only the step before an end counts
+    last = batch._replace(dones=np.broadcast_to(np.arange(7) != 2, (2, 7)))  # only the last step of an episode counts
     assert loss(last) == loss(last._replace(obs=after_the_end)) != loss(last._replace(obs=within))
     labelled = batch._replace(target_actions=(batch.target_actions + 1) % 4)
     assert loss(batch) == loss(labelled) != 0
     assert log(batch)["action_loss"] != log(labelled)["action_loss"]
 
 
-def test_the_teammates_action_is_predicted_from_the_steps_before_it():
+def test_teammate_actions_are_predicted_from_earlier_steps():
     method, params = tiny("ad", layers=1, teammate_actions=True, teammate_loss=True)
     batch = ad_batch()
     loss = jax.jit(lambda b: method.loss(params, params, b, None)[1])
@@ -276,7 +276,7 @@ def test_the_teammates_action_is_predicted_from_the_steps_before_it():
     assert log["loss"] == pytest.approx(log["action_loss"] + log["next_obs_loss"] + log["teammate_loss"], rel=1e-5)
     first, last = batch.prev_teammate_actions.copy(), batch.prev_teammate_actions.copy()
     valid = int(batch.attention_mask[0].sum())
-    last[0, valid - 1] = (last[0, valid - 1] + 1) % 4  # a target, and an input that no prediction follows
+    last[0, valid - 1] = (last[0, valid - 1] + 1) % 4  # the last action is a target, but no prediction depends on it
     assert loss(batch._replace(prev_teammate_actions=last))["teammate_loss"] != log["teammate_loss"]
     beyond = first.copy()
     beyond[~batch.attention_mask] = 3
@@ -289,7 +289,7 @@ def test_the_teammates_action_is_predicted_from_the_steps_before_it():
 
 
 def ego_inputs(steps: int, episode: int, seed=0) -> EgoInput:
-    """Input of an ego over some steps."""
+    """Return the inputs of an ego for consecutive steps."""
     rng = np.random.default_rng(seed)
     t = np.arange(steps)
     zero_first = t > 0
@@ -320,7 +320,7 @@ def player(name: str, context: int, cached: bool, **changes: Any):
 @pytest.mark.parametrize(
     ("name", "positions"), [*KINDS, ("dpt", "none"), pytest.param("dpt", "rope", marks=pytest.mark.slow)]
 )
-def test_cached_equals_exact_while_the_window_is_not_full(name, positions):
+def test_cached_equals_exact_until_the_window_is_full(name, positions):
     seen = ego_inputs(12, episode=4)
     exact, cached = (player(name, 12, way, positions=positions)(seen) for way in (False, True))
     np.testing.assert_allclose(exact, cached, rtol=1e-4, atol=1e-5)
@@ -344,7 +344,7 @@ def test_acting_computes_what_training_computes(name):
 def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first):
     method, params = tiny("dpt")
     seen = ego_inputs(11, episode=4)  # two finished episodes, and three steps of the third
-    known = np.array([0, 1, 2, 4, 5, 6])[first:]  # an episode's last step has no successor in it
+    known = np.array([0, 1, 2, 4, 5, 6])[first:]  # the last step of an episode has no next state
     after = jax.tree.map(lambda x: x[known + 1][None], seen)
     both = jnp.stack([seen.obs[known][None], after.obs], axis=2)
     transitions = Transition(both, after.prev_action, after.prev_reward, after.prev_teammate_action)
@@ -355,8 +355,8 @@ def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first):
 
 @pytest.mark.parametrize("cached", [True, False])
 @pytest.mark.parametrize(("name", "context", "first_without"), [("ad", 5, 5), ("hybrid_ad", 5, 5), ("dpt", 5, 8)])
-def test_steps_outside_the_context_have_no_part(name, context, first_without, cached):
-    """The first step changes: AD's window of 5 steps loses it after 5, DPT's 5 transitions after two episodes of 3."""
+def test_steps_outside_the_context_have_no_effect(name, context, first_without, cached):
+    """The first step leaves AD's window after 5 steps and DPT's context after two episodes of 3 steps."""
     seen = ego_inputs(12, episode=4)
     play = player(name, context, cached)
     changed = seen._replace(obs=seen.obs.at[0].add(3.0))
@@ -366,7 +366,7 @@ def test_steps_outside_the_context_have_no_part(name, context, first_without, ca
 
 
 def test_a_full_cached_window_drops_a_fifth():
-    """With K = 10 it drops 2 steps, and so has the last 9 and 10 steps in turn; DPT's context is exact."""
+    """With K = 10, the window drops 2 steps when full and so alternates between 9 and 10; DPT's context is exact."""
     seen = ego_inputs(16, episode=4)
     cached, ten, nine = (player("ad", context, way)(seen) for context, way in ((10, True), (10, False), (9, False)))
     np.testing.assert_allclose(cached[:10], ten[:10], rtol=1e-4, atol=1e-5)
@@ -378,7 +378,7 @@ def test_a_full_cached_window_drops_a_fifth():
 
 
 class TestChangeIf:
-    """A change that a batch computes only when a row needs it."""
+    """`change_if` computes a change only when a row of the batch needs it."""
 
     CONDITION = jnp.array([True, False, True])
 
@@ -389,7 +389,7 @@ class TestChangeIf:
     def rows(self, condition, add, memory):
         return change_if(condition, self.change, {"scale": jnp.float32(3), "add": add}, memory)
 
-    def test_rows_are_changed_by_their_own_condition(self):
+    def test_each_row_changes_by_its_own_condition(self):
         add, memory = jnp.array([10, 20, 30]), {"a": jnp.arange(6.0).reshape(3, 2), "b": jnp.arange(3)}
         changed = jax.jit(jax.vmap(self.rows))(self.CONDITION, add, memory)
         np.testing.assert_array_equal(changed["a"], [[0, 3], [2, 3], [12, 15]])
@@ -399,7 +399,7 @@ class TestChangeIf:
         alike = jax.vmap(self.rows, in_axes=(0, None, None))(self.CONDITION, 5, {"a": jnp.ones(2), "b": jnp.int32(1)})
         np.testing.assert_array_equal(alike["b"], [6, 1, 6])
 
-    def test_nothing_is_computed_for_a_batch_that_needs_no_change(self):
+    def test_unchanged_batches_skip_the_computation(self):
         calls = []
 
         def noted(params, memory):
@@ -413,8 +413,8 @@ class TestChangeIf:
 
 
 @pytest.mark.slow
-def test_amago_prefers_what_is_rewarded():
-    """Learns from random play in which action 2 is rewarded; imitation alone would remain random."""
+def test_amago_learns_the_rewarded_action():
+    """Train on random play that rewards action 2; imitation alone would stay random."""
     options = ModelOptions(layers=1, width=16, heads=2, dropout=0.0, discounts=(0.5, 0.8))
     method = get_method("amago_offline")(options, FLAT)
     params = slow = random_parameters(method)

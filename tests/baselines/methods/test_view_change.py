@@ -1,4 +1,4 @@
-"""Mirrored and hidden views: what an ego sees in a mirrored view is what it would see on the mirrored layout."""
+"""Mirrored and hidden views: a mirrored view equals the view on the mirrored layout."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def change(rows: bool, columns: bool, hidden: bool = False) -> ViewChange:
 
 
 @pytest.mark.parametrize(("rows", "columns"), MIRRORINGS)
-def test_a_mirrored_view_is_that_of_the_mirrored_layout_at_every_step(rows, columns):
-    """Both layouts are played from the same start, the mirrored one with mirrored actions."""
+def test_mirrored_views_equal_views_on_the_mirrored_layout(rows, columns):
+    """Play both layouts from the same start, the mirrored one with mirrored actions."""
     rng, other = np.random.default_rng(0), mirrored_layout(LAYOUT, rows, columns)
     free = np.flatnonzero(LAYOUT.walkable)
     positions = rng.choice(free, (64, 2)).astype(np.uint8)
@@ -68,7 +68,7 @@ def test_a_mirrored_view_is_that_of_the_mirrored_layout_at_every_step(rows, colu
         mirrored = np.asarray(view.actions(jnp.asarray(actions)))
         one = rules.step(LAYOUT, one, actions, recipe).state
         two = rules.step(other, two, mirrored, recipe).state
-    assert seen > 0  # something was carried around
+    assert seen > 0  # an agent held an item at some step
 
 
 @pytest.mark.parametrize(("rows", "columns"), MIRRORINGS)
@@ -80,7 +80,7 @@ def test_mirroring_twice_changes_nothing(rows, columns):
 
 
 def test_a_hidden_recipe_indicator_looks_like_a_counter():
-    """asymm_right is asymm_both without the recipe indicator in the ego's room; nothing else tells them apart."""
+    """asymm_right differs from asymm_both only by the missing recipe indicator in the ego's room."""
     both, right = get_layout("asymm_both"), get_layout("asymm_right")
     positions = np.array([[both.agent_cells[0], both.agent_cells[1]]], np.uint8)
     facings, recipe = np.zeros((1, 2), np.uint8), both.recipe_items[:1]
@@ -94,7 +94,7 @@ def test_a_hidden_recipe_indicator_looks_like_a_counter():
 
 
 def test_views_of_batches():
-    """The number of a row's layout says which layout it is, and how it is mirrored."""
+    """A row's layout number encodes the layout and its mirroring."""
     layouts = [get_layout("asymm_both"), LAYOUT]
     size = max(layout_size(layout) for layout in layouts)
     records = np.zeros((4, 2, size), np.uint8)

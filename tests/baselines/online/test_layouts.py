@@ -1,4 +1,4 @@
-"""Layouts to train on by playing: four recipes, and fixtures in other places."""
+"""Layouts for online training: four recipes and rearranged fixtures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def mirrored(rows):
 
 
 def reached(layout):
-    """The letters that each set of agents can face."""
+    """Return the map letters that each set of agents can face."""
     found = Counter()
     for cell, letter in enumerate("".join(layout.rows)):
         x, y = cell % layout.width, cell // layout.width
@@ -32,7 +32,7 @@ def reached(layout):
 
 
 @pytest.mark.parametrize("name", TRAINING)
-def test_fixtures_change_places_among_cells_that_the_same_agents_reach(name):
+def test_rearranged_fixtures_stay_reachable_for_the_same_agents(name):
     layout = get_layout(name)
     others = rearranged_layouts(layout, 6)
     assert len(others) == 6
@@ -43,20 +43,20 @@ def test_fixtures_change_places_among_cells_that_the_same_agents_reach(name):
 
 
 @pytest.mark.parametrize("name", TRAINING)
-def test_no_layout_of_the_benchmark_and_none_twice_even_mirrored(name):
+def test_rearranged_layouts_are_new_and_distinct(name):
     known = [get_layout(one).rows for one in LAYOUT_NAMES]
     for other in rearranged_layouts(get_layout(name), 100):
         assert not mirrored(other.rows) & set(known)
         known.append(other.rows)
 
 
-def test_fewer_layouts_are_the_first_of_more():
+def test_smaller_sets_of_layouts_are_prefixes_of_larger_ones():
     layout = get_layout("cramped_up")
     many = [other.rows for other in rearranged_layouts(layout, 5)]
     assert [other.rows for other in rearranged_layouts(layout, 3)] == many[:3]
 
 
-def test_unseen_layouts_are_none_that_models_are_trained_on():
+def test_unseen_layouts_are_not_training_layouts():
     layout = get_layout("asymm_both")
     trained = {rows for one in rearranged_layouts(layout, MOST_REARRANGED) for rows in mirrored(one.rows)}
     unseen = unseen_layouts(layout, 4)
@@ -64,9 +64,9 @@ def test_unseen_layouts_are_none_that_models_are_trained_on():
     assert {(one.name, one.recipes) for one in unseen} == {(layout.name, layout.recipes)}
 
 
-def test_more_layouts_than_there_are():
+def test_too_many_layouts_are_refused():
     layout = get_layout("test_wide")
-    few = type(layout)("few", "few", ("W0WBW", "1AWAX", "WWWPW"))  # 3! arrangements of each room's fixtures
+    few = type(layout)("few", "few", ("W0WBW", "1AWAX", "WWWPW"))  # 3! arrangements of the fixtures in each room
     with pytest.raises(OptionError, match=r"few: its fixtures have (\d|[12]\d|3[0-5]) other arrangements, expected 36"):
         rearranged_layouts(few, 36)
 

@@ -1,4 +1,4 @@
-"""One program for functions that differ in constant arrays alone."""
+"""One compiled program for functions that differ only in constant arrays."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icrl4aht_baselines.online.programs import run_all, shared_programs
 
 
 def walker(table: list[int], steps: int = 3) -> Callable[..., Any]:
-    """Returns a function that follows a table for some steps, in a loop."""
+    """Return a function that follows a lookup table for a number of steps."""
     leads_to = np.array(table, np.int32)
 
     def walk(scale: Any, cell: Any) -> dict[str, Any]:
@@ -38,10 +38,10 @@ def test_each_function_has_its_own_constants():
     for number, function in enumerate(functions):
         alone = function(jnp.float32(2), cells[number])
         assert {key: float(value[number]) for key, value in found.items()} == {k: float(v) for k, v in alone.items()}
-    assert found["end"].tolist() == [1, 2, 0]  # with the first table the third one would end at 1
+    assert found["end"].tolist() == [1, 2, 0]  # the first table's constants would give 1 for the third function
 
 
-def test_members_are_repeated():
+def test_repeated_functions_share_a_program():
     (shared,) = shared_programs([walker(table) for table in TABLES], jnp.float32(1), jnp.int32(0))
     some = shared.repeated([2, 1, 1])
     assert some.members == [2, 1, 1]
@@ -49,8 +49,8 @@ def test_members_are_repeated():
     assert found["end"].tolist() == [0, 1, 2]
 
 
-def test_functions_of_other_structure_are_programs_of_their_own():
-    """More steps, tables of another length and other results; the order of the functions is kept."""
+def test_different_structures_get_separate_programs():
+    """Step counts, table lengths and results differ; the order of the functions is kept."""
     functions = [walker([1, 0]), walker([1, 0], steps=2), walker([0, 1]), walker([1, 0, 2])]
     functions.append(lambda scale, cell: (walker([1, 0])(scale, cell)["end"],))
     found = shared_programs(functions, jnp.float32(2), jnp.int32(0))
@@ -58,6 +58,6 @@ def test_functions_of_other_structure_are_programs_of_their_own():
 
 
 def test_constants_that_cannot_be_replaced_are_found():
-    """A function that is compiled by itself keeps its constants, and would play all layouts with the first one's."""
+    """A separately compiled function would keep the first layout's constants for all layouts."""
     with pytest.raises(AssertionError):
         shared_programs([jax.jit(walker([1, 0]))], jnp.float32(2), jnp.int32(0))

@@ -1,4 +1,4 @@
-"""RL^2: the model along a sequence and step by step, its episodes for learning, its training and resume."""
+"""RL^2: outputs over sequences and single steps, learning episodes, training and resume."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ def through(trainer, tmp_path_factory) -> tuple[Path, Any]:
     return folder, train(METHOD, TrainingData(None, {}), OPTIONS, folder, {}, trainer=trainer)
 
 
-def test_the_state_carries_over_steps_and_calls():
-    """The output along a sequence is that of its steps one by one, and of its halves."""
+def test_the_memory_continues_over_steps_and_calls():
+    """A sequence gives equal outputs at once, in halves and step by step."""
     rng = np.random.default_rng(0)
     steps = StepInput(
         jnp.asarray(rng.integers(0, 2, (6, 3, 5, 5, 46)), jnp.uint8),
@@ -98,10 +98,10 @@ def test_the_state_carries_over_steps_and_calls():
 
 
 def test_episodes_for_learning(trainer):
-    """The sequences to learn from contain the observations, actions and rewards of the episode that was played."""
+    """Learning sequences contain the observations, actions and rewards of the played episode."""
     player, state = trainer.players[0], trainer.init()
     tasks, key = state.tasks[0], jax.random.key(3)
-    for number in range(3):  # tasks that did not end continue in the next episode
+    for number in range(3):  # unfinished tasks continue in the next episode
         after, played, returns = player.episode(state.params, trainer._mates[0], tasks, jax.random.fold_in(key, number))
         assert played.action.shape == (100, 8)
         np.testing.assert_array_equal(played.seen.prev_action[1:], played.action[:-1])
@@ -112,7 +112,7 @@ def test_episodes_for_learning(trainer):
         assert not memory[ended].any() and np.abs(memory[~ended]).sum() > 0
         np.testing.assert_array_equal(played.hidden[0], tasks.ego.state)
         for before in (after.before.prev_action, after.before.prev_reward, after.before.prev_teammate_action):
-            assert ended.any() and not np.asarray(before)[ended].any()  # a new task knows nothing of the one before
+            assert ended.any() and not np.asarray(before)[ended].any()  # a new task starts with empty memory
         tasks = after
     changes = np.asarray(tasks.ego.change.upside_down), np.asarray(tasks.ego.change.sideways)
     assert all(0 < flags.sum() < 8 for flags in changes)
@@ -125,8 +125,8 @@ def test_the_log(through):
     assert {"return cramped_up assembly_line", "policy_loss", "value_loss", "entropy", "loss"} <= lines[0].keys()
 
 
-def test_imitation_teaches_what_the_oracle_does(trainer):
-    """On one and the same episode, the oracle's actions become likelier with a weight of imitation only."""
+def test_imitation_makes_oracle_actions_likelier(trainer):
+    """On a fixed episode, the oracle's actions become likelier only with a positive imitation weight."""
     state = trainer.init()
     _, played, _ = trainer.players[0].episode(state.params, trainer._mates[0], state.tasks[0], jax.random.key(0))
     fallen = {}
@@ -142,7 +142,7 @@ def test_imitation_teaches_what_the_oracle_does(trainer):
     assert fallen[0.0] < fallen[5.0] / 4
 
 
-def test_a_stopped_training_resumes_to_the_same_bits(trainer, through, tmp_path):
+def test_a_stopped_training_resumes_bit_for_bit(trainer, through, tmp_path):
     def stop(step: int, loss: float | None) -> None:
         if step == 8:
             raise KeyboardInterrupt
@@ -156,7 +156,7 @@ def test_a_stopped_training_resumes_to_the_same_bits(trainer, through, tmp_path)
 
 @pytest.mark.parametrize("layers", [1, 2])
 def test_a_first_step_is_not_mirrored(layers):
-    """Before a task's first step nothing was done: the zeros are no actions, and stay zeros in a mirrored view."""
+    """Zeros mean "no previous action" at a task's first step, so mirroring keeps them."""
     flags = jnp.array([True, True])
     change = ViewChange(~flags, flags, flags)
     zero = jnp.zeros(2, jnp.int32)
@@ -172,8 +172,8 @@ def test_a_first_step_is_not_mirrored(layers):
     np.testing.assert_allclose(np.asarray(both[1][0]), np.asarray(alone), atol=1e-6)
 
 
-def test_tasks_on_layouts_of_their_own():
-    """Each plays and learns as on its layout alone."""
+def test_tasks_on_different_layouts_in_one_batch():
+    """Each task plays and learns as it does in a batch of its own layout."""
     layouts, mates = rearranged_layouts(LAYOUT, 3)[::2], []
     mates = [build_teammate(one, sample_teammate("assembly_line", 0, "train")) for one in layouts]
     group = TaskGroup([*layouts, layouts[1]], "assembly_line", [*mates, mates[1]], True, "some")
@@ -192,7 +192,7 @@ def test_tasks_on_layouts_of_their_own():
 
 
 def _plain(leaf: Any) -> np.ndarray:
-    """Returns an array of numbers for one that may be of random keys."""
+    """Return an array as numbers; random keys become their data."""
     return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
 
 
@@ -232,7 +232,7 @@ class TestGroups:
         assert mixed_chances(1)[0].tolist() == [1.0, 0.0, 0.0, 0.0]
 
     def test_behaviours(self):
-        """With the behaviour `stay` the teammate never moves, with `script` it plays as without behaviours."""
+        """The behaviour `stay` never moves; `script` plays like the teammate itself."""
         (base,) = teammates(1)
         mates = with_behaviours([base] * len(BEHAVIOURS), np.eye(len(BEHAVIOURS), dtype=np.float32))
         (plain,), taken = played_actions([base]), dict(zip(BEHAVIOURS, played_actions(mates), strict=True))
@@ -243,7 +243,7 @@ class TestGroups:
 
 
 def played_actions(mates: list[Policy]) -> list[np.ndarray]:
-    """Return 40 actions of each of teammates that share their functions, in the state at the start of an episode."""
+    """Return 40 actions of each teammate in the state at the start of an episode."""
     cells, facings = np.array(LAYOUT.agent_cells, np.uint8), np.zeros(2, np.uint8)
     record = jnp.asarray(start(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
     act = jax.jit(mates[0].act)
@@ -258,7 +258,7 @@ def played_actions(mates: list[Policy]) -> list[np.ndarray]:
 
 
 class TestPreparing:
-    """Teammates of histories, of other tasks, and on other layouts."""
+    """Choice of teammates from histories, other tasks and other layouts."""
 
     MODEL = dataclasses.replace(ModelOptions(**RL2_SETTINGS["model"]), width=8)
     CHOICE = HistoryOptions(("cramped_up",), source=("noise",), hide_recipe=("cramped_up",))
@@ -266,12 +266,12 @@ class TestPreparing:
     def prepare(self, play: PlayOptions, tasks: Any = (), choice: HistoryOptions = CHOICE, batch: int = 64) -> Any:
         return prepare_play("rl2", self.MODEL, TrainOptions(steps=1, batch_size=batch), play, choice, tasks)
 
-    def test_tasks_add_teammates_and_are_on_record(self):
+    def test_teammates_of_tasks_are_added_and_recorded(self):
         tasks = read_tasks(manifest_path("layout", "train", "diverse"))
         plain, job = self.prepare(PlayOptions()), self.prepare(PlayOptions(), tasks)
         assert plain.about["trained_on"] == [cell for cell in job.about["trained_on"] if cell["source"] == "noise"]
         added = {cell["algorithm"]: cell for cell in job.about["trained_on"] if cell["source"] == "tasks"}
-        here = [task for task in tasks if task.layout.name == "cramped_up"]  # those on asymm_both are left out
+        here = [task for task in tasks if task.layout.name == "cramped_up"]  # tasks on asymm_both are left out
         assert sum(cell["tasks"] for cell in added.values()) == len(here)
         assert {cell["layout"] for cell in added.values()} == {"cramped_up"}
         ids = {teammate_id(task.teammate) for task in here}
@@ -280,8 +280,8 @@ class TestPreparing:
         assert seen.layouts == ("cramped_up",) and set(seen.teammates) >= set(added)
         assert sum(job.about["histories"]["groups"].values()) == job.trainer.tasks
 
-    def test_other_layouts_are_played_as_well(self):
-        """Every version of a layout is played by as many tasks as the others, or one more, in all families together."""
+    def test_rearranged_layouts_are_played_too(self):
+        """All versions of a layout have equally many tasks over all families, up to one."""
         play = PlayOptions(rearranged=6, four_recipes=True)
         groups = [one.group for one in self.prepare(play).trainer.players]
         assert all(group.hidden and len(group.layouts) in (1, len(group.teammates)) for group in groups)
@@ -291,7 +291,9 @@ class TestPreparing:
         assert tasks["cramped_up rearranged"] == pytest.approx(REARRANGED_SHARE * tasks["cramped_up"], abs=3)
         assert 0 < tasks["cramped_up four recipes"] < tasks["cramped_up"]
         rearranged = [group for group in groups if group.label == "cramped_up rearranged"]
-        families = {group.family for group in groups} - {"fcp"}  # learned teammates play on their own layout only
+        families = {group.family for group in groups} - {
+            "fcp"
+        }  # learned teammates play only on the layout they were trained on
         assert {group.family for group in rearranged} == families
         played = collections.Counter(layout for group in rearranged for layout in group.layouts)
         assert {one.rows for one in played} == {one.rows for one in rearranged_layouts(LAYOUT, 6)}
@@ -307,16 +309,16 @@ class TestPreparing:
         assert job.about["histories"]["layouts"] == ["cramped_down"]
 
     @pytest.mark.slow
-    def test_teammates_of_other_layouts_are_on_record(self):
-        """With few tasks, some teammates are played with on rearranged layouts alone."""
+    def test_teammates_on_rearranged_layouts_are_recorded(self):
+        """With few tasks, some teammates appear only on rearranged layouts."""
         tasks = read_tasks(manifest_path("layout", "train", "diverse"))
         few = self.prepare(PlayOptions(minibatches=1), tasks, batch=2)
         job = self.prepare(PlayOptions(rearranged=6, minibatches=1), tasks, batch=2)
         counts = [sum(cell["tasks"] for cell in one.about["trained_on"]) for one in (few, job)]
         assert counts[0] < counts[1]
 
-    def test_shares_follow_what_was_measured(self):
-        """The ego matters with diverse teammates on demo_simple, and with none of them on coord_simple."""
+    def test_shares_follow_the_measured_oracle_gain(self):
+        """The oracle earns more than `stay` with diverse teammates on demo_simple, not on coord_simple."""
         tasks = read_tasks(manifest_path("teammate", "train", "diverse"))
         assert _shares(None, [task for task in tasks if task.layout.name in ("demo_simple", "coord_simple")]) == {
             "coord_simple": FLAT_SHARE,
@@ -347,7 +349,7 @@ class TestPreparing:
             (PlayOptions(), HistoryOptions(("cramped_up",), channels="own"), None, "rl2 takes canonical channels"),
         ],
     )
-    def test_impossible_choices(self, play, choice, manifest, message):
+    def test_invalid_choices_of_teammates(self, play, choice, manifest, message):
         tasks = read_tasks(manifest_path(*manifest)) if manifest else ()
         with pytest.raises(OptionError, match=message):
             self.prepare(play, tasks, choice)
@@ -379,7 +381,9 @@ class TestCommand:
         assert agent.details and agent.details["sampled"] is True
         assert trained.hide_recipe == ("cramped_up",)
         task = published_task("cramped_down", "H1/t0")
-        prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # compiles: it fits what the evaluator passes
+        prepare_rollout(
+            agent.make, [task], get_protocol("seeded", 1)
+        )  # compiling checks that the ego accepts the evaluator's inputs
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

@@ -1,4 +1,4 @@
-"""Histories of trained agents: what is recorded, labels, teammates, resume, and the release."""
+"""Histories recorded from trained agents: arrays, labels, teammates, resume and the release."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CONFIG = NoiseConfig(2, 10, start=(1.0, 1.0), end=(0.0, 0.0))
 
 
 def cook(layout: Any) -> Policy:
-    """An agent that always interacts, and sees ego_inputs."""
+    """An agent that always interacts."""
     return Policy((), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(5), memory), "ego_input")
 
 
@@ -44,7 +44,7 @@ COOK, IDLE = NamedEgo("cook", cook, {"version": 1}), NamedEgo("idle", idle)
 
 @pytest.fixture(scope="module")
 def dataset() -> Any:
-    """Bundled histories of one layout with heuristics of one kind."""
+    """Return bundled histories of one layout with heuristic teammates of one family."""
     return load_icrl4aht(layout="cramped_up").filter(teammate_family="H3")
 
 
@@ -59,7 +59,7 @@ def test_the_release_is_verified_to_the_last_step(release):
     assert not list(release.parent.glob("*.parts"))
 
 
-def test_what_the_release_says(release, dataset):
+def test_provenance_of_the_release(release, dataset):
     found = load_icrl4aht(release)
     made, given = release_teammates(found).tasks, release_teammates(dataset).tasks
     assert found.counts("source") == {"student": 2 * len(given)}
@@ -70,7 +70,7 @@ def test_what_the_release_says(release, dataset):
     assert not set(found.column("task_id")) & set(dataset.column("task_id"))
 
 
-def test_the_noise_falls_and_the_labels_are_without_it(release):
+def test_noise_decreases_and_labels_contain_none(release):
     found = load_icrl4aht(release)
     for history in (found[0], found[len(found) - 1]):
         taken, labels = (np.asarray(values[:]).reshape(10, 100) for values in (history.actions, history.expert_actions))
@@ -79,11 +79,11 @@ def test_the_noise_falls_and_the_labels_are_without_it(release):
         assert share[0] < 0.4 and (share[-1] == 1).all()
         assert np.corrcoef(share, np.arange(10))[0, 1] > 0.9
         oracle = np.asarray(history.oracle_actions[:])
-        assert len(set(oracle.tolist())) > 3  # the script sees the same states, and does something else
+        assert len(set(oracle.tolist())) > 3  # the script would act differently in these states
 
 
 def test_another_agent_labels(dataset):
-    """The labeller sees the history that the agent makes, its actions included."""
+    """The labeller receives the agent's history, including its actions."""
 
     def counts(layout: Any) -> Policy:
         def act(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
@@ -95,7 +95,7 @@ def test_another_agent_labels(dataset):
     config = NoiseConfig(1, 10, start=(0.0, 0.0))
     found = record_histories(idle, tasks, config, make_labeller=counts)
     assert (found.actions == STAY).all()
-    # Nothing was done before the first step; then every step was a "stay".
+    # The first step has no previous action; later ones follow a "stay".
     np.testing.assert_array_equal(found.expert_actions[0], (1 + np.maximum(np.arange(1000) - 1, 0)) % 6)
     with pytest.raises(OptionError, match="the labeller takes state, expected ego_input, as the agent does"):
         with_noise(idle(None), 10, AGENTS["oracle"](tasks[0].layout))
@@ -107,13 +107,13 @@ def test_teammates_of_other_tasks_are_played_as_well(dataset):
     added = more.tasks[len(plain.tasks) :]
     here = [task for task in tasks if task.layout.name == "cramped_up"]
     assert [task.teammate for task in added] == [task.teammate for task in here] and len(here) > 30
-    assert {task.layout.name for task in added} == {"cramped_up"}  # those on other layouts are left out
+    assert {task.layout.name for task in added} == {"cramped_up"}  # tasks on other layouts are left out
     assert len({task.task_id for task in plain.tasks + more.tasks}) == len(plain.tasks) + len(more.tasks)
     again = release_teammates(dataset, tasks=[*plain.tasks, *here[:1]])
-    assert len(again.tasks) == len(plain.tasks) + 1  # each teammate once
+    assert len(again.tasks) == len(plain.tasks) + 1  # every teammate appears once
 
 
-def test_impossible_tasks(dataset):
+def test_unusable_tasks_are_refused(dataset):
     with pytest.raises(OptionError, match="none of the 120 tasks of the manifests is on cramped_up; leave them out"):
         release_teammates(dataset, tasks=read_tasks(manifest_path("teammate", "test")))
     learned = replace(TEST_TASKS[0], teammate={"kind": "rl", "family": "fcp", "theta": {}})

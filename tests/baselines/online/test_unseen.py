@@ -1,4 +1,4 @@
-"""Returns on unseen layouts: those of each layout played alone, and the command."""
+"""Returns on unseen layouts: equal to playing each layout alone; the command."""
 
 from __future__ import annotations
 
@@ -29,10 +29,13 @@ TASKS = [
 ]
 
 
-def test_returns_are_those_of_each_layout_alone():
+def test_returns_equal_playing_each_layout_alone():
     found = unseen_returns({"oracle": AGENTS["oracle"]}, TASKS, 3, 2)["oracle"]["cramped_up", "H1"]
     assert found.shape == (3, 2)
-    layout, task = unseen_layouts(TASKS[0].layout, 3)[-1], TASKS[-1]  # the last version meets the last teammate
+    layout, task = (
+        unseen_layouts(TASKS[0].layout, 3)[-1],
+        TASKS[-1],
+    )  # the last version is played with the last teammate
     mates = [build_teammate(layout, task.teammate)]
     rollout = EvaluationRollout(layout, AGENTS["oracle"](layout), mates, get_protocol("seeded"))
     state = rollout.start(task_key(2, task.task_id)[None])
@@ -55,7 +58,7 @@ def test_learned_teammates_play_on_their_own_layout_only():
 class TestCommand:
     @pytest.fixture
     def played(self, monkeypatch) -> list[Any]:
-        """Arguments of the calls that play, in place of which returns are made up."""
+        """Replace playing by invented returns; collect the arguments of each call."""
         calls = []
 
         def returns(egos: dict[str, Any], tasks: list[Any], *sizes: Any) -> Any:

@@ -1,4 +1,4 @@
-"""docs/results.md: its tables against hand-made numbers, and the committed page."""
+"""docs/results.md: tables computed from hand-made numbers, and the committed page."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from tests.helpers.paths import ROOT
 
 
 def blocks(mean: Any, gain: Any = 0.0) -> dict[str, np.ndarray]:
-    """Five tasks and three seeds whose return rises by `gain`, and from the very first episode by half more."""
+    """Return results of five tasks and three seeds whose return rises by `gain`."""
     values, gain = np.broadcast_to(mean, (5, 3)), np.broadcast_to(gain, (5, 3))
     return {"mean": values, "first": values - gain / 2, "last": values + gain / 2, "opening": values - gain}
 
 
 def everywhere(share: float, gain: float = 0.0) -> dict[ResultCell, dict[str, np.ndarray]]:
-    """Returns of an agent that has the same share of the headroom in every cell."""
+    """Return results of an agent with an equal normalised score in every cell."""
     egos = cell_headroom("seeded")
     return {
         cell: blocks(egos[cell]["stay"] + share * (egos[cell]["oracle"] - egos[cell]["stay"]), gain)
@@ -94,8 +94,8 @@ def test_layouts_above_the_paper():
     assert layouts_above_paper(cells) == []
 
 
-def test_the_page_has_columns_of_the_models_that_the_present_code_makes():
-    """Others, and models without their memory, are in the summary."""
+def test_the_page_has_a_column_for_each_current_model():
+    """Older models and models without memory appear only in the summary."""
     agents = {"a": everywhere(0.5, gain=2.0), f"a{FORGETS}": everywhere(0.1), "old": everywhere(0.2)}
     ablations = {"ablate windows": {"plain": "the first", "long": "K = 500"}}
     stored = stored_of(agents, commits={"old": "71f723c"}, ablations=ablations)
@@ -120,7 +120,7 @@ def test_the_page_has_columns_of_the_models_that_the_present_code_makes():
 
 
 def test_unseen_layouts(tmp_path):
-    """Returns by hand: two versions of two layouts, one of them with two families, 40 episodes."""
+    """Check scores of hand-made returns on two versions of two layouts."""
 
     def returns(*of_versions: float) -> np.ndarray:
         return np.repeat(np.array(of_versions)[:, None], 40, axis=1)
@@ -144,7 +144,7 @@ def test_unseen_layouts(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_committed_page_is_that_of_the_stored_results():
+def test_the_committed_page_matches_the_stored_results():
     page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
     assert page == render_comparison(read_stored(results_file()))
 

@@ -1,4 +1,4 @@
-"""The page of a report in headless Chromium, as wide as a phone."""
+"""The page of a report in headless Chromium at the width of a phone."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TOO_WIDE = """(width) => [...document.body.querySelectorAll("*")]
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory) -> Path:
-    """A page with every section: all layouts, long names and pictures of episodes."""
+    """Write a page with every section: all layouts, long names and pictures of episodes."""
     folder = tmp_path_factory.mktemp("report")
     Image.fromarray(np.zeros((400, 900), np.uint8)).save(folder / "a.gif")
     runs = [evaluated_run(name, TEST_LAYOUTS, protocol="published") for name in ("AD", "random")]

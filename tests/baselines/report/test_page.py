@@ -1,4 +1,4 @@
-"""The page, the Markdown report and cards: complete, self-contained, and safe with any agent's name."""
+"""The HTML page, the Markdown report and cards: complete, self-contained, names escaped."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
-GIF = b"GIF89a"  # the page does not look inside
+GIF = b"GIF89a"  # the page does not decode the image
 EVIL = '<img src=x onerror="alert(1)">&co'
 
 
 class Elements(HTMLParser):
-    """Parser that collects what a page would fetch or run, and the tooltips of its elements."""
+    """Parser that collects external addresses, scripts and tooltips of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -145,7 +145,7 @@ def test_curves_share_their_axes_and_may_have_one_episode():
 
 
 def trained(run: EvaluationRun, **model) -> EvaluationRun:
-    """The results as those of a model that was trained on the layouts of its name."""
+    """Return the results with a training record that lists the layouts in the agent's name."""
     histories = {
         "root": "hf://datasets/you/icrl4aht@v1",
         "layouts": list(run.sources[0].layouts),
@@ -205,8 +205,8 @@ def test_headroom_cards_name_cells_without_headroom(tmp_path):
     assert "**0.0 / 0.0 / 39.9**" in text and "No headroom: coord_simple/H1, coord_simple/H2" in text
 
 
-def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
-    """Tasks with headroom, every agent once before any twice, reference egos last."""
+def test_shown_episodes_prefer_cells_with_headroom(tmp_path, monkeypatch):
+    """Tasks with headroom come first, every agent appears once before any twice, reference egos last."""
     (tmp_path / "a.gif").write_bytes(GIF)
     monkeypatch.setattr(gifs, "save_episodes", lambda *a, **k: (ShownEpisode(1, 7.0, tmp_path / "a.gif"),))
     monkeypatch.setattr(gifs, "restore_ego", lambda source: source)
@@ -227,7 +227,7 @@ def test_episodes_are_of_what_is_worth_seeing(tmp_path, monkeypatch):
     assert 'id="episodes"' not in write_page_with_episodes(runs, path, episodes=False).read_text()
 
 
-def test_egos_that_cannot_be_made_again_say_why(tmp_path):
+def test_egos_that_cannot_be_loaded_give_a_reason(tmp_path):
     source = evaluated_run("AD").sources[0]
     with pytest.raises(OptionError, match="AD is neither a reference ego, nor a bundled model, nor of a run folder"):
         restore_ego(source)
@@ -235,8 +235,8 @@ def test_egos_that_cannot_be_made_again_say_why(tmp_path):
         restore_ego(source._replace(trained={"run": str(tmp_path / "gone")}))
 
 
-def test_commands_with_tasks_of_ones_own(tmp_path, monkeypatch):
-    """Evaluates, prints the summary, and draws the first and the last episode, which earn what the results say."""
+def test_commands_with_a_custom_manifest(tmp_path, monkeypatch):
+    """Evaluate, print the summary, and draw the first and last episode with the stored returns."""
     theta = next(task for task in TEST_TASKS if task.teammate_family == "H4").teammate
     write_tasks(tmp_path / "own.jsonl", [make_task("teammate", "train", "demo_wide", theta | {"theta_id": 77}, 5)])
     monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 3, 5))

@@ -1,4 +1,4 @@
-"""Results as one table: cells, kinds of tasks, overlaps with training data, merged runs, and stored results."""
+"""Results in one table: cells, kinds of tasks, overlap with training data, merged and stored runs."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_kinds_of_tasks_never_share_a_cell(kind):
     ],
 )
 def test_overlaps_of_training_and_tasks(tasks, record, expected):
-    """A layout may be in training unless the layout track reserves it for tests."""
+    """Training on a test layout is an overlap only in the layout track."""
     entries = None if record is None else [{"layout": "demo_wide", **entry} for entry in record]
     run = evaluated_run("AD", tasks=tasks, trained_on=entries)
     assert rows(run)[0]["overlap"].split() == expected
@@ -94,7 +94,7 @@ def test_overlaps_of_training_and_tasks(tasks, record, expected):
     assert set(expected) <= set(OVERLAPS)
 
 
-def test_only_reference_egos_need_no_record_of_their_training():
+def test_only_reference_egos_may_have_no_training_record():
     assert rows(evaluated_run("stay", trained_on=None))[0]["overlap"] == ""
     with pytest.raises(OptionError, match=r"runs/mine: trained_on: expected a layout, a family"):
         evaluated_run("mine", trained_on=[{"layout": "demo_wide"}])
@@ -133,7 +133,7 @@ def test_cells_are_split_by_kind_and_layout():
 
 @pytest.fixture
 def ramp(tmp_path):
-    """Results of an agent in one cell: episode returns 0..99 plus the seed, in every task."""
+    """Return results of one cell with episode returns 0..99 plus the seed in every task."""
     settings = {"agent": "ramp", "seeds": [0, 1], "protocol": asdict(get_protocol("seeded")), "code_version": "0"}
     settings |= {"details": {"trained_on": [{"layout": "demo_wide", "family": "H4"}]}}
     for task in published_test_tasks().values():
@@ -143,7 +143,7 @@ def ramp(tmp_path):
     return tmp_path / "ramp"
 
 
-def test_stored_results_are_read_as_they_were_added(ramp, tmp_path):
+def test_stored_results_round_trip(ramp, tmp_path):
     stored = add_results(add_results(StoredResults(), ramp, "a ramp"), ramp, "")
     write_stored(tmp_path / "results.json", stored)
     again = read_stored(tmp_path / "results.json")
@@ -155,7 +155,7 @@ def test_stored_results_are_read_as_they_were_added(ramp, tmp_path):
         assert blocks["overlaps"] == ("family",) and blocks["gain"].tolist() == [[80.0, 80.0]] * 5
 
 
-def test_the_packages_results_are_written_as_they_are(tmp_path):
+def test_bundled_results_are_in_canonical_form(tmp_path):
     write_stored(tmp_path / "results.json", read_stored(results_file()))
     assert (tmp_path / "results.json").read_bytes() == results_file().read_bytes()
 
@@ -185,8 +185,8 @@ def test_damaged_stored_results(content, tmp_path):
         read_stored(tmp_path / "bad.json")
 
 
-def test_results_of_a_track_each(tmp_path):
-    """A bundled model has a model, and so training data, for each track."""
+def test_results_are_kept_for_each_track(tmp_path):
+    """A bundled model has separate parameters and training data for each track."""
     record = {"teammate": [{"layout": "demo_wide", "family": "H4"}], "layout": []}
     run = evaluated_run("ad-reference", ("demo_wide", "cramped_down"), details={"trained_on": record}, trained_on=None)
     assert [source.layouts for source in run.sources] == [("demo_wide",), ("cramped_down",)]

@@ -1,4 +1,4 @@
-"""Scores against hand-made numbers: of cells, of groups of cells, the summary, and the paper's numbers next to them."""
+"""Scores of cells and groups, the summary and the paper's numbers, against hand-made values."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_the_score_is_the_mean_over_complete_cells_with_headroom():
     )
 
 
-def test_the_paper_is_quoted_where_the_protocol_matches():
+def test_paper_numbers_appear_only_if_the_protocol_matches():
     assert list(find_headlines(evaluated_run("DPT", protocol="published"))[0].paper) == ["DPT"]
     assert find_headlines(evaluated_run("DPT"))[0].paper == {}
     assert find_headlines(evaluated_run("DPT", protocol="published", variant=("K", 500)))[0].paper == {}
@@ -75,7 +75,7 @@ def test_results_without_a_score_say_why():
     assert "return 11.0; gain" in test.text, "no interval of a single instance"
 
 
-def test_other_episode_lengths_compare_with_nothing():
+def test_other_episode_lengths_have_no_paper_numbers():
     run = evaluated_run("AD", protocol="published", steps=20)
     found = group_score(DEMO_WIDE[:1], run, "published", (1.0, 1.0))
     assert (found.published, found.normalised) == (None, None)
@@ -110,8 +110,8 @@ def test_published_numbers_of_groups_of_cells():
     )
 
 
-def test_the_papers_averages_are_those_of_its_cells():
-    """Finds errors in the copied numbers, which are rounded to a tenth."""
+def test_the_papers_averages_equal_the_means_of_its_cells():
+    """This check finds copying errors; the numbers are rounded to a tenth."""
     for layouts in read_published()["methods"].values():
         for families in layouts.values():
             if "H1" in families:
@@ -119,7 +119,7 @@ def test_the_papers_averages_are_those_of_its_cells():
                 assert abs(mean - families[AVERAGE][0]) < 0.11
 
 
-def test_a_part_of_a_group_says_so():
+def test_incomplete_groups_are_marked():
     run = evaluated_run("AD", families=("H1", "H2"))
     found = group_score(DEMO_WIDE, run, "seeded")
     assert (found.played, found.mean, found.notes[0]) == ((2, 4), 11.0, "2 of 4 cells")

@@ -1,4 +1,4 @@
-"""Means and their intervals, on values whose intervals are known."""
+"""Means and confidence intervals of values with known intervals."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def test_one_cell_has_the_percentile_interval():
     assert mean_interval(values) == found, "random numbers are fixed"
 
 
-def test_equal_values_have_no_interval_and_no_values_no_mean():
+def test_equal_values_and_empty_input():
     assert mean_interval(np.full(5, 7.0), np.full((3, 2), 1.0)) == (4.0, 4.0, 4.0)
     assert np.isnan(mean_interval()).all()
 
 
-def test_seeds_of_an_instance_are_no_further_instances():
-    """The same 15 values: as instances, as seeds of five instances that differ, and of ones that do not."""
+def test_seeds_do_not_count_as_instances():
+    """Compare 15 values as instances, as seeds of five different instances and of five equal ones."""
     values = np.linspace(-1, 1, 15)
     flat, differing, alike = (mean_interval(found) for found in (values, values.reshape(5, 3), values.reshape(3, 5).T))
     widths = [high - low for _, low, high in (flat, differing, alike)]

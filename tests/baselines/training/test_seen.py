@@ -1,4 +1,4 @@
-"""Record of the layouts and teammates that a model was trained on."""
+"""The record of the layouts and teammates in a model's training data."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from icrl4aht_data.errors import NotStoredError, OptionError
 
 @pytest.fixture
 def dataset(two_sources) -> Dataset:
-    """Noise histories of demo_wide with two teammates."""
+    """Return noise histories of demo_wide with two teammates."""
     return load_icrl4aht(two_sources[0], split="train", layout="demo_wide", source="noise")
 
 
