@@ -291,9 +291,7 @@ class TestPreparing:
         assert tasks["cramped_up rearranged"] == pytest.approx(REARRANGED_SHARE * tasks["cramped_up"], abs=3)
         assert 0 < tasks["cramped_up four recipes"] < tasks["cramped_up"]
         rearranged = [group for group in groups if group.label == "cramped_up rearranged"]
-        families = {group.family for group in groups} - {
-            "fcp"
-        }  # learned teammates play only on the layout they were trained on
+        families = {group.family for group in groups} - {"fcp"}  # learned teammates play only on their training layout
         assert {group.family for group in rearranged} == families
         played = collections.Counter(layout for group in rearranged for layout in group.layouts)
         assert {one.rows for one in played} == {one.rows for one in rearranged_layouts(LAYOUT, 6)}
@@ -381,9 +379,7 @@ class TestCommand:
         assert agent.details and agent.details["sampled"] is True
         assert trained.hide_recipe == ("cramped_up",)
         task = published_task("cramped_down", "H1/t0")
-        prepare_rollout(
-            agent.make, [task], get_protocol("seeded", 1)
-        )  # compiling checks that the ego accepts the evaluator's inputs
+        prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # compiles
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

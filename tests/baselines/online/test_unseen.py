@@ -35,7 +35,7 @@ def test_returns_equal_playing_each_layout_alone():
     layout, task = (
         unseen_layouts(TASKS[0].layout, 3)[-1],
         TASKS[-1],
-    )  # the last version is played with the last teammate
+    )  # last version, last teammate
     mates = [build_teammate(layout, task.teammate)]
     rollout = EvaluationRollout(layout, AGENTS["oracle"](layout), mates, get_protocol("seeded"))
     state = rollout.start(task_key(2, task.task_id)[None])

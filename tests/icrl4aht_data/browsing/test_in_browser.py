@@ -1,4 +1,4 @@
-"""The page in headless Chromium: decoded states, drawn pixels, what is shown, keys, phone width and dark mode."""
+"""The browse page in headless Chromium: decoding, drawing, keys, phone width and dark mode."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def file(dataset, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def open_page(file) -> Iterator[OpenPage]:
-    """Opens the page in a new tab, which must have no error and ask for no other file."""
+    """Open the page in a new tab; check that it has no errors and requests no other file."""
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         problems: list[str] = []
@@ -83,7 +83,7 @@ def table_of(page) -> dict[str, str]:
     return dict(zip(cells[::2], cells[1::2], strict=True))
 
 
-def test_the_browser_decodes_the_states_of_the_reader(open_page, dataset):
+def test_decoded_states_equal_those_of_the_reader(open_page, dataset):
     page = open_page()
     assert page.evaluate("[chosen.history, chosen.episode, chosen.step]") == [0, 0, 0]
     decode = """async (position) => (await episodesOf(position)).map(({ records, rewards, actions, expert_actions }) =>
@@ -99,8 +99,8 @@ def test_the_browser_decodes_the_states_of_the_reader(open_page, dataset):
     page.close()
 
 
-def test_a_drawn_state_is_that_of_draw_frame(open_page, dataset):
-    """The pixels differ in text, which has the browser's font, and by smoothing at edges."""
+def test_drawn_pixels_equal_draw_frame(open_page, dataset):
+    """Text and smoothed edges may differ, because the browser draws them."""
     for number in (0, len(dataset) - 1):
         history = dataset[number]
         layout = get_layout(history.entry.layout)
@@ -127,7 +127,7 @@ def test_a_drawn_state_is_that_of_draw_frame(open_page, dataset):
         page.close()
 
 
-def test_what_is_shown_of_a_step(open_page, dataset):
+def test_details_shown_for_a_step(open_page, dataset):
     history = dataset[1]
     page = open_page(f"#history={history.entry.history_id}&episode=3&step=7")
     at, earned = 47, history.rewards[40:47].sum()
@@ -203,7 +203,7 @@ def test_a_phone_does_not_scroll_sideways(open_page, dark):
     page.close()
 
 
-def test_a_page_with_some_episodes_says_which(open_page, dataset, tmp_path):
+def test_a_partial_page_lists_its_episodes(open_page, dataset, tmp_path):
     size = len(make_browser_page(dataset).html)
     smaller = make_browser_page(dataset, megabytes=0.985 * size / 1e6)
     save_browser_page(smaller, tmp_path / "small.html")
@@ -217,7 +217,7 @@ def test_a_page_with_some_episodes_says_which(open_page, dataset, tmp_path):
     page.close()
 
 
-def test_a_damaged_page_says_so(open_page, file, tmp_path):
+def test_a_damaged_page_shows_an_error(open_page, file, tmp_path):
     text = file.read_text()
     at = text.index('"histories": ["') + 200
     (tmp_path / "damaged.html").write_text(text[:at] + "AAAA" + text[at + 4 :])

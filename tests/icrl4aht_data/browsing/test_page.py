@@ -1,4 +1,4 @@
-"""The page of `icrl4aht-data browse`: what it embeds is what the reader gives, within its size, and safely written."""
+"""The page of `icrl4aht-data browse`: embedded data equals the reader's, size limit, safe writing."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tests.helpers.states import random_records
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
-    """Two layouts with two teammates each, one with noise histories; expert and oracle labels."""
+    """Return a release with two layouts, two teammates each, and both kinds of labels."""
     root = tmp_path_factory.mktemp("browse") / "release"
     sources = ("ppo", "noise", "ppo", "noise")
     random_release(root, oracle=True, sources=sources, episodes=8)
@@ -108,7 +108,7 @@ def test_thirty_bundled_histories_stay_below_five_megabytes():
     assert_embeds(page.html, chosen)
 
 
-def test_a_page_that_would_be_too_large_has_fewer_episodes_and_says_so(release):
+def test_large_selections_are_thinned_with_a_note(release):
     dataset = load_icrl4aht(release)
     size = len(make_browser_page(dataset).html)
     page = make_browser_page(dataset, megabytes=0.9 * size / 1e6)
@@ -154,7 +154,7 @@ def test_the_page_is_self_contained(release):
     assert "href=" not in outside.replace('href="data:,"', "")
 
 
-def test_names_of_a_release_are_text_on_the_page(release, tmp_path):
+def test_names_of_a_release_are_escaped(release, tmp_path):
     hostile = shutil.copytree(release, tmp_path / "<b>$data&amp;<script>")
     html = make_browser_page(load_icrl4aht(hostile)).html.decode()
     assert "<h1>Learning histories of &lt;b&gt;$data&amp;amp;&lt;script&gt;</h1>" in html
@@ -183,7 +183,7 @@ class TestCommand:
         with pytest.raises(UnknownNameError, match="99"):
             browse(release, "--out", tmp_path / "other.html", "--history", 99)
 
-    def test_a_release_of_observations_has_nothing_to_draw(self, release, tmp_path):
+    def test_releases_without_states_are_refused(self, release, tmp_path):
         to_release(load_icrl4aht(release), tmp_path / "obs", "observations")
         with pytest.raises(NotStoredError, match="obs: a release of kind observations has no state records"):
             browse(tmp_path / "obs", "--out", tmp_path / "page.html")
@@ -241,7 +241,7 @@ def test_impossible_states_and_actions_are_errors(release, monkeypatch):
     assert len(embed_history(history).records) == 8 * 21
 
 
-def test_the_server_gives_the_page_to_this_machine_only():
+def test_the_server_listens_on_loopback_only():
     with page_server(b"<p>page") as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()

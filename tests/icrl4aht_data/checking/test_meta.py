@@ -1,4 +1,4 @@
-"""Lies in meta/ under a valid manifest: `verify_release` compares every value with what it can compute."""
+"""False values in meta/ under a valid manifest: `verify_release` recomputes and compares them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Change = Callable[[Any], Any]
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory) -> Path:
-    """The bundled histories of learners in a task with a learned teammate. Read only."""
+    """Return bundled PPO histories of a task with a learned teammate (read-only)."""
     dataset = load_icrl4aht(source="ppo", teammate_kind="fcp")
     return to_release(dataset.filter(task_id=dataset.entries[0].task_id), tmp_path_factory.mktemp("meta") / "r", "lite")
 
@@ -36,7 +36,7 @@ def problems(root: Path, level: Any = "quick") -> list[str]:
 
 
 def spoiled(source: Path, target: Path, name: str, change: Change) -> Path:
-    """Copy a release, change one of its JSON files (a list of all lines of a JSONL file), and write its manifest."""
+    """Copy a release, change one of its JSON or JSONL files, and write a matching manifest."""
     shutil.copytree(source, target)
     path, is_lines = target / name, name.endswith("jsonl")
     lines = path.read_text().splitlines()
@@ -105,7 +105,7 @@ def test_the_unspoiled_release_is_valid(learned):
         (INFO, lambda c: first(c["statistics"]).update(disk_bytes=1), "statistics: expected"),
     ],
 )
-def test_lies(learned, tmp_path, name, change, message):
+def test_false_values_are_found(learned, tmp_path, name, change, message):
     dataset = load_icrl4aht(learned)
     (note,) = read_provenance(learned / PROVENANCE).values()
     assert note.ego is not None
@@ -116,7 +116,7 @@ def test_lies(learned, tmp_path, name, change, message):
 
 
 def test_a_teammate_in_provenance_is_not_used(learned, tmp_path):
-    """This once replaced the teammate of the task, whose id is a hash of it."""
+    """Regression: provenance once replaced the task's teammate, although the task's id hashes it."""
     root = spoiled(learned, tmp_path / "release", PROVENANCE, lambda c: first(c)["teammate"].update(family="brdiv"))
     with pytest.raises(IndexFormatError, match="unknown field `family`"):
         load_icrl4aht(root).recover_teammate(0)
@@ -131,7 +131,7 @@ def test_unsafe_versions_are_not_written(learned, tmp_path):
         write_release(tmp_path / "out", "lite", [], data_version="1")
 
 
-def test_lies_in_a_release_without_tasks(converted_release, tmp_path):
+def test_false_values_without_tasks_are_found(converted_release, tmp_path):
     for number, (change, message) in enumerate(
         (
             (lambda c: [line.update(seed=3) for line in c], "seed: expected -1 without tasks, found 3"),
@@ -142,7 +142,7 @@ def test_lies_in_a_release_without_tasks(converted_release, tmp_path):
         assert any(message in problem for problem in found), found
 
 
-def test_files_that_nothing_refers_to(learned, tmp_path):
+def test_unreferenced_files_are_found(learned, tmp_path):
     root = tmp_path / "release"
     shutil.copytree(learned, root)
     policy = next(root.glob("teammates/*"))
@@ -156,7 +156,7 @@ def test_files_that_nothing_refers_to(learned, tmp_path):
 
 
 @pytest.mark.parametrize("with_info", [True, False])
-def test_a_shard_with_a_hole_of_a_terabyte(damaged, with_info):
+def test_a_sparse_terabyte_shard(damaged, with_info):
     os.truncate(damaged / SHARD, 10**12)
     if not with_info:
         (damaged / INFO).unlink()
@@ -167,7 +167,7 @@ def test_a_shard_with_a_hole_of_a_terabyte(damaged, with_info):
             assert sum("bytes, found" in problem for problem in found) == 1, found
 
 
-def test_a_card_with_a_hole_of_a_terabyte(damaged):
+def test_a_sparse_terabyte_card(damaged):
     os.truncate(damaged / "README.md", 10**12)
     found = problems(damaged)
     assert any("README.md: expected at most 4,294,967,296 bytes, found 1,000,000,000,000" in line for line in found)

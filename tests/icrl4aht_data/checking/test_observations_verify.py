@@ -1,4 +1,4 @@
-"""Releases of observations: faults that `verify_release` finds in them, and what commands print about them."""
+"""Releases of observations: faults found by `verify_release` and output of commands."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class TestVerify:
             assert report.transitions == transitions
             assert [note[:20] for note in report.notes] == ["nothing was replayed"] * (level == "deep")
 
-    def test_deep_finds_an_observation_that_no_cell_shows(self, published_folder, tmp_path):
+    def test_deep_finds_an_impossible_observation(self, published_folder, tmp_path):
         first = 2 * (7 + get_layout("demo_wide").ingredient_types)
         root = spoiled(published_folder, tmp_path, "obs", (33, slice(None), slice(None), first), 1)  # walls everywhere
         assert problems(root) == []
@@ -74,7 +74,7 @@ class TestCommand:
         assert result.exit_code == code, (result.output, result.exception)
         return result.output if result.exception is None or code == 2 else f"{result.output}{result.exception}"
 
-    def test_convert_says_what_is_missing(self, published_folder, tmp_path):
+    def test_convert_lists_missing_options(self, published_folder, tmp_path):
         said = self.run("convert", published_folder[0], "--out", tmp_path / "out", "--kept-steps", KEPT)
         assert said == f"{tmp_path / 'out'}: observations, no state records: nothing can be replayed or drawn\n"
         self.run(

@@ -78,8 +78,8 @@ def test_missing_and_extra_files(damaged):
 
 
 @pytest.mark.parametrize("name", ["meta/info.json", HISTORIES, "meta/tasks.jsonl", "meta/provenance.json"])
-def test_quick_refuses_what_loading_refuses(damaged, name):
-    """A bit of meta/ that changes no value that other checks compare."""
+def test_quick_checks_the_checksums_of_meta(damaged, name):
+    """Flip a bit of meta/ that only the checksum reveals."""
     path = damaged / name
     path.write_text(path.read_text() + " ")
     with pytest.raises(ReleaseError, match=f"{name}: expected sha256"):
@@ -88,7 +88,7 @@ def test_quick_refuses_what_loading_refuses(damaged, name):
 
 
 def test_weights_are_in_the_folder_of_their_hash(tmp_path):
-    """Other weights in place of a policy's are found although the manifest lists them."""
+    """Replaced weights of a policy are found even if the manifest lists them."""
     root = shutil.copytree(MINI, tmp_path / "release")
     weights = next(root.glob("teammates/*/policy.safetensors"))
     weights.write_bytes(weights.read_bytes()[:-1] + b"?")
@@ -113,7 +113,7 @@ def rewritten(tmp_path, spoil, kind: Kind = "lite"):
 @pytest.mark.parametrize(
     ("name", "value"), [("expert_return", 0.5), ("expert_return_sampled", None), ("expert_step", 8)]
 )
-def test_returns_of_experts_are_those_of_the_provenance(tmp_path, name, value):
+def test_expert_returns_match_the_provenance(tmp_path, name, value):
     (task,) = make_tasks(["demo_simple"])
     arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
     labels = ExpertLabels("ab" * 32, "greedy", step=7, return_greedy=0.0, return_sampled=16.9, episodes=200)
@@ -184,14 +184,14 @@ def test_an_unspoiled_rewrite_is_valid(tmp_path):
         ),
     ],
 )
-def test_physics_that_cannot_have_happened_is_found_by_deep(tmp_path, spoil, message):
+def test_deep_finds_impossible_transitions(tmp_path, spoil, message):
     root = rewritten(tmp_path, spoil)
     assert problems(root) == [], "only --deep looks at the physics"
     found = problems(root, level="deep")
     assert any(message in line for line in found), found
 
 
-def test_observations_that_the_state_does_not_show(tmp_path, monkeypatch):
+def test_observations_that_differ_from_the_state(tmp_path, monkeypatch):
     real = release.observe
 
     def wrong(layout, record, agent):
@@ -255,7 +255,7 @@ def foreign(lines):
         (lambda lines: lines[0].update(teammate_family="H9"), "unknown teammate_family 'H9'"),
     ],
 )
-def test_index_lines_that_lie(damaged, change, message):
+def test_false_index_lines_are_found(damaged, change, message):
     spoil_index(damaged, change)
     assert any(message in problem for problem in problems(damaged)), problems(damaged)
 
@@ -289,7 +289,7 @@ def test_other_episode_lengths_than_stated(damaged):
 
 @pytest.mark.parametrize(("flips", "texts"), [(1, 1), pytest.param(25, 7, marks=pytest.mark.slow)])
 def test_no_damage_makes_verify_raise(damaged, flips, texts):
-    """Flipped bits and hostile texts in any file: verify reports, never raises, and never calls the release valid."""
+    """With flipped bits or hostile texts in any file, verify reports problems and never raises."""
     rng = np.random.default_rng(7)
     hostile = [b'{"format_version": ' + b"9" * 5000 + b"}", b"[" * 5000, b"", b"[]", b"{}", b"null", b"\xff\xfe"]
     for path in sorted(p for p in damaged.rglob("*") if p.is_file()):
@@ -298,7 +298,7 @@ def test_no_damage_makes_verify_raise(damaged, flips, texts):
         for data in [*spoiled, *hostile[:texts], content[: len(content) // 2]]:
             path.write_bytes(data)
             assert not verify_release(damaged, level="deep").ok, path
-            if path.name != "MANIFEST.sha256":  # as if the author of the damage had written the manifest, too
+            if path.name != "MANIFEST.sha256":  # the manifest matches the damaged files
                 write_manifest(damaged)
                 verify_release(damaged, level="deep")
                 (damaged / "MANIFEST.sha256").unlink()
@@ -348,7 +348,7 @@ class TestCommand:
         assert {finding["file"] for finding in content["findings"]} == {SHARD}
 
 
-def test_a_shard_that_neither_manifest_nor_folder_has(damaged):
+def test_a_missing_unlisted_shard(damaged):
     (damaged / SHARD).unlink()
     write_manifest(damaged)
     assert any("the index names this shard" in problem for problem in problems(damaged))

@@ -1,4 +1,4 @@
-"""The command line: list, show, errors as a process prints them, and the version."""
+"""The command line: list, show, error output and version."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.helpers.paths import ROOT
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
-    """The installed command, as a process of its own."""
+    """Run the installed command in a subprocess."""
     return subprocess.run([sys.executable, "-m", "icrl4aht_data", *arguments], capture_output=True, text=True)
 
 
@@ -51,7 +51,7 @@ def test_show_release_and_history(lite):
     assert "12 histories" in CliRunner().invoke(cli, ["show", str(lite[0])]).output
 
 
-def test_list_and_show_say_sources_learners_and_labels(two_sources):
+def test_list_and_show_print_sources_learners_and_labels(two_sources):
     root = str(two_sources[0])
 
     def say(*arguments: str) -> str:
@@ -120,7 +120,7 @@ def test_ranges_of_ids():
     assert [id_ranges(ids) for ids in ([7], [5, 4, 3], [1, 2, 5, 9, 8])] == ["7", "3-5", "1-2,5,8-9"]
 
 
-def test_list_gives_ids_of_histories_that_show_takes(lite):
+def test_show_accepts_the_ids_printed_by_list(lite):
     root = str(lite[0])
     for task in json.loads(CliRunner().invoke(cli, ["list", "--json", root]).output):
         assert len(task["history_ids"]) == task["histories"]
@@ -141,7 +141,7 @@ def test_piped_output_is_tab_separated_and_complete(lite):
 
 
 def test_filters_by_source_reach_every_command(two_sources, tmp_path):
-    """`verify` and `convert` have arguments and options of their own that were once named source."""
+    """Regression: `--source` once clashed with arguments of `verify` and `convert`."""
     root, out = str(two_sources[0]), str(tmp_path / "noise")
     for command in (
         ["verify", root, "--source", "noise"],
@@ -178,7 +178,7 @@ def test_plots_of_many_tasks_have_a_panel_for_each_layout(lite, tmp_path, monkey
 
 
 def test_commands_destroy_nothing(lite, full, tmp_path):
-    """Run commands with targets that exist: a release, a user's files, or the source itself."""
+    """Run commands whose target is an existing release, a user's file or the source."""
     shutil.copytree(full[0], tmp_path / "cb")
     shutil.copytree(lite[0], tmp_path / "ca")
     (tmp_path / "mine").mkdir()
@@ -217,8 +217,8 @@ def test_errors_become_one_line_and_exit_code_1(tmp_path):
 
 
 @pytest.mark.parametrize(("arguments", "code"), [(["list"], 0), (["show", "--json"], 0), (["list", "--nope"], 2)])
-def test_output_that_was_closed_from_the_start_is_dropped(lite, monkeypatch, arguments, code):
-    """`list >&-` was an AttributeError with a traceback."""
+def test_closed_stdout_is_ignored(lite, monkeypatch, arguments, code):
+    """Regression: `list >&-` failed with an AttributeError."""
     monkeypatch.setattr(sys, "argv", ["icrl4aht-data", *arguments, str(lite[0])])
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
@@ -232,7 +232,7 @@ def test_output_that_was_closed_from_the_start_is_dropped(lite, monkeypatch, arg
 
 @pytest.mark.slow
 @pytest.mark.parametrize("program", ["icrl4aht_data list", "icrl4aht_data show --json", "icrl4aht_data --help"])
-def test_a_reader_that_has_gone_stops_a_command_quietly(program):
+def test_a_closed_pipe_ends_a_command_quietly(program):
     reader, writer = os.pipe()
     os.close(reader)
     arguments = [sys.executable, "-m", *program.split()]

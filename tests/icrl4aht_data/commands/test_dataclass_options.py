@@ -1,4 +1,4 @@
-"""Command-line options made from dataclasses: types, bounds, flags, defaults, and which values reach the command."""
+"""Command-line options generated from dataclasses: types, bounds, flags, defaults, given values."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def call(*words: str) -> tuple[int, str]:
     ("words", "given"),
     [
         ("", {}),
-        ("--steps 10 --out y", {"steps": 10}),  # a value that equals the default is given, too
+        ("--steps 10 --out y", {"steps": 10}),  # a value equal to the default counts as given
         ("--learning-rate 0.5 --dropout 0", {"learning_rate": 0.5, "dropout": 0.0}),
         ("--discounts 0.5 --discounts 0.6", {"discounts": [0.5, 0.6]}),
         ("--ta --no-normalize", {"teammate_actions": True, "normalize": False}),
@@ -67,7 +67,7 @@ def call(*words: str) -> tuple[int, str]:
         ("--positions rope --limit 3 --hidden 8", {"positions": "rope", "limit": 3, "widths": {"hidden": 8}}),
     ],
 )
-def test_given_values_alone_reach_the_command(words, given):
+def test_only_given_values_reach_the_command(words, given):
     code, output = call(*words.split())
     assert code == 0
     assert json.loads(output)["given"] == given
@@ -142,6 +142,6 @@ def test_a_dataclass_checks_its_own_values(values, message):
         Options(**values)
 
 
-def test_a_value_that_is_no_choice_is_an_unknown_name():
+def test_an_invalid_choice_raises_unknown_name():
     with pytest.raises(UnknownNameError, match="unknown positions 'ropes'; valid: none, rope"):
         Options(positions="ropes")  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Sets of arrays in the cache folder: rebuilt on any mismatch, limited in size, errors that say what to do."""
+"""Cached sets of arrays: rebuilt on any mismatch, limited in size, helpful errors."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_wrong_sizes_and_headers_are_built_again(folder, damage):
 
 
 @pytest.mark.parametrize("what", ["file", "link", "pipe", "empty folder", "array of other set"])
-def test_what_has_the_name_of_a_set_is_replaced(folder, what):
+def test_foreign_files_with_a_sets_name_are_replaced(folder, what):
     other = f"histories-{1:032x}"
     cached_arrays(other, 8, lambda path: np.save(path / "a.npy", np.arange(3)))
     target = folder / KEY
@@ -79,7 +79,7 @@ def test_what_has_the_name_of_a_set_is_replaced(folder, what):
     assert sorted(path.name for path in folder.iterdir()) == [KEY, other]
 
 
-def test_what_a_killed_process_left_is_removed_a_day_later(folder):
+def test_leftovers_of_killed_processes_are_removed_after_a_day(folder):
     for age in (0, 2 * 86400):
         left = folder / f".{KEY}.partial-{age}"
         left.mkdir(parents=True)
@@ -88,13 +88,13 @@ def test_what_a_killed_process_left_is_removed_a_day_later(folder):
     assert {path.name for path in folder.iterdir()} == {KEY, f".{KEY}.partial-0"}
 
 
-def test_the_least_used_arrays_make_room(folder, monkeypatch):
+def test_least_recently_used_arrays_are_evicted(folder, monkeypatch):
     def build(path: Path) -> None:
         np.save(path / "a.npy", np.zeros(1000, np.uint8))
 
     one, two, three, four, huge = (f"{name}-{7:032x}" for name in ("one", "two", "three", "four", "huge"))
     monkeypatch.setenv("ICRL4AHT_CACHE_BYTES", "3500")
-    (folder / "mine").mkdir(parents=True)  # what the package did not make is neither counted nor removed
+    (folder / "mine").mkdir(parents=True)  # foreign files are neither counted nor removed
     np.save(folder / "mine" / "a.npy", np.zeros(9000, np.uint8))
     for key in (one, two, three):
         cached_arrays(key, 1128, build)
@@ -123,7 +123,7 @@ def test_a_cache_folder_that_can_only_be_read(folder):
     (folder / KEY).chmod(0o555)
     try:
         with permissions_count():
-            check(cached_arrays(KEY, SIZE, build))  # what it has can be used
+            check(cached_arrays(KEY, SIZE, build))  # existing arrays can still be read
             assert module.cache_room() == 0
             with pytest.raises(CacheError, match=r"cannot be used: Permission denied \(.*check its permissions"):
                 cached_arrays(f"histories-{1:032x}", SIZE, build)
@@ -151,14 +151,14 @@ def test_a_full_disk_is_an_error_that_leaves_nothing(folder, announced):
 
 
 @pytest.mark.skipif(not can_mount(), reason="needs the right to mount a disk")
-def test_unused_arrays_make_room_on_a_full_disk(folder):
+def test_unused_arrays_are_evicted_on_a_full_disk(folder):
     with small_disk(folder, 2 * 2**20):
         for number in range(3):
             check(cached_arrays(f"histories-{number:032x}", SIZE, build))
         assert [path.name for path in folder.iterdir()] == [f"histories-{2:032x}"]
 
 
-def test_new_arrays_take_their_space_at_once(tmp_path):
+def test_new_arrays_allocate_their_space_at_once(tmp_path):
     array = new_mapped_array(tmp_path / "a.npy", (3000, 70), np.dtype("u1"))
     assert not array.any()
     assert (tmp_path / "a.npy").stat().st_blocks * 512 >= 3000 * 70

@@ -26,7 +26,7 @@ STEPS = 400
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory) -> Path:
-    """A release of one history, whose chunks are in deflate's format, but not compressed. Read only."""
+    """Return a release of one history with uncompressed deflate chunks (read-only)."""
     root = tmp_path_factory.mktemp("stored") / "release"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(chunks, "DEFLATE_LEVEL", 0)
@@ -50,7 +50,7 @@ def actions_row(root: Path) -> tuple[np.void, int]:
 
 
 def forge(root: Path, target: Path, form: str) -> np.ndarray:
-    """Copy a release with other actions of history 0 in a chunk of equal size and CRC-32; returns these actions."""
+    """Copy a release with forged actions of history 0, of equal size and CRC-32; return them."""
     shutil.copytree(root, target)
     row, _ = actions_row(root)
     with (target / SHARD).open("r+b") as stream:
@@ -117,13 +117,13 @@ def test_a_forged_chunk_is_refused(stored, tmp_path, monkeypatch, mode, form):
 
 def test_verify_finds_a_forged_chunk(stored, tmp_path):
     forge(stored, tmp_path / "forged", "other actions")
-    write_manifest(tmp_path / "forged")  # so that only the chunk table tells
+    write_manifest(tmp_path / "forged")  # only the chunk table reveals the change
     problems = [finding.problem for finding in verify_release(tmp_path / "forged").findings]
     assert any("chunk 0 of actions in history 0" in problem and "blake2b" in problem for problem in problems), problems
 
 
 def test_a_forged_release_with_its_own_hashes_does_not_share_a_cache(stored, tmp_path, monkeypatch):
-    """A release may have other content under equal checksums; the cache must not serve it for the original."""
+    """The cache must tell apart two releases whose CRC-32 checksums agree."""
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
     forged = forge(stored, tmp_path / "forged", "other actions")
     path, (row, number) = chunk_table_path(tmp_path / "forged", SHARD), actions_row(stored)

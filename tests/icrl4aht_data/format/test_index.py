@@ -1,4 +1,4 @@
-"""The index as columns: equal to the lines, cached by content, rebuilt when the content changes, safe to share."""
+"""The index as columns: equal to its lines, cached by content, rebuilt after changes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_entries_are_the_lines(long, folder):
 
 @pytest.fixture
 def rewritten(long, tmp_path) -> Callable[[Callable[[list[str]], str]], Index]:
-    """Reads the long index after a change of its lines."""
+    """Change the lines of the long index and read it."""
     shutil.copytree(long[0] / "meta", tmp_path / "meta")
     path = tmp_path / "meta" / "histories.jsonl"
     lines = path.read_text().splitlines()
@@ -136,18 +136,18 @@ def test_a_changed_index_is_parsed_again(tmp_path, folder):
     text = path.read_text()
     changed = text.replace(f'"env_idx": {entries[9].env_idx},', f'"env_idx": {(entries[9].env_idx + 1) % 9},')
     path.write_text(changed)
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # even if the clock says that nothing happened
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # even if the modification time is unchanged
     assert read_index(root).entry(9).env_idx != entries[9].env_idx
     assert len(cached(folder)) == 2
 
 
 def test_a_damaged_cache_is_rebuilt(long, folder):
-    """Files of the cached columns are damaged, each in another way."""
+    """Each file of the cached columns is damaged differently."""
     root, entries = long
     read_index(root)
     (made,) = cached(folder)
     right = contents(folder / made)
-    damages = [name for name in DAMAGES if "bit" not in name]  # sizes and headers do not show a flipped bit
+    damages = [name for name in DAMAGES if "bit" not in name]  # sizes and headers do not reveal a flipped bit
     assert len(right) > 3 * len(damages)
     for (name, data), damage in zip(list(right.items())[::3], damages, strict=False):
         DAMAGES[damage](folder / made / name)

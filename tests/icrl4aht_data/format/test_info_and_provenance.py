@@ -1,4 +1,4 @@
-"""meta/info.json and meta/provenance.json: written as they were read, and checked once."""
+"""meta/info.json and meta/provenance.json: round trips and malformed content."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_unknown_fields_of_a_provenance_are_kept():
     assert Provenance.from_json(note).to_json() == note
 
 
-def test_the_ego_matters_if_the_partner_of_a_learned_teammate_earns_more():
+def test_headroom_with_a_learned_teammate_uses_its_partners_return():
     assert not ReferenceEgos(2.0, 4.75, 6.0, 20).matters
     learned = ReferenceEgos(2.0, 4.75, 6.0, 20, self_play=10.0)
     assert learned.matters
@@ -38,7 +38,7 @@ def test_the_ego_matters_if_the_partner_of_a_learned_teammate_earns_more():
     assert "self_play" not in made.to_json()["references"]
 
 
-def test_what_is_known_of_the_expert_is_kept():
+def test_expert_fields_are_kept():
     labels = {"policy_sha256": "ab" * 32, "action": "greedy", "step": 7, "return_greedy": 0.0, "return_sampled": 16.9}
     note = {"xla_threads": 2, "expert": labels | {"episodes": 200, "last_return_greedy": -1.0}}
     found = Provenance.from_json(note)

@@ -1,4 +1,4 @@
-"""Files of a release that are checked against its manifest before they are believed."""
+"""Files of a release are checked against its manifest before they are used."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.robustness.limits import permissions_count
 
 @pytest.mark.parametrize("name", [HISTORIES, INFO, PROVENANCE, TASKS])
 def test_no_flipped_bit_of_meta_is_read(damaged, name):
-    """Also if the file's times are set back."""
+    """Flipped bits are found even if the modification time is restored."""
     path, rng = damaged / name, np.random.default_rng(0)
     right, before = path.read_bytes(), path.stat()
     for _ in range(40):
@@ -78,7 +78,7 @@ def test_a_file_of_meta_that_the_manifest_does_not_list(damaged):
     path.write_text("".join(line for line in lines if PROVENANCE not in line))
     with pytest.raises(IndexFormatError, match=rf"{PROVENANCE}: .*{MANIFEST} does not list this file; fetch"):
         load_icrl4aht(damaged)
-    (damaged / PROVENANCE).unlink()  # a release may be without it
+    (damaged / PROVENANCE).unlink()  # this file is optional
     load_icrl4aht(damaged)
     check_against_manifest(damaged, [INFO, chunk_table_name(SHARD)])
 

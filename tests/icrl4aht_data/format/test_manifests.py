@@ -1,4 +1,4 @@
-"""The published test tasks: ids made from the parameters, and bundled manifests that equal them."""
+"""The published test tasks: ids derived from the parameters, and equal bundled manifests."""
 
 from __future__ import annotations
 

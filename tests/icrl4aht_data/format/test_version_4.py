@@ -1,4 +1,4 @@
-"""What format version 4 adds: oracle actions, independent learners, sources in provenance, tasks that were left out."""
+"""Additions of format version 4: oracle actions, independent learners, sources, left-out tasks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SOURCES = ("noise", "ppo", "ppo", "noise")
 
 @pytest.fixture(scope="module", params=KINDS)
 def mixed(request, tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]]]:
-    """A release of each kind with both sources, two learners a task of source ppo, and oracle actions. Read only."""
+    """Return releases of each kind with both sources, two PPO learners and oracle actions (read-only)."""
     root = tmp_path_factory.mktemp("mixed") / request.param
     options: dict[str, Any] = {"streams": 2, "episodes": 5, "oracle": True, "learners": 2, "sources": SOURCES}
     experts = [SCRIPT if source == "noise" else None for source in SOURCES]
@@ -41,7 +41,7 @@ def mixed(request, tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarr
 
 @pytest.fixture(scope="module")
 def lite_mixed(tmp_path_factory) -> Path:
-    """A small lite release of a noise task and a task with two learners, with everything that provenance can say."""
+    """Return a small lite release with a noise task, two PPO learners and all provenance fields."""
     root = tmp_path_factory.mktemp("mixed") / "lite"
     options: dict[str, Any] = {"streams": 2, "episodes": 5, "oracle": True, "learners": 2, "sources": SOURCES[:2]}
     random_release(root, "lite", ("coord_simple",), experts=[SCRIPT, None], **options)
@@ -59,7 +59,7 @@ def lite_mixed(tmp_path_factory) -> Path:
 
 
 def spoiled(source: Path, target: Path, name: str, change: Callable[[Any], object]) -> Path:
-    """Copy a release with one file of meta/ changed and a manifest that agrees."""
+    """Copy a release, change one file of meta/ and write a matching manifest."""
     shutil.copytree(source, target)
     path, text = target / name, (source / name).read_text()
     content = [json.loads(line) for line in text.splitlines()] if name.endswith("jsonl") else json.loads(text)
@@ -74,7 +74,7 @@ def problems(root: Path) -> str:
     return "\n".join(f"{finding.file}: {finding.problem}" for finding in verify_release(root, level="deep").findings)
 
 
-def test_the_arrays_are_those_that_were_written(mixed):
+def test_arrays_round_trip(mixed):
     root, written = mixed
     dataset = load_icrl4aht(root)
     for history in dataset:
@@ -93,7 +93,7 @@ def test_the_arrays_are_those_that_were_written(mixed):
     assert dataset.filter(source="noise").ids.tolist() == [0, 1, 10, 11]
 
 
-def test_verification_says_what_it_believes(mixed, lite_mixed):
+def test_verification_lists_unchecked_facts(mixed, lite_mixed):
     report = verify_release(mixed[0], level="deep")
     assert report.ok, report.findings
     (note,) = report.notes
@@ -109,8 +109,8 @@ def test_verification_says_what_it_believes(mixed, lite_mixed):
     ]
 
 
-def test_published_files_have_no_place_for_it(lite_mixed, tmp_path):
-    """They lose oracle actions but those of noise, and number the streams of several learners consecutively."""
+def test_published_files_omit_the_additions(lite_mixed, tmp_path):
+    """Published files keep oracle actions of noise only and number all streams consecutively."""
     before = load_icrl4aht(lite_mixed)
     to_published(before, tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5") as file:
@@ -158,7 +158,7 @@ def test_published_files_have_no_place_for_it(lite_mixed, tmp_path):
         (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise histories"),
     ],
 )
-def test_lies(lite_mixed, tmp_path, name, change, message):
+def test_false_values_are_found(lite_mixed, tmp_path, name, change, message):
     found = problems(spoiled(lite_mixed, tmp_path / "release", name, change))
     assert message in found
 
@@ -178,7 +178,7 @@ def last(content: dict[str, Any]) -> dict[str, Any]:
         (lambda a: a.update(expert_actions=(a["oracle_actions"] + 1) % 6), "differ from the script's, oracle_actions"),
     ],
 )
-def test_arrays_that_lie(tmp_path, change, message):
+def test_false_arrays_are_found(tmp_path, change, message):
     (task,) = make_tasks(["demo_simple"])
     arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
     arrays["oracle_actions"] = arrays["expert_actions"]
@@ -207,19 +207,19 @@ def left_out(root: Path, *tasks: LeftOutTask) -> Path:
     return root
 
 
-def test_tasks_that_were_left_out_are_kept_by_conversions(lite_mixed, tmp_path):
+def test_conversions_keep_left_out_tasks(lite_mixed, tmp_path):
     other = replace(LEFT_OUT, layout="coord_simple", learners=0, streams=0, return_start=None, return_end=None)
     root = left_out(shutil.copytree(lite_mixed, tmp_path / "a"), LEFT_OUT, other)
     assert verify_release(root, level="deep").ok
     assert load_icrl4aht(root).info.left_out == [LEFT_OUT, other]
-    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # of coord_simple, as its selection
+    to_release(load_icrl4aht(root), tmp_path / "out", "full")  # keeps left-out tasks of the selected layouts
     assert read_info(tmp_path / "out").left_out == [other]
     random_release(tmp_path / "b", layouts=("demo_wide",), teammates=1, streams=1)
     made = load_icrl4aht(tmp_path / "b").entries[0].task_id
     left_out(tmp_path / "b", other)
     left_out(root, LEFT_OUT, other, replace(LEFT_OUT, task_id=made))
     combine_releases(tmp_path / "both", [root, tmp_path / "b"])
-    assert read_info(tmp_path / "both").left_out == [LEFT_OUT, other]  # each once, without the task that b has
+    assert read_info(tmp_path / "both").left_out == [LEFT_OUT, other]  # each once, except the task contained in b
     assert verify_release(tmp_path / "both").ok
 
 

@@ -1,4 +1,4 @@
-"""Canonical channels: each layout's own channels in their places, everything else 0."""
+"""Canonical channels: own channels at their canonical positions, all others 0."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 
 
 def placed(layout: Layout, own: np.ndarray) -> np.ndarray:
-    """Own observations put into the canonical places by name."""
+    """Return own observations moved to the canonical channels by name."""
     out = np.zeros((*own.shape[:-1], 46), own.dtype)
     for number, name in enumerate(channel_names(layout)):
         out[..., CANONICAL_CHANNELS.index(name)] = own[..., number]
@@ -55,7 +55,7 @@ def test_a_channel_that_no_layout_has_is_refused():
 
 
 @each_layout
-def test_own_channels_are_in_their_places_and_others_are_0(layout):
+def test_own_channels_are_mapped_and_others_are_0(layout):
     records = random_records(layout, 200, np.random.default_rng(5))
     for agent in (0, 1):
         expected = placed(layout, observe(layout, records, agent))

@@ -48,7 +48,7 @@ Cells = dict[tuple[int, int], int]
 
 
 def channel_names(n: int, delivery: bool) -> list[str]:
-    """The channels in the specification's order, for n ingredient types."""
+    """Return the channels in the specification's order, for n ingredient types."""
     counts = [str(i) for i in range(n)]
     item = ["plate", "cooked", *counts]
     agent = ["position", "up", "down", "right", "left", *item]
@@ -65,7 +65,7 @@ def channel_names(n: int, delivery: bool) -> list[str]:
 
 
 def seen(layout: Layout, record: np.ndarray, agent: int) -> dict[str, Cells]:
-    """Channel -> map cell (x, y) -> value, for all values that are not 0."""
+    """Return channel -> map cell (x, y) -> value, for all nonzero values."""
     _, _, _, n, channels = SPECIFIED[layout.name]
     names = channel_names(n, layout.name in ("test_simple", "test_wide"))
     assert len(names) == channels
@@ -80,7 +80,7 @@ def seen(layout: Layout, record: np.ndarray, agent: int) -> dict[str, Cells]:
 
 
 def part(found: dict[str, Cells], *prefixes: str) -> dict[str, Cells]:
-    """The channels whose names start with one of the prefixes."""
+    """Return the channels whose names start with one of the prefixes."""
     return {name: cells for name, cells in found.items() if name.startswith(prefixes)}
 
 
@@ -156,7 +156,7 @@ def test_values_are_0_to_19_in_every_state_that_a_step_leads_to(layout):
 
 
 def test_a_complete_scene_seen_by_the_ego():
-    """Every channel that is not 0; from (1, 1) the window reaches x = -1..3, y = -1..3."""
+    """Check all nonzero channels; from (1, 1) the window covers x = -1..3, y = -1..3."""
     record = state_record(
         CRAMPED,
         (1, 1, "left"),
@@ -194,7 +194,7 @@ def test_a_complete_scene_seen_by_the_ego():
 def test_cells_outside_the_map_are_all_zero_and_all_others_are_not_cut(layout):
     records = random_records(layout, 256, np.random.default_rng(2))
     observed = observe_both(layout, records)
-    assert observed.shape[2:4] == (5, 5)  # also where the map has four rows
+    assert observed.shape[2:4] == (5, 5)  # also if the map has only four rows
     positions = unpack(layout, records).positions.astype(int)
     reach = np.arange(-2, 3)
     x, y = positions[..., None] % layout.width + reach, positions[..., None] // layout.width + reach
@@ -223,7 +223,7 @@ def test_the_other_agent_is_seen_only_within_the_window(layout):
     others = observed[..., agent : 2 * agent]
     np.testing.assert_array_equal(others[..., 0].sum(axis=(2, 3)), np.stack([near, near], axis=1))
     assert not others[~near].any()
-    for me in (0, 1):  # where seen, the other looks as it does to itself
+    for me in (0, 1):  # a visible agent has the channels of its own view
         itself = observed[:, 1 - me, 2, 2, :agent]
         np.testing.assert_array_equal(others[near, me].sum(axis=(1, 2)), itself[near])
 
@@ -255,7 +255,7 @@ def test_a_correct_delivery_shows_on_the_goal_for_one_step(layout, goal, poses, 
     after = rules.step(layout, record, np.array([actions]), next_recipe)
     assert after.reward == 20
     assert seen(layout, after.state, deliverer)["delivery"] == at(1, goal)
-    assert "delivery" not in seen(layout, after.state, 1 - deliverer)  # the goal is not in this window
+    assert "delivery" not in seen(layout, after.state, 1 - deliverer)  # the goal is outside this window
     later = rules.step(layout, after.state, np.array([[STAY, STAY]]), next_recipe)
     assert "delivery" not in seen(layout, later.state, deliverer)
 
@@ -264,7 +264,7 @@ def test_a_correct_delivery_shows_on_the_goal_for_one_step(layout, goal, poses, 
 
 
 @each_layout
-def test_packing_what_was_unpacked_gives_the_same_record(layout):
+def test_unpacking_and_packing_round_trips(layout):
     records = np.random.default_rng(6).integers(0, 256, (2, 64, record_size(layout)), dtype=np.uint8)
     state = unpack(layout, records)
     again = pack(state)

@@ -18,7 +18,7 @@ from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.states import random_records, state_record
 
 CELL = 32
-COORD = LAYOUTS["coord_simple"]  # it has everything: a pot, a button, an indicator, three ingredients
+COORD = LAYOUTS["coord_simple"]  # has a pot, a button, an indicator and three ingredients
 ONION, TOMATO = COORD.recipe_items.tolist()[0] // 3, COORD.recipe_items.tolist()[1] // 3
 DISH = 3 * ONION | PLATE | COOKED
 
@@ -41,7 +41,7 @@ def changed_cells(before: np.ndarray, after: np.ndarray, layout=COORD) -> set[in
 
 
 def share(pixels: np.ndarray, strong: int, weak: tuple[int, int], least: int = 80) -> float:
-    """The share of pixels whose channel `strong` exceeds both others by `least`."""
+    """Return the share of pixels whose channel `strong` exceeds both others by `least`."""
     return float((pixels[..., strong] > pixels[..., list(weak)].max(axis=-1) + least).mean())
 
 
@@ -142,7 +142,7 @@ def test_an_episode_becomes_an_endless_gif_with_a_frame_a_step(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["episode.gif"]
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_partial_one(tmp_path, monkeypatch):
+def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "frame.png"
     path.write_text("old")
 

@@ -1,4 +1,4 @@
-"""The rules, in hand-drawn scenes.
+"""Rules of the game in hand-drawn scenes.
 
 Most scenes are in cramped_up, where one room holds everything:
 
@@ -56,7 +56,7 @@ class Seen(NamedTuple):
 
 
 def act(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111) -> Seen:
-    """One step of the scene; a correct delivery leads to `next_recipe`."""
+    """Return the scene after one step; a correct delivery changes the recipe to `next_recipe`."""
     after = rules.step(layout, record, np.array([[ego, teammate]]), np.array([next_recipe], np.uint8))
     state = unpack(layout, after.state)
     xy = [(int(cell) % layout.width, int(cell) // layout.width) for cell in state.positions[0]]
@@ -81,7 +81,7 @@ def slot(request: pytest.FixtureRequest) -> int:
 
 
 def solo(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields) -> np.ndarray:
-    """A scene with the agent of that slot at pose `at` with an item in hand, the other one aside with none."""
+    """Return a scene with one agent at pose `at` holding an item, and the other out of the way."""
     if slot == 0:
         return state_record(layout, at, aside, hands=[hand, 0], **fields)
     return state_record(layout, aside, at, hands=[0, hand], **fields)
@@ -90,7 +90,7 @@ def solo(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Po
 def act_alone(
     slot: int, record: np.ndarray, action: int, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111
 ) -> Seen:
-    """One step in which the agent of that slot acts and the other one stays."""
+    """Return the scene after one step in which the given agent acts and the other stays."""
     ego, teammate = (action, STAY) if slot == 0 else (STAY, action)
     return act(layout, record, ego, teammate, next_recipe)
 
@@ -109,7 +109,7 @@ def test_action_ids_are_in_the_papers_order():
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_every_pair_of_cells_and_actions_moves_as_the_map_says(layout):
-    """Compares with steps 1 to 3 of the specification, written out cell by cell."""
+    """Compare with steps 1 to 3 of the specification, written out cell by cell."""
     cells, wanted_cells, actions = [], [], []
     starts = [pair for pair in product(*layout.rooms) if pair[0] != pair[1]]
     for old, pair in product(starts, product(range(6), repeat=2)):
@@ -176,7 +176,7 @@ def test_piles_are_endless(slot, at, item):
 def test_a_counter_takes_one_item_and_gives_it_back(slot, item):
     down = interact(slot, solo(slot, AT_COUNTER, item))
     assert (down.hands, down.counters, down.reward, down.shaped) == ([0, 0], {COUNTER: item}, 0, [0, 0])
-    up = interact(slot, down.record)  # not even the recipe's dish pays when it comes off a counter
+    up = interact(slot, down.record)  # taking the recipe's dish from a counter pays nothing
     assert (up.hands[slot], up.counters, up.reward, up.shaped) == (item, {}, 0, [0, 0])
 
 
@@ -207,7 +207,7 @@ def test_a_pot_takes_three_and_cooks_by_itself_for_20_steps(slot):
 def test_a_correct_delivery_pays_20_and_changes_the_recipe(slot, next_recipe):
     after = interact(slot, solo(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
     assert (after.reward, after.shaped, after.hands) == (20, [0, 0], [0, 0])
-    assert (after.recipe, after.delivered) == (next_recipe, 1)  # it may be the same again
+    assert (after.recipe, after.delivered) == (next_recipe, 1)  # the next recipe may be the same
     later = act(CRAMPED, after.record, STAY, next_recipe=RECIPE_001)
     assert (later.delivered, later.recipe, later.reward) == (0, next_recipe, 0)
 
@@ -251,8 +251,8 @@ def test_a_press_costs_5_and_lights_one_button_for_9_observations(slot):
 @pytest.mark.parametrize(
     ("hands", "pot", "hands_after", "pot_after"),
     [
-        ([ZERO, ONE], ZERO, [0, 0], (RECIPE_001, 19)),  # the teammate's is the third
-        ([ZERO, ONE], 2 * ZERO, [0, ONE], (RECIPE_000, 19)),  # the teammate's would be the fourth
+        ([ZERO, ONE], ZERO, [0, 0], (RECIPE_001, 19)),  # the teammate adds the third ingredient
+        ([ZERO, ONE], 2 * ZERO, [0, ONE], (RECIPE_000, 19)),  # the teammate's ingredient would be the fourth
         ([PLATE, PLATE], SOUP_000, [DISH_000, PLATE], (0, 0)),
         ([PLATE, ONE], SOUP_000, [DISH_000, 0], (ONE, 0)),  # the pot that the ego emptied takes an ingredient
         ([ONE, PLATE], SOUP_000, [ONE, DISH_000], (0, 0)),
@@ -277,11 +277,11 @@ def own(slot: int, value: float) -> list[float]:
     [
         (ZERO, 0, RECIPE_000, 3),
         (ZERO, 2 * ZERO, RECIPE_000, 3),
-        (ZERO, 2 * ONE, RECIPE_000, 3),  # the recipe needs it, whatever else is inside
+        (ZERO, 2 * ONE, RECIPE_000, 3),  # the recipe needs it, regardless of the pot's content
         (ONE, 0, RECIPE_000, 0),
         (ONE, ONE, RECIPE_111, 3),
         (ZERO, ZERO, RECIPE_001, 3),
-        (ZERO, 2 * ZERO, RECIPE_001, 0),  # enough of it inside
+        (ZERO, 2 * ZERO, RECIPE_001, 0),  # the pot has enough of this ingredient
         (ONE, 2 * ZERO, RECIPE_001, 3),
         (ONE, ONE, RECIPE_001, 0),
     ],
@@ -314,10 +314,10 @@ AWAY = ((2, 3, "down"), (6, 3, "down"))  # before the counters (2, 4) and (6, 4)
         ([0, SOUP_111], 0, {}, 3),
         ([ZERO, 0], PLATE, {}, 0),  # as many plates in hands as pots in use
         ([ZERO, ONE], PLATE, {}, 3),
-        ([ZERO, 0], DISH_000, {}, 3),  # a dish is no plate
+        ([ZERO, 0], DISH_000, {}, 3),  # a dish does not count as a plate
         ([ZERO, 0], 0, {(1, 4): PLATE}, 0),
         ([ZERO, ONE], 0, {(6, 4): PLATE}, 0),
-        ([ZERO, 0], 0, {(1, 4): ZERO, (6, 4): DISH_000}, 3),  # neither is a plate
+        ([ZERO, 0], 0, {(1, 4): ZERO, (6, 4): DISH_000}, 3),  # other items do not count as plates
     ],
 )
 def test_taking_a_plate_pays_3_if_it_is_needed(slot, pots, other_hand, counters, reward):

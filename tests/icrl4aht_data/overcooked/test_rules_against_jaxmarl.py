@@ -1,4 +1,4 @@
-"""Differential: from the same states and actions, our step, rewards and observations equal JaxMARL's."""
+"""Differential test: equal steps, rewards and observations as JaxMARL from equal states."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.helpers.states import random_records
 BATCH, STEPS, SCENES = 512, 20, 20  # trajectories: 10,240 steps; single steps from random states: 10,240
 
 
-DEFAULT = ("coord_ring", "demo_wide")  # with buttons; with a type of ingredient that has no pile
+DEFAULT = ("coord_ring", "demo_wide")  # layouts with buttons, and with an ingredient that has no pile
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ each_layout = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 
 
 def records_of(layout: Layout) -> np.ndarray:
-    """uint8 (800, S): states that play reaches, and states of every kind that the rules allow."""
+    """Return records, uint8 (800, S), from play and drawn at random from all valid states."""
     rng = np.random.default_rng(5)
     return np.concatenate([random_history(layout, 4, 100, rng)["state"], random_records(layout, 400, rng)])
 
@@ -40,7 +40,9 @@ def test_entries_that_can_differ_from_zero(layout):
     assert np.isin(seen[0], words.entries((0,))).all()
     assert np.isin(seen[1], words.entries((1,))).all()
     np.testing.assert_array_equal(words.entries((0, 1)), np.union1d(words.entries((0,)), words.entries((1,))))
-    assert len(words.entries((0,))) < VISIBLE * layout.channels / 2  # few, which is what they are for
+    assert (
+        len(words.entries((0,))) < VISIBLE * layout.channels / 2
+    )  # most entries are always zero, so encoders can skip them
 
 
 @pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
@@ -72,7 +74,7 @@ def test_records_of_all_layouts_in_one_batch_with_canonical_channels():
 
 
 @pytest.mark.parametrize(("column", "value"), [("pot_timers", 31), ("pot_items", 255), ("hands", 255)])
-def test_contents_that_the_rules_exclude_have_the_last_word(column, value):
+def test_impossible_contents_map_to_the_last_word(column, value):
     layout = get_layout("cramped_up")
     records, words = records_of(layout), cell_words([layout])
     records[:, getattr(columns(layout), column)] = value
