@@ -1,4 +1,4 @@
-"""The card of a release: facts about it, README.md for people, and the tables that are too long for it as card.json."""
+"""Dataset card of a release: README.md, and card.json with the tables too long for it."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ from icrl4aht_data.utils.templates import card_file, markdown_table
 from icrl4aht_data.utils.text import counted_noun
 
 HEADROOM_PROTOCOL = "published"
-"""The evaluation protocol whose headroom is shown: that of the paper's numbers."""
+"""Evaluation protocol of the headroom shown in cards, which is the paper's."""
 
 CURVES_FIGURE, LAYOUTS_FIGURE, HEADROOM_FIGURE = (
     f"figures/{name}.png" for name in ("learning_curves", "layouts", "headroom")
 )
-"""Figures of a release that is built for publication."""
+"""Paths of the figures of a release built for publication."""
 
-_LEAST_RISE, _CLEAR_RISE = 5.0, 10  # what ends should exceed starts by: a quarter of a delivery, and a half
+_LEAST_RISE, _CLEAR_RISE = 5.0, 10  # thresholds of the rise of returns: a quarter and half of a delivery
 _SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
 _NO_SHARED_ROOM = ("coord_simple", "test_simple")
 _SCHEDULE = {"histories", "episodes", "start", "end", "begin", "finish", "power"}
@@ -69,19 +69,19 @@ def card_texts(section: str) -> dict[str, str]:
 
     Args:
         section: "sources" (of histories), "kinds" (of release), "arrays" (`schema.FIELDS`), "index" (fields of
-            `schema.Entry`) or "episodes" (columns that differ from both, see `episode_texts`).
+            `schema.Entry`) or "episodes" (other columns of `EPISODE_COLUMNS`).
     """
     return tomllib.loads(card_file("dataset_texts.toml").read_text(encoding="utf-8"))[section]
 
 
 def episode_texts() -> dict[str, str]:
-    """Return a description of each column of `EPISODE_COLUMNS`, name -> text."""
+    """Return column name -> description, for the columns of `EPISODE_COLUMNS`."""
     texts = card_texts("index") | card_texts("arrays") | card_texts("episodes")
     return {name: texts[name] for name in EPISODE_COLUMNS}
 
 
 def write_card(root: Path) -> None:
-    """Write README.md and card.json of a release folder, which needs no manifest yet.
+    """Write README.md and card.json of a release folder, which may still lack a manifest.
 
     Raises:
         ReleaseError: if the release cannot be read.
@@ -92,7 +92,7 @@ def write_card(root: Path) -> None:
 
 
 def render_card(content: Mapping[str, Any]) -> str:
-    """Return README.md of a release from its `facts`."""
+    """Return the content of README.md from a release's `facts`."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(
@@ -103,13 +103,13 @@ def render_card(content: Mapping[str, Any]) -> str:
 
 
 def teammate_name(task: Task) -> str:
-    """Return a heuristic's family, or an algorithm, with the number of the parameters, such as "H3/t12"."""
+    """Return the name of a task's teammate: family or algorithm, and number, such as "H3/t12" or "fcp/t1"."""
     family = task.teammate_kind if task.teammate_family == "rl" else task.teammate_family
     return f"{family}/t{task.teammate.get('theta_id', 0)}"
 
 
 def evaluated_on(layouts: Iterable[str]) -> list[str]:
-    """Return the layouts on which the benchmark tests models that were trained on `layouts`."""
+    """Return the test layouts of the benchmark for models trained on `layouts`."""
     names, tested = list(layouts), list[str]()
     for track, splits in TRACKS.items():
         own = [name for name in names if track_of(name) == track]
@@ -118,7 +118,7 @@ def evaluated_on(layouts: Iterable[str]) -> list[str]:
 
 
 def size_category(rows: int) -> str:
-    """Return the Hub's name for a number of rows, here transitions: n<1K, 1K<n<10K, ..., n>1T."""
+    """Return the Hub's size category of a number of rows: n<1K, 1K<n<10K, ..., n>1T."""
     number = len(str(rows)) - len("1000")
     if number < 0:
         return f"n<{_SIZES[0]}"
@@ -127,7 +127,7 @@ def size_category(rows: int) -> str:
 
 @dataclass(frozen=True)
 class _TaskFacts:
-    """One task of a release with its histories, which agree in all fields of the index but numbers and returns."""
+    """One task of a release with its histories and provenance."""
 
     first: Entry
     histories: Sequence[Entry]
@@ -145,7 +145,7 @@ class _TaskFacts:
 
     @property
     def rise(self) -> float:
-        """What the last episodes earn more than the first, on average."""
+        """Mean difference between the returns of the last and the first episodes."""
         return _mean(entry.return_end - entry.return_start for entry in self.histories)
 
     @property
@@ -159,10 +159,10 @@ class _TaskFacts:
 
 
 def facts(root: Path) -> dict[str, Any]:
-    """Return what the card of a release says about it: plain values, and lists of rows for its tables.
+    """Return the facts that a release's card states: values, and lists of rows for its tables.
 
     Args:
-        root: a release folder; needs no card and no manifest yet.
+        root: a release folder, which may still lack a card and a manifest.
 
     Raises:
         ReleaseError: if the release cannot be read.
@@ -234,14 +234,14 @@ def _mean(values: Iterable[float]) -> float:
 
 
 def _span(values: Iterable[float], digits: int = 0) -> str:
-    """Return a number, "least to most" of several that differ, or nothing for none."""
+    """Return the range of some values as text, such as "3" or "3 to 5"; empty without values."""
     found = list(values)
     ends = [f"{end:z,.{digits}f}" for end in (min(found), max(found))] if found else []
     return " to ".join(dict.fromkeys(ends))
 
 
 def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return configurations of the Hub's viewer, name -> split -> files: all histories, each layout's, all episodes."""
+    """Return the configurations of the Hub's viewer, name -> split -> file pattern."""
     patterns = {"default": f"{PARQUET_INDEX}/*/{{}}.parquet"}
     patterns |= {entry.layout: f"{PARQUET_INDEX}/{entry.layout}/{{}}.parquet" for entry in entries}
     patterns |= {PARQUET_EPISODES: f"{PARQUET_EPISODES}/*/{{}}-*.parquet"}
@@ -254,7 +254,7 @@ def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str,
 
 
 def _grouped(tasks: Iterable[_TaskFacts], *names: str) -> dict[tuple[str, ...], list[_TaskFacts]]:
-    """Return the tasks by the values of some index fields, ordered by layout as in the release, source and split."""
+    """Group tasks by the values of some index fields, in the usual order of sources and splits."""
     groups: dict[tuple[str, ...], list[_TaskFacts]] = {}
     for task in tasks:
         groups.setdefault(tuple(getattr(task.first, name) for name in names), []).append(task)
@@ -269,7 +269,7 @@ def _grouped(tasks: Iterable[_TaskFacts], *names: str) -> dict[tuple[str, ...], 
 
 
 def _learning(tasks: Iterable[_TaskFacts], *names: str) -> list[dict[str, Any]]:
-    """Return how much histories rise, a row for each combination of some index fields."""
+    """Return rows on the rise of returns, one for each combination of some index fields."""
     rows = []
     for key, own in _grouped(tasks, *names).items():
         entries = [entry for task in own for entry in task.histories]
@@ -294,7 +294,7 @@ def _learned_last(family: str) -> tuple[bool, tuple[int, str]]:
 
 
 def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the teammates of a release, each once, by layout, split and family."""
+    """Return one row per teammate of a release, sorted by layout, split and family."""
     groups = defaultdict[tuple[str, str, str], list[_TaskFacts]](list)
     for one in tasks:
         if one.task is not None:
@@ -322,7 +322,7 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
 
 
 def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return for each split how many teammates of known behaviour there are, and how many different behaviours."""
+    """Return the numbers of teammates with known behaviour and of distinct behaviours, by split."""
     found: dict[str, list[tuple[Any, ...]]] = {}
     for row in teammates:
         if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None:
@@ -334,7 +334,7 @@ def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _labels(tasks: Iterable[_TaskFacts]) -> list[dict[str, Any]]:
-    """Return what the policies behind the expert actions earn, a row for each task where it was measured."""
+    """Return one row per task with the measured returns of its expert."""
     return [
         {
             **{name: getattr(task.first, name) for name in ("task_id", "layout", "source", "split")},
@@ -352,7 +352,7 @@ def _labels(tasks: Iterable[_TaskFacts]) -> list[dict[str, Any]]:
 
 
 def _test_headroom(layouts: Sequence[str]) -> list[list[str]]:
-    """Return the rows of the card's table of what the oracle earns more than `stay`: bold with headroom."""
+    """Return the rows of the card's headroom table: returns of the oracle minus those of `stay`, bold with headroom."""
     cells, rows = read_headroom(HEADROOM_PROTOCOL), []
     for family in HEURISTICS:
         known = [cells.get((layout, family)) for layout in layouts]
@@ -363,7 +363,7 @@ def _test_headroom(layouts: Sequence[str]) -> list[list[str]]:
 
 
 def _headroom_groups(headroom: Mapping[str, bool], info: ReleaseInfo) -> dict[str, list[str]]:
-    """Return title -> layouts of the rows of totals; all layouts are one group where the headroom of one is unknown."""
+    """Return title -> layouts, for the rows of totals; one group "all" if the headroom of a layout is unknown."""
     if len(headroom) < len(info.layouts):
         return {"all": list(info.layouts)}
     groups: dict[str, list[str]] = {}
@@ -417,11 +417,11 @@ def _arrays(info: ReleaseInfo) -> list[list[str]]:
 
 
 def _known_families(tasks: Iterable[_TaskFacts]) -> dict[str, list[str]]:
-    """Return heuristic families among the teammates that models are trained on.
+    """Return the families of heuristic training teammates, by their similarity to test teammates.
 
     Returns:
-        `tested`: families with test teammates, or teammates that act like those of their own family; `drawn`: families
-        whose teammates do not; `alike`: those of them that act like a test teammate of another family.
+        `tested`: families whose teammates are test teammates, or act like one of the same family; `drawn`: families
+        with other teammates; `alike`: teammates of these that act like a test teammate of another family.
     """
     tested, drawn, alike = set(), set(), set()
     for task in tasks:
@@ -439,14 +439,14 @@ def _known_families(tasks: Iterable[_TaskFacts]) -> dict[str, list[str]]:
 
 
 def _distinct(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
-    """Return the values of a field of the tasks' provenance, each once."""
+    """Return the distinct values of a field of the tasks' provenance."""
     values = (getattr(task.made, name) for task in tasks)
     found = {json.dumps(value, default=asdict): value for value in values if value is not None}
     return [found[text] for text in sorted(found)]
 
 
 def _populations(tasks: Sequence[_TaskFacts], info: ReleaseInfo) -> dict[str, Any]:
-    """Return how learned teammates were trained, and where there are none, or fewer than their profile asks for."""
+    """Return facts on the training of learned teammates, and the layouts with none or fewer than planned."""
     own = {task.task.teammate_key: task.first for task in tasks if task.task and task.first.split == "train"}
     found = Counter((entry.layout, entry.teammate_kind) for entry in own.values())
     wanted: Counter[tuple[str, str]] = Counter()
@@ -470,7 +470,7 @@ def _populations(tasks: Sequence[_TaskFacts], info: ReleaseInfo) -> dict[str, An
 
 
 def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
-    """Return how the histories were made: learners, kept streams, schedules of noise, labellers, versions."""
+    """Return facts on the generation of histories: learners, kept streams, noise schedules, experts, versions."""
     streams: dict[tuple[int, float | None], list[int]] = {}
     for made in (task.made for task in tasks):
         if made.filter and made.streams_kept:

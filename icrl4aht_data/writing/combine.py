@@ -28,19 +28,19 @@ def combine_releases(
     overwrite: bool = False,
     done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
-    """Write a release with the histories of several, in order, under new history ids.
+    """Combine releases into one, with the histories in order and renumbered.
 
     Args:
-        target: the folder to write, which appears when it is complete.
-        roots: releases of one kind and one episode length, no two with a task in common.
-        data_version: version of the combination; by default that of the releases, if they agree.
+        target: the folder to write.
+        roots: releases of the same kind and episode length without common tasks.
+        data_version: version of the combination; by default the common version of the releases.
         overwrite: replace a release at `target`.
-        done: called after the histories of a task.
+        done: called when the histories of a task are written.
 
     Raises:
-        OptionError: if the releases do not fit together; names both, and how they differ; if `data_version` is not
-            SemVer; if `target` may not be written, see `release_folder.check_target`.
-        ReleaseError: if one of them cannot be read.
+        OptionError: if the releases differ in kind or environment, or share a task; if `data_version` is not SemVer; if
+            `target` may not be written, see `release_folder.check_target`.
+        ReleaseError: if a release cannot be read.
     """
     if data_version is not None:
         check_version(data_version)
@@ -111,10 +111,12 @@ def _common_version(datasets: Sequence[Dataset]) -> str:
 
 
 def _source_card(datasets: Sequence[Dataset]) -> str:
-    """Return a list of the releases, with the hashes of their manifests, and their cards."""
+    """Return a card that lists the releases with the hashes of their manifests, followed by their cards."""
     parts, cards = [], []
     for dataset in datasets:
-        listed = read_manifest(dataset.root)  # before hashing: refuses a manifest that is a pipe or far too large
+        listed = read_manifest(
+            dataset.root
+        )  # read before hashing, since it refuses a manifest that is a pipe or too large
         parts.append(
             f"* {dataset.root.name}: data version {dataset.info.data_version}, {len(dataset):,} histories, "
             f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}\n"
@@ -126,6 +128,5 @@ def _source_card(datasets: Sequence[Dataset]) -> str:
 
 
 def _card_text(card: str) -> str:
-    """Return a card without YAML, which is valid only at the start of a file, and without pictures, which are not
-    copied."""
+    """Return a card without YAML front matter and pictures, which do not work in a combined card."""
     return re.sub(r"\A---\n(?s:.*?)\n---\n|^!\[.*\n\n?", "", card, flags=re.MULTILINE)

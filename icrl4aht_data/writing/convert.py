@@ -1,4 +1,4 @@
-"""Conversion of releases between the kinds full, lite and observations, and to the current format version."""
+"""Conversion of releases to another kind (full, lite, observations) and to the current format version."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def to_release(
     overwrite: bool = False,
     advance: HistoryProgress = lambda done, total: None,
 ) -> Path:
-    """Write a selection as a release of the current format version, its histories in order and numbered from 0.
+    """Write a selection as a release of the current format version, with histories numbered from 0.
 
     Args:
         dataset: a release, or a part of one.
-        target: the folder to write, which appears when it is complete.
-        kind: "full", "lite" or "observations"; only the last one if the dataset has no states.
+        target: the folder to write.
+        kind: "full", "lite" or "observations"; a dataset without states supports only "observations".
         overwrite: replace a release at `target`.
-        advance: progress.
+        advance: called with the number of histories written and their total.
 
     Raises:
-        OptionError: if `target` may not be written, see `release_folder.check_target`, or if a kind with states is
-            wanted of a dataset without.
+        OptionError: if `target` may not be written, see `release_folder.check_target`, or if `kind` needs states and
+            the dataset has none.
     """
     target = as_path(target)
     if kind in KINDS and not dataset.has_states:

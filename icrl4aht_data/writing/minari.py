@@ -1,14 +1,14 @@
 """Conversion to a Minari dataset.
 
-A Minari dataset has one Minari episode for each episode of the selection, in order, with the observations of the kept
-steps and the one after them, the ego's actions, and the rewards. No episode terminates; each is truncated after its
-last kept step. `infos` of an episode with n steps are arrays of n + 1 rows, one for each observation:
+A Minari dataset has one Minari episode per episode of the selection, in order, with the observations of the n kept
+steps and of the state after them, the ego's actions, and the rewards. Episodes never terminate, but are truncated after
+the last kept step. `infos` has arrays of n + 1 rows, one for each observation:
 
     state            uint8 (n + 1, S), state record, see `icrl4aht_data.overcooked.state`
     teammate_action  int8 (n + 1,), the teammate's action that led to the observation; -1 in the first row
     expert_action, oracle_action   int8 (n + 1,), labels of the observation, if the history has them; -1 in the last row
 
-The metadata have a key `icrl4aht` with what Minari has no fields for: data version, tasks, provenance, and the task,
+The key `icrl4aht` of the metadata has facts without a Minari field: data version, tasks, provenance, and the task,
 source, stream, learner and number of episodes of every history. Checkpoints are not converted.
 """
 
@@ -49,19 +49,19 @@ def to_minari(
 ) -> Path:
     """Write a selection as a Minari dataset; `minari.load_dataset(target.name)` opens it in MINARI_DATASETS_PATH.
 
-    Observations have the layout's own channels if the selection's layouts have as many, else the canonical ones. The
-    dataset of one task with a heuristic teammate has its environment: `recover_environment` of Minari makes it.
+    Observations have the layouts' own channels if all layouts have the same number, else the canonical channels. For a
+    single task with a heuristic teammate, Minari's `recover_environment` makes its environment.
 
     Args:
         dataset: a release with state records, or a part of one.
-        target: the folder to write, named as Minari names datasets: `<name>-v<number>`.
-        overwrite: replace a folder that this function wrote, or a release.
-        advance: progress.
+        target: the folder to write, with a Minari name `<name>-v<number>`.
+        overwrite: replace a folder written by this function, or a release.
+        advance: called with the number of histories written and their total.
 
     Raises:
-        OptionError: if Minari is not installed, if `target` has another form of name, or if it may not be written, see
-            `release_folder.check_target`.
-        NotStoredError: for a release of observations, which does not have those after the last steps.
+        OptionError: if Minari is not installed, if the name of `target` has another form, or if it may not be written,
+            see `release_folder.check_target`.
+        NotStoredError: if the release has no state records, and so no observations after the last steps.
     """
     try:
         import minari
@@ -106,7 +106,7 @@ def to_minari(
 
 
 def _describe(dataset: Dataset) -> dict[str, Any]:
-    """Return the metadata `icrl4aht` of a selection."""
+    """Return the content of the metadata key `icrl4aht`."""
     recorded = read_provenance(dataset.origin.file(PROVENANCE))
     first = {entry.task_id: entry for entry in dataset.entries}
     names = ("task_id", "source", "env_idx", "learner", "episodes")
@@ -122,7 +122,7 @@ def _describe(dataset: Dataset) -> dict[str, Any]:
 
 
 def _environment(dataset: Dataset, tasks: list[dict[str, Any]], canonical: bool) -> Any:
-    """Return the spec of the environment of a single task with a heuristic teammate, else None."""
+    """Return the environment spec if there is a single task with a heuristic teammate, else None."""
     if len(tasks) > 1 or tasks[0]["teammate"]["kind"] == "rl":
         return None
     noise = dataset.recover_teammate(dataset.entries[0].history_id).get("noise", "seeded")

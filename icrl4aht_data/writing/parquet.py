@@ -1,4 +1,4 @@
-"""Parquet files of a release: its index, one row per history, and its episodes, one row each."""
+"""Writing of Parquet files: the index, one row per history, and the episodes, one row per episode."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ROW_GROUP = 2000
-"""Least episodes in a row group, the part of a file that is written and read at once: about 10 MB in memory."""
+"""Minimum number of episodes in a row group: about 10 MB in memory."""
 
 FILE_EPISODES = 500_000
-"""Episodes after which a history starts the next file: about 100 MB."""
+"""Number of episodes after which a new file starts: about 100 MB."""
 
 
 def to_parquet(dataset: Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
-    """Write the selection's index as a Parquet file, one row per history. Needs pyarrow, of the extra `hf`.
+    """Write a selection's index as a Parquet file, one row per history. Needs pyarrow (extra `hf`).
 
     Args:
         dataset: a release, or a part of one.
@@ -45,7 +45,7 @@ def to_parquet(dataset: Dataset, path: str | Path, *, overwrite: bool = False) -
     schema = index_schema().with_metadata({"icrl4aht-data": "index"})
     rows = arrow.Table.from_pylist([entry.to_json() for entry in dataset.entries], schema)
     with explain_full_disk(path), atomic_write(path) as partial, partial.open("wb") as stream:
-        pq.write_table(rows, stream)  # which would leave a file open where it fails
+        pq.write_table(rows, stream)  # given a stream, because pyarrow leaves its own file open after an error
     return path
 
 
@@ -56,20 +56,20 @@ def write_episodes(
     file_episodes: int = FILE_EPISODES,
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Write the episodes of a release as Parquet files `<layout>/<split>-00000-of-00001.parquet`, one row each.
+    """Write Parquet files `<layout>/<split>-00000-of-00001.parquet` with one row per episode.
 
-    Memory holds one history and one row group at a time. All episodes of a history are in one file, in order. The
-    columns are `arrow_tables.EPISODE_COLUMNS`, with records as wide as the longest one of the selection's layouts.
+    Only one history and one row group are in memory at a time. All episodes of a history are in one file, in order. The
+    columns are `arrow_tables.EPISODE_COLUMNS`; state records are padded to the longest of the selection's layouts.
 
     Args:
         dataset: a release with state records, or a part of one.
-        folder: the folder of the layouts' folders.
-        file_episodes: episodes after which a history starts the next file of its layout and split.
-        advance: called with the number of histories written, and their total.
+        folder: the folder to write the layouts' folders to.
+        file_episodes: number of episodes after which a new file starts.
+        advance: called with the number of histories written and their total.
 
     Raises:
         OptionError: if pyarrow is not installed.
-        IndexFormatError: if a history's episodes do not have the release's number of steps.
+        IndexFormatError: if an episode does not have the release's number of steps.
     """
     schema = episode_schema(dataset)
     done = 0
@@ -88,7 +88,7 @@ def write_episodes(
 
 
 def _write_row_groups(part: Dataset, path: Path, schema: pa.Schema) -> Iterator[int]:
-    """Write the episodes of a file; yield the number of histories in each row group when it is written."""
+    """Write one Parquet file of episodes; yield the number of histories in each row group after writing it."""
     arrow = import_pyarrow()
     import pyarrow.parquet as pq
 

@@ -1,12 +1,12 @@
-"""Conversion from and to the two files of the published code.
+"""Conversion between releases and the files of the published code.
 
-The published code keeps all histories in `histories.h5`, one group each, with observations as float32 in gzip-6 chunks
-of 4096 steps and action ids in its own order, and an index `histories_index.jsonl` of the paper's 14 fields (App. D.3).
-Files written here also have each group's `state` and `episode_end_state`, `tasks.jsonl` and `provenance.json`, which
-the published readers ignore; converted back they lose only checkpoints and oracle actions. The published index does not
-have learners: streams of several learners of a task are numbered consecutively in it.
-Files without states, which observations do not determine, become a release of observations; files without tasks one
-that knows its tasks by name.
+The published code stores all histories in `histories.h5`, one group each, with float32 observations in gzip-6 chunks of
+4096 steps and its own order of action ids. Its index `histories_index.jsonl` has the paper's 14 fields (App. D.3).
+`to_published` also writes `state` and `episode_end_state` of each group, `tasks.jsonl` and `provenance.json`, which the
+published readers ignore. With these, converting back loses only checkpoints and oracle actions. The published index has
+no learners, so the streams of a task's learners are numbered consecutively.
+Files without states become a release of observations, because observations do not determine the state. Without
+`tasks.jsonl`, such a release knows its tasks only by name.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ PUBLISHED_CHUNK = 4096
 _TO_PUBLISHED = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS], np.int32)
 
 FROM_PUBLISHED = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], np.int32)
-"""int32 (6,): action id of the published files -> action id of this package."""
+"""int32 (6,), maps action ids of the published files to those of this package."""
 
 
 def to_published(
@@ -69,16 +69,16 @@ def to_published(
     overwrite: bool = False,
     advance: HistoryProgress = lambda done, total: None,
 ) -> Path:
-    """Write a selection as the published code's two files, its histories numbered from 0.
+    """Write a selection as files of the published code, with histories numbered from 0.
 
     Args:
         dataset: a release, or a part of one.
-        target: the folder to write, which appears when it is complete.
+        target: the folder to write.
         chunk: steps per chunk.
-        states: also store the state records, if there are any: without them `from_published` makes a release of
+        states: also store the state records, if there are any; without them, `from_published` makes a release of
             observations.
-        overwrite: replace a folder that was written by this function, or a release.
-        advance: progress.
+        overwrite: replace a folder written by this function, or a release.
+        advance: called with the number of histories written and their total.
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`.
@@ -106,10 +106,10 @@ def to_published(
 
 
 class _SafeFile(io.FileIO):
-    """A new file whose writes do not fail: libhdf5 may crash when it closes a file on a full disk.
+    """File that stores write errors instead of raising them, because libhdf5 may crash on a full disk.
 
     Attributes:
-        error: the first error of the disk, after which nothing is written.
+        error: the first write error, after which nothing is written.
     """
 
     error: OSError | None = None
@@ -133,7 +133,7 @@ class _SafeFile(io.FileIO):
 
 @contextmanager
 def _new_hdf5(path: Path) -> Iterator[h5py.File]:
-    """Yield a new HDF5 file to write to; raise OSError, which names it, if the disk has no room for it."""
+    """Yield a new HDF5 file to write to; raise OSError with its name if the disk is full."""
     with add_filename(path), _SafeFile(path, "w+") as stream:
         with h5py.File(stream, "w") as file:
             yield file
@@ -142,7 +142,7 @@ def _new_hdf5(path: Path) -> Iterator[h5py.File]:
 
 
 def _streams_each(provenance: Provenance | None) -> int:
-    """Return how many numbers of streams each learner of a task has in the published index."""
+    """Return the number of stream ids in the published index that are reserved for each learner of a task."""
     ego = None if provenance is None else provenance.ego
     return 2**31 if ego is None else ego["environments"]
 
@@ -168,28 +168,28 @@ def from_published(
     overwrite: bool = False,
     advance: HistoryProgress = lambda done, total: None,
 ) -> Kind:
-    """Write a release from a folder with the published code's two files.
+    """Write a release from files of the published code.
 
     Args:
         source: a folder with `histories.h5` and `histories_index.jsonl`.
-        target: the folder to write, which appears when it is complete.
-        kind: by default "lite" if the groups have state records, "observations" if none has.
-        tasks: a JSONL file with the tasks that the index names; by default `tasks.jsonl` in `source`. A release of
-            observations can be made without: it knows of its tasks what the index says.
-        family_map: `teammate_family` of the index -> family (rl, H1..H4) or kind of teammate, in addition to the names
-            of the published code, see `published_index.FAMILY_MAP`.
+        target: the folder to write.
+        kind: kind of the release; by default "lite" if the groups have state records, else "observations".
+        tasks: a JSONL file with the tasks of the index; by default `tasks.jsonl` in `source`. Optional for a release of
+            observations, which then knows its tasks only by name.
+        family_map: `teammate_family` of the index -> family (rl, H1..H4) or kind of teammate, in addition to
+            `published_index.FAMILY_MAP`.
         data_version: version of the data, SemVer.
-        kept_steps: steps of every episode; an unfinished one may end a history.
+        kept_steps: steps of every episode; the last episode of a history may be unfinished.
         overwrite: replace a release at `target`.
-        advance: progress.
+        advance: called with the number of histories converted and their total.
 
     Returns:
         The kind of the release.
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`.
-        PublishedFormatError: if a file is missing or malformed, if a group has no array that a release of that kind
-            needs, or if a group, a stream or a content appears twice; names file and group.
+        PublishedFormatError: if a file is missing or malformed, if a group lacks an array that the kind of release
+            needs, or if two histories have the same group, stream or content; with file and group.
     """
     kept_steps, source, target = check_int("kept_steps", kept_steps, 1), as_path(source), as_path(target)
     check_target(target, overwrite, [source])
@@ -234,7 +234,7 @@ def from_published(
 
 @contextmanager
 def _wrap_errors(what: str) -> Iterator[None]:
-    """Raise errors of h5py, which a damaged file makes raise anything, as `PublishedFormatError`."""
+    """Raise any error of h5py as `PublishedFormatError`, since damaged files cause errors of any type."""
     try:
         yield
     except Icrl4ahtError:
@@ -244,7 +244,7 @@ def _wrap_errors(what: str) -> Iterator[None]:
 
 
 def _check_content(history: _PublishedHistory, seen: dict[bytes, _PublishedHistory]) -> None:
-    """Check that a history is not a copy of another one of its task; `seen` has those so far, by a hash."""
+    """Check that no earlier history of the task has the same content; `seen` maps hashes to the earlier ones."""
     digest = hashlib.sha256(b"".join(history.read(name).tobytes() for name in ("actions", "rewards"))).digest()
     other = seen.setdefault(digest, history)
     record = record_field(history.kind).name
@@ -255,7 +255,7 @@ def _check_content(history: _PublishedHistory, seen: dict[bytes, _PublishedHisto
 
 
 def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenance:
-    """Return provenance that says what the conversion changed: names of teammates, and rows of views."""
+    """Return provenance with notes about renamed teammates and padded views."""
     notes = dict(history.line.get("published", {}))
     if history.short and history.kind == OBSERVATIONS:
         layout = get_layout(history.line["layout"])
@@ -264,7 +264,7 @@ def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenanc
 
 
 def _stored_kind(file: h5py.File, lines: list[dict[str, Any]]) -> Kind:
-    """Return "lite" if every group has states, "observations" if none has."""
+    """Return "lite" if all groups have states, "observations" if none has."""
     with _wrap_errors(f"{file.filename}: cannot be read"):
         groups = [line["h5_group"] for line in lines if exists(file, line["h5_group"])]
         without = [group for group in groups if not exists(file, f"{group}/state")]
@@ -279,7 +279,7 @@ def _stored_kind(file: h5py.File, lines: list[dict[str, Any]]) -> Kind:
 def _tasks(
     histories: list[_PublishedHistory], source: Path, path: Path | None, kind: Kind
 ) -> list[tuple[Task, list[_PublishedHistory]]]:
-    """Return the tasks that the index names, in its order, with their histories."""
+    """Return the tasks of the index with their histories, in the order of the index."""
     by_task: dict[str, list[_PublishedHistory]] = {}
     for history in histories:
         by_task.setdefault(history.line["task_id"], []).append(history)
@@ -306,7 +306,7 @@ def _tasks(
 
 @dataclass(frozen=True)
 class _PublishedHistory:
-    """One history of the published file; its arrays are read, checked and converted on access.
+    """One history of a published file, whose arrays are read, checked and converted on access.
 
     Args:
         file: the open file.
@@ -327,19 +327,19 @@ class _PublishedHistory:
 
     @property
     def short(self) -> bool:
-        """Whether the views have fewer rows than those of a release, see `published_views`."""
+        """Whether the observations are short views, see `published_views`."""
         return is_short(get_layout(self.line["layout"]), self.line["obs_shape"])
 
     def field_names(self) -> list[str]:
-        """Return the names of the arrays that the release takes."""
+        """Return the names of the arrays to convert."""
         fields = held_fields(self.kind)
         return [f.name for f in fields if self.kind not in f.optional or self.line.get(f"has_{f.name}")]
 
     def check_arrays(self) -> None:
-        """Check that the group has the arrays that the release takes, and observations.
+        """Check that the group has the arrays to convert, and observations.
 
         Raises:
-            PublishedFormatError: names the group and the missing arrays.
+            PublishedFormatError: if arrays are missing; with the group and their names.
         """
         name = self.line["h5_group"]
         with _wrap_errors(f"{self.where}: cannot be read"):
@@ -361,10 +361,12 @@ class _PublishedHistory:
         """Return one array in the field's compact dtype: (T, ...), or (E, S) for `episode_end_state`.
 
         Raises:
-            PublishedFormatError: names the array, and the expected and found values.
+            PublishedFormatError: if the array is invalid; with its name, the expected and the found values.
         """
         layout, steps = get_layout(self.line["layout"]), self.line["T"]
-        if name == "obs" and self.short and self.kind != OBSERVATIONS:  # states show the rows that were not recorded
+        if (
+            name == "obs" and self.short and self.kind != OBSERVATIONS
+        ):  # for releases with states, missing rows are rendered
             return fast_observe(layout, self.read("state"), np.empty((steps, *layout.obs_shape), np.uint8))
         array = self._read_recorded(name)
         if name == "obs" and self.short:
@@ -386,7 +388,7 @@ class _PublishedHistory:
         return array
 
     def _read_recorded(self, name: str) -> np.ndarray:
-        """Return one array in the field's compact dtype; views have the rows that were recorded."""
+        """Return one array in the field's compact dtype; short views are not padded."""
         field, layout, steps = FIELDS[name], get_layout(self.line["layout"]), self.line["T"]
         rows = steps if field.axis == "T" else steps // self.kept_steps
         shape = self.line["obs_shape"] if name == "obs" and self.short else field.held(layout).shape
@@ -400,7 +402,7 @@ class _PublishedHistory:
         low, high = (0, 1) if compact.kind == "b" else (np.iinfo(compact).min, np.iinfo(compact).max)
         if name in ACTION_FIELDS:
             low, high = 0, len(ACTIONS) - 1
-        with np.errstate(invalid="ignore"):  # the comparison finds values that the cast changed
+        with np.errstate(invalid="ignore"):  # values that the cast changes fail the comparison
             array = found.astype(compact)
         wrong = (array != found) | (found < low) | (found > high)
         if wrong.any():

@@ -1,7 +1,8 @@
-"""Index lines of published files: checked, and with the teammates' names of the published code translated.
+"""Reading the index of published files, with their names of teammates translated to ours.
 
-The published code's own files say `teammate_kind` "rl" or "heuristic", and `teammate_family` the algorithm (ippo, fcp,
-brdiv, ...) or the heuristic. Here, as in the paper, the family is rl or H1..H4, and the kind is that name.
+In published files, `teammate_kind` is "rl" or "heuristic", and `teammate_family` is the algorithm (ippo, fcp, brdiv,
+...) or the heuristic. In this package, as in the paper, the family is rl or H1..H4, and the kind is the algorithm or
+the heuristic.
 """
 
 from __future__ import annotations
@@ -20,22 +21,23 @@ PUBLISHED_FIELDS = tuple(ENTRY_HINTS)[:14]
 """Fields of an index line (paper, App. D.3)."""
 
 _KINDS = {"ippo": "rl"} | KIND_FAMILIES
-"""Names of algorithms and heuristics -> family."""
+"""Name of an algorithm or heuristic -> family."""
 
 FAMILY_MAP = (
     {name: name for name in FAMILIES} | {name: name for name in _KINDS} | {"recipe_aware": "recipe_aware_button"}
 )
-"""`teammate_family` in published files -> a family, or a kind of teammate, which implies its family."""
+"""`teammate_family` in published files -> family or kind of teammate in this package."""
 
 _GENERAL = {"rl": ("rl",), "heuristic": tuple(HEURISTIC_KINDS.values())}
-"""`teammate_kind` of the published code -> the families that it can mean."""
+"""`teammate_kind` in published files -> possible families."""
 
 
 def parse_family_map(pairs: tuple[str, ...]) -> dict[str, str]:
-    """Return the pairs OLD=NEW of a command line as a dict.
+    """Parse command-line pairs OLD=NEW as a dict.
 
     Raises:
-        OptionError: for a text that is not a pair, or a NEW that is neither a family nor a kind of teammate.
+        OptionError: if a text is not such a pair.
+        UnknownNameError: if NEW is neither a family nor a kind of teammate.
     """
     found = {}
     for pair in pairs:
@@ -53,14 +55,14 @@ def read_published_index(path: Path, family_map: Mapping[str, str] | None = None
 
     Args:
         path: the file.
-        family_map: `teammate_family` of the file -> a family or a kind of teammate, in addition to `FAMILY_MAP`.
+        family_map: `teammate_family` of the file -> family or kind of teammate, in addition to `FAMILY_MAP`.
 
     Returns:
-        The lines; one whose names were translated has the original ones under "published".
+        The lines as dicts. If names were translated, "published" has the original ones.
 
     Raises:
-        PublishedFormatError: names the line; for a field that is missing or wrong, and for a group or a stream of a
-            task that is used twice.
+        PublishedFormatError: if a field is missing or invalid, or if two lines have the same group, or the same stream
+            of a task; with the line number.
     """
     lines: list[dict[str, Any]] = []
     seen: dict[Any, int] = {}
@@ -93,7 +95,7 @@ def _parse(text: str) -> dict[str, Any]:
 
 
 def _translate(line: dict[str, Any], family_map: Mapping[str, str]) -> dict[str, Any]:
-    """Return a line with a family and a kind as in the paper."""
+    """Return a line with family and kind of the teammate translated to the paper's names."""
     family, kind = line["teammate_family"], line["teammate_kind"]
     new = family_map.get(family) or family_map.get(family.lower())
     if new is None:

@@ -1,8 +1,8 @@
-"""Observations of the published code on maps with fewer rows than a view has.
+"""Padding of observations of the published code, whose views are too short on maps with fewer than 5 rows.
 
-There, a view has only as many rows as the map: 4 x 5 cells on the cramped layouts. It shows the rows from two above the
-agent to one below it; the row two below is missing. Where that row is outside of the map it is 0, as everything outside
-is. Where it is on the map its fixed cells are known (walls, pots, piles); items on them were not recorded and are 0.
+On such a map, a published view has only as many rows as the map: 4 x 5 cells on the cramped layouts. The missing row is
+two cells below the agent. The padding is 0 outside the map. Inside the map it shows the fixed cells (walls, pots,
+piles), and 0 for items, which were not recorded.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ PADDING = (
     "below the ego shows the map's fixed cells, and 0 outside of the map; items, pots' contents and timers in it were "
     "not recorded and are 0"
 )
-"""Description of completed views, for provenance."""
+"""Note about padded views for meta/provenance.json."""
 
 
 def is_short(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
-    """Return whether views of this shape have as many rows as a map that is lower than a view."""
+    """Return whether observations of this shape are short views, with one row per row of a map of fewer than 5 rows."""
     return layout.height < WINDOW and tuple(obs_shape) == (layout.height, *layout.obs_shape[1:])
 
 
 def complete_views(layout: Layout, short: np.ndarray) -> np.ndarray:
-    """Return views with all rows.
+    """Pad short views to five rows.
 
     Args:
         layout: the layout.
@@ -39,7 +39,8 @@ def complete_views(layout: Layout, short: np.ndarray) -> np.ndarray:
         uint8 (T, 5, 5, C).
 
     Raises:
-        PublishedFormatError: without file and group, if a view shows the layout from no cell of the ego's room.
+        PublishedFormatError: if a view does not match the layout from any cell of the ego's room; without file and
+            group, which the caller adds.
     """
     rows = short.shape[1]
     fixed = fixed_channels(layout)

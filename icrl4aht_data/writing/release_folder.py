@@ -1,4 +1,4 @@
-"""Atomic writing of a folder, which replaces another one only on demand, and only one that this package writes."""
+"""Atomic writing of folders. Existing folders are replaced only on request, and only if this package wrote them."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.utils.files import explain_full_disk, files_below, lock_path, process_lock
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
-"""File names of the published code."""
+"""Names of the files of the published code."""
 
 _CONVERTED = (
     {HISTORIES_H5, HISTORIES_INDEX, "tasks.jsonl", "provenance.json"},
     {"data/main_data.hdf5", "data/metadata.json"},
 )
-"""Files of the folders that are no releases: published files, and a Minari dataset."""
+"""Sets of files by which folders of published files and Minari datasets are recognised."""
 
 
 def as_path(target: object) -> Path:
     """Return the path of a folder or file to write.
 
     Raises:
-        OptionError: if it is neither a path nor a text.
+        OptionError: if it is neither a path nor a string.
     """
     if not isinstance(target, (str, Path)):
         raise OptionError(f"{target!r:.100}: expected the path of a folder or file to write")
@@ -39,16 +39,16 @@ def as_path(target: object) -> Path:
 
 @contextmanager
 def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[str | Path] = ()) -> Iterator[Path]:
-    """Yield a new folder to fill, which becomes `target` if the block ends without an error.
+    """Yield a temporary folder to fill, which is renamed to `target` if the block ends without an error.
 
     Args:
         target: the folder to write.
         overwrite: replace a release, or a folder of converted files, at `target`.
-        sources: folders that are read meanwhile; addresses are ignored.
+        sources: folders that the block reads; addresses are ignored.
 
     Raises:
-        OptionError: as `check_target`, before the block and again after it; if another process is writing the folder.
-        DiskFullError: if the disk is full; nothing is left of the new folder then.
+        OptionError: if `check_target` fails before or after the block, or another process is writing the folder.
+        DiskFullError: if the disk is full; the temporary folder is removed.
     """
     sources = tuple(sources)
     check_target(target, overwrite, sources)
@@ -58,14 +58,18 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             with process_lock(lock_path(target), wait=False):
-                if old.exists() and not target.exists():  # a writer was killed between the two renames below
+                if (
+                    old.exists() and not target.exists()
+                ):  # an earlier process was killed between the two renames in `_replace`
                     old.rename(target)
                     check_target(target, overwrite, sources)
                 for leftover in (new, old):
                     shutil.rmtree(leftover, ignore_errors=True)
                 try:
                     new.mkdir()
-                    with explain_full_disk(target):  # measures the space before that of the new folder is freed
+                    with explain_full_disk(
+                        target
+                    ):  # outermost, to measure the free space before the temporary folder is removed
                         yield new
                     check_target(target, overwrite, sources)
                     _replace(target, new, old)
@@ -79,13 +83,12 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
 
 
 def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = ()) -> bool:
-    """Check that a folder may be written: it must not exist, except empty, or with `overwrite` as a folder of ours.
+    """Check that a folder is missing or empty, or may be replaced.
 
     Args:
         target: the folder to write.
-        overwrite: whether to replace a release, or a folder of converted files. Every file in it has to be one that its
-            manifest lists, or one that a conversion writes.
-        sources: folders that are read meanwhile, none equal to the target, inside or around it.
+        overwrite: allow replacing a release, or a folder of converted files, without other files.
+        sources: folders to read from; none may equal the target, or be inside or around it.
 
     Returns:
         Whether there is a folder to replace.
@@ -114,7 +117,7 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
 
 
 def _foreign_content(folder: Path) -> str | None:
-    """Return what of a folder this package does not write, in words; None if it writes everything."""
+    """Return why a folder was not written by this package, in words; None if it was."""
     if not folder.is_dir():
         return "is not a folder"
     present = set(files_below(folder))
@@ -130,7 +133,7 @@ def _foreign_content(folder: Path) -> str | None:
 
 
 def _replace(target: Path, new: Path, old: Path) -> None:
-    """Rename the new folder to the target, and what was there to `old`."""
+    """Rename an existing target to `old`, and the new folder to the target."""
     if target.exists():
         target.rename(old)
     try:

@@ -1,4 +1,4 @@
-"""Writer of one HDF5 shard, chunk by chunk, with its chunk table."""
+"""Writing of HDF5 shards and their chunk tables."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import add_filename
 from icrl4aht_data.utils.system import in_slices, usable_cores
 
-_BLOCK = 2000  # steps: one chunk of scalars, two of records
+_BLOCK = 2000  # steps; the length of one chunk of scalars or two chunks of records
 
 
 class EncodedChunk(NamedTuple):
     """One chunk of a history, ready to be stored.
 
     Args:
-        field: the field.
-        start: its first row, a step or an episode of the history.
-        data: the shuffled and deflated bytes.
+        field: field of the chunk.
+        start: first row of the chunk, a step or episode of the history.
+        data: shuffled and deflated bytes.
     """
 
     field: Field
@@ -49,9 +49,9 @@ def write_shard(
 
     Args:
         root: the release folder.
-        shard: path in the release, as in every entry.
+        shard: path in the release, equal to `shard` of every entry.
         kind: kind of the release.
-        entries: index entries of the histories; `h5_group` and `h5_row` say where each one is stored.
+        entries: index entries of the histories, each with its position in the shard (`h5_group`, `h5_row`).
         histories: the chunks of each entry's history, see `encode_history`.
     """
     path, table_path = root / shard, chunk_table_path(root, shard)
@@ -65,7 +65,7 @@ def write_shard(
         file.attrs["layout"] = layout.name
         for group in dict.fromkeys(entry.h5_group for entry in entries):
             _create_datasets(file, layout, kind, [entry for entry in entries if entry.h5_group == group])
-        opened: dict[str, Any] = {}  # looking a dataset up takes as long as writing a chunk
+        opened: dict[str, Any] = {}  # cached, since opening a dataset takes as long as writing a chunk
         for entry, chunks in zip(entries, histories, strict=True):
             for field, start, data in sorted(chunks, key=lambda chunk: file_order(chunk.field, chunk.start)):
                 position = (start,) if entry.h5_row is None else (entry.h5_row, start)
@@ -89,7 +89,7 @@ def write_shard(
 
 
 def metadata_lines(content: bytes, chunks: np.ndarray) -> np.ndarray:
-    """Return chunk table lines for the bytes of a shard between its chunks, which HDF5 writes."""
+    """Return the chunk table's rows for the HDF5 metadata of a shard, the bytes between its chunks."""
     ordered = np.sort(chunks, order="offset")
     starts = [*ordered["offset"].tolist(), len(content)]
     stops = [0, *(ordered["offset"] + ordered["size"]).tolist()]
@@ -102,7 +102,7 @@ def metadata_lines(content: bytes, chunks: np.ndarray) -> np.ndarray:
 
 
 def _checksums(data: bytes) -> tuple[int, np.ndarray]:
-    """Return the last two values of a chunk table's row."""
+    """Return CRC-32 and hash of a chunk, the last two values of a chunk table's row."""
     return zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
 
 
@@ -127,10 +127,10 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
 
 
 def file_order(field: Field, start: int) -> tuple[int, ...]:
-    """Return the sort key of a chunk in the file, so that a window of steps is one byte range.
+    """Return the sort key of a chunk, which makes a window of steps one byte range of the file.
 
-    Chunks are ordered by block of `_BLOCK` steps, and in a block: the first state records, the scalars that every
-    window needs, the other records, labels, observations.
+    Chunks are sorted by block of `_BLOCK` steps, then by field. In a block, the scalars that every window needs are
+    between the first and the second chunk of state records.
     """
     if field.axis == "E":
         return (1,)
@@ -140,15 +140,15 @@ def file_order(field: Field, start: int) -> tuple[int, ...]:
 
 
 def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -> list[EncodedChunk]:
-    """Return every chunk of a history, in the order of the chunk table.
+    """Encode all chunks of a history, in the order of the chunk table.
 
     Args:
         kind: kind of the release.
         entry: the history's index entry.
-        arrays: field name -> array, of the field's dtype or another one with the same values.
+        arrays: field name -> array, of any dtype with values that the stored dtype can hold.
 
     Raises:
-        OptionError: if the stored dtype cannot hold a value, or an array does not have the entry's length.
+        OptionError: if the stored dtype cannot hold a value, or an array's length differs from the index entry.
     """
     layout, parts = get_layout(entry.layout), []
     for field in entry.stored_fields(kind):
@@ -167,7 +167,7 @@ def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -
     threads = min(usable_cores(), len(parts))
 
     def encode(first: int, stop: int) -> None:
-        for thread in range(first, stop):  # every thread gets parts of all fields, since some take longer
+        for thread in range(first, stop):  # strided, since some fields take longer to encode
             for number in range(thread, len(parts), threads):
                 encoded[number] = encode_chunk(*parts[number][2:])
 

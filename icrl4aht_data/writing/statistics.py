@@ -1,4 +1,4 @@
-"""Statistics of a release by layout: the paper's table "Dataset statistics per layout", and how much histories rise."""
+"""Statistics of a release: the paper's table "Dataset statistics per layout", and the rise of returns."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def layout_statistics(
         entries: the index.
         tasks: the release's tasks.
         provenance: task id -> how its histories were made.
-        kept_steps: steps of an episode.
-        sizes: shard -> bytes.
+        kept_steps: steps of every episode.
+        sizes: shard -> size in bytes.
     """
     statistics = {}
     for layout in dict.fromkeys(entry.layout for entry in entries):
@@ -75,7 +75,7 @@ def layout_statistics(
 
 
 def _policy(task: Task) -> str:
-    """Return a text that is equal for checkpoints of one training, and for nothing else."""
+    """Return a key that is equal only for checkpoints of the same policy."""
     checkpoint = task.teammate.get("theta", {}).get("checkpoint")
     if task.teammate_family != "rl" or checkpoint is None:
         return json.dumps(task.teammate, sort_keys=True)
@@ -93,11 +93,11 @@ def print_statistics(info: ReleaseInfo, console: Console) -> None:
 
 
 def print_learning(content: Mapping[str, Any], console: Console) -> None:
-    """Print how much the histories of a release rise, and what is not in the release.
+    """Print how much returns rise by layout and source, and the tasks that were left out.
 
     Args:
-        content: what `card.facts` says of the release.
-        console: where it is printed.
+        content: result of `card.facts`.
+        console: console to print to.
     """
     learning: list[dict[str, Any]] = content["learning"]
     totals = [

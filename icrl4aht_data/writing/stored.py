@@ -1,4 +1,4 @@
-"""Histories of existing releases as input of `write_release`, read one array at a time."""
+"""Input of `write_release` from existing releases, read one array at a time."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from icrl4aht_data.format.schema import TASKS, TEAMMATES, Kind, held_fields
 from icrl4aht_data.writing.release import NewHistory, NewTask
 
 HistoryProgress = Callable[[int, int], None]
-"""Called with the number of histories done, and their total."""
+"""Callback that receives the number of histories done and their total."""
 
 
 class LazyArrays(Mapping[str, np.ndarray]):
-    """The arrays of one history, each read when it is accessed, so that a shard's arrays need not fit in memory.
+    """Arrays of one history, each read on access, so that a shard's arrays need not fit in memory.
 
     Args:
         names: names of the fields.
-        read: returns the array of a field.
+        read: function that returns the array of a field.
     """
 
     def __init__(self, names: Sequence[str], read: Callable[[str], np.ndarray]) -> None:
@@ -34,7 +34,7 @@ class LazyArrays(Mapping[str, np.ndarray]):
             raise KeyError(name)
         return self._read(name)
 
-    def __contains__(self, name: object) -> bool:  # the base class would read the array
+    def __contains__(self, name: object) -> bool:  # the inherited method would read the array
         return name in self._names
 
     def __iter__(self) -> Iterator[str]:
@@ -45,7 +45,7 @@ class LazyArrays(Mapping[str, np.ndarray]):
 
 
 def release_tasks(dataset: Dataset) -> list[Task]:
-    """Return the tasks of a selection's release; without given tasks those of the selection, known by name only."""
+    """Return the tasks of a dataset's release; if it stores none, `NamedTask`s made from the selected entries."""
     if dataset.knows_tasks:
         return read_tasks(dataset.origin.file(TASKS))
     return list({entry.task_id: named_task(entry.to_json()) for entry in dataset.entries}.values())
@@ -54,7 +54,7 @@ def release_tasks(dataset: Dataset) -> list[Task]:
 def stored_task(
     dataset: Dataset, task: Task, provenance: Provenance, kind: Kind, done: Callable[[], None] = lambda: None
 ) -> NewTask:
-    """Return a task to write, with all histories of a selection in order, and the checkpoints of teammate and expert.
+    """Return a task to write, with its histories and the checkpoints of its teammate and expert.
 
     Args:
         dataset: histories of the task.
@@ -72,7 +72,7 @@ def stored_task(
             done()
 
     if task.teammate.get("kind") == "rl":
-        dataset.origin.below(f"{TEAMMATES}/{task.teammate['theta']['sha256']}")  # fetched and checked
+        dataset.origin.below(f"{TEAMMATES}/{task.teammate['theta']['sha256']}")  # fetches and checks the checkpoint
     files = checkpoint_files(dataset.root / TEAMMATES, task, dataset.root)
     if provenance.expert is not None and (sha256 := provenance.expert.policy_sha256) is not None:
         files |= expert_files(dataset.origin.below(expert_folder(sha256)), sha256, dataset.root)
@@ -80,5 +80,5 @@ def stored_task(
 
 
 def with_source(provenance: Provenance, source: str) -> Provenance:
-    """Return provenance that says how the histories were made, which releases of version 3 say in the index only."""
+    """Return provenance with the histories' source, which format version 3 stores only in the index."""
     return provenance if source == (provenance.source or "ppo") else replace(provenance, source=source)
