@@ -1,4 +1,4 @@
-"""Checks of a release's files: against the manifest, the recorded sizes, and the tasks that name checkpoints."""
+"""Checks of a release's files against the manifest, the recorded sizes, and the tasks."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from icrl4aht_data.utils.hashes import file_hash
 _HUB_FILES = (".gitattributes", ".cache/huggingface/")
 """Files that the Hub and its client add to a repository's."""
 
-_META = re.compile(r"meta/[^/]+")  # `load_icrl4aht` compares these files with the manifest, so every level does
+_META = re.compile(r"meta/[^/]+")  # checked at every level, because `load_icrl4aht` checks these files, too
 
 
 def check_files(
     origin: ReleaseLocation, listed: Mapping[str, str], chosen: set[str], report: Report, advance: NamedProgress
 ) -> None:
-    """Check that the chosen files exist with the manifest's hashes, and that no unlisted files do.
+    """Check that the chosen files have the manifest's hashes, and that there are no unlisted files.
 
     Sizes are compared first, because hashing a sparse file of a terabyte would take hours.
 
@@ -42,7 +42,7 @@ def check_files(
     """
     root, quick = origin.folder, report.level == "quick"
     expected, present = listed.keys() & chosen, set(files_below(root))
-    if not quick or origin.remote is None:  # files of a remote need not be downloaded for a quick check
+    if not quick or origin.remote is None:  # a quick check does not download files
         for name in sorted(expected - present):
             report.add(name, "listed in the manifest, but missing")
     for name in sorted(present - listed.keys() - {MANIFEST}):
@@ -54,7 +54,7 @@ def check_files(
             path = resolve_inside(root, name)
             size, right = path.stat().st_size, sizes.get(name)
             if right is None and size > LARGEST:
-                if not name.startswith("data/"):  # no file but a shard is this large
+                if not name.startswith("data/"):  # only shards may be larger
                     report.add(name, f"expected at most {LARGEST:,} bytes, found {size:,}")
                     continue
                 right = _covered_size(root, name)
@@ -72,7 +72,7 @@ def check_files(
 
 
 def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
-    """Return the sizes of shards in meta/info.json, if that file is the one that the manifest lists."""
+    """Return the sizes of shards in meta/info.json; empty if the file does not match the manifest."""
     try:
         path = resolve_inside(root, INFO)
         plain_size(path, LARGEST)
@@ -82,7 +82,7 @@ def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
 
 
 def _covered_size(root: Path, name: str) -> int:
-    """Return the size of a shard by its chunk table, which covers every byte."""
+    """Return the size of a shard according to its chunk table."""
     return int(read_table(resolve_inside(root, chunk_table_name(name)))["size"].sum(dtype=np.int64))
 
 
@@ -93,9 +93,9 @@ def check_references(
     provenance: Mapping[str, Provenance] | None,
     report: Report,
 ) -> None:
-    """Check that shards, chunk tables and policies in the manifest are those of a history or a task.
+    """Check that each shard, chunk table and checkpoint in the manifest belongs to a history or a task.
 
-    A policy's folder is named by the SHA-256 of its weights. A release may be without the policies.
+    A checkpoint's folder is named by the SHA-256 of its weights. Checkpoints are optional.
 
     Args:
         listed: the manifest, file -> SHA-256.

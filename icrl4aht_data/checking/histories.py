@@ -28,11 +28,11 @@ from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.system import free_memory
 
-_COPIES = 4  # of a history's arrays that checking it holds in memory
+_COPIES = 4  # memory of checking a history, in multiples of the size of its arrays
 
 
 def check_chunks(shard: Shard, report: Report) -> set[int]:
-    """Decode every chunk of a shard; returns the ids of histories with a damaged chunk."""
+    """Decode every chunk of a shard, and return the ids of histories with a damaged chunk."""
     damaged = set()
     for row, history_id, field in shard.chunks():
         try:
@@ -50,8 +50,8 @@ def check_history(history: History, info: ReleaseInfo, contents: dict[tuple[str,
     Args:
         history: the history.
         info: the release's info.
-        contents: (task id, hash of what the ego saw and did) -> history id, of the shard's histories so far; receives
-            this one.
+        contents: (task id, hash of the ego's observations and actions) -> history id, of the histories checked so far;
+            receives this one.
         report: receives the problems.
     """
     entry, layout = history.entry, get_layout(history.entry.layout)
@@ -103,5 +103,5 @@ def _history_faults(history: History, kept_steps: int, deep: bool) -> Iterator[s
             yield f"{name}: the index says {getattr(entry, name)}, the rewards give {value}"
     if deep and not has_states:
         yield from observation_faults(layout, history)
-    elif deep and possible:  # the rules are defined for possible states only
+    elif deep and possible:  # the rules accept only possible states
         yield from replay_faults(layout, history, dones, rewards)

@@ -1,4 +1,4 @@
-"""Checks of a release's index against its tasks, its meta/info.json and the names of its shards."""
+"""Checks of a release's index against tasks, meta/info.json and names of shards."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, TASKS, Entry
 from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
 from icrl4aht_data.writing.statistics import layout_statistics
 
-_NAMED = 100  # missing shards of one set that are reported
+_NAMED = 100  # maximum number of missing shards to report per set
 _OF_A_TASK = (
     *("track", "split", "layout", "teammate_family", "teammate_kind", "seed", "source"),
     *("expert_return", "expert_return_sampled", "expert_step"),
 )
-"""Fields of the index that the histories of one task share."""
+"""Index fields that are equal for all histories of a task."""
 
 
 def check_index(index: Index, tasks: list[Task], provenance: Mapping[str, Provenance] | None, report: Report) -> None:
@@ -87,7 +87,7 @@ def _describes(task: Task, entry: Entry) -> bool:
 
 
 def _check_disjoint_teammates(tasks: list[Task], report: Report) -> None:
-    """Check that no teammate of a training task is one of a test task on the same track."""
+    """Check that training and test tasks of a track have no common teammates."""
     seen: dict[tuple[str, str, str], str] = {}
     for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # train before test
         key = (task.track, task.layout.name, json.dumps(task.teammate, sort_keys=True))
@@ -98,7 +98,7 @@ def _check_disjoint_teammates(tasks: list[Task], report: Report) -> None:
 
 
 def _check_info(index: Index, tasks: list[Task], provenance: Mapping[str, Provenance] | None, report: Report) -> None:
-    """Check that meta/info.json has the totals and statistics of the index, with the sizes of shards that it says."""
+    """Check the totals and statistics in meta/info.json against the index."""
     root, info, shards = index.root, index.info, index.values("shard")
     kept_steps = info.environment.kept_steps
     described = describe(info.kind, info.data_version, kept_steps, list(index.entries), info.format_version)
@@ -108,7 +108,7 @@ def _check_info(index: Index, tasks: list[Task], provenance: Mapping[str, Proven
     elif report.ok and provenance is not None:
         statistics = layout_statistics(index.entries, tasks, provenance, kept_steps, info.shards)
         described = replace(described, shards=info.shards, statistics=statistics)
-    found = parse_json(read_text(resolve_inside(root, INFO)))  # also fields that `ReleaseInfo` does not have
+    found = parse_json(read_text(resolve_inside(root, INFO)))  # may have fields that `ReleaseInfo` does not have
     for name in sorted(found.keys() - {field.name for field in fields(ReleaseInfo)}):
         report.add(INFO, f"{name}: an unknown field")
     for name, expected in described.to_json().items():

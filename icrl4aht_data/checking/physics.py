@@ -1,4 +1,4 @@
-"""Checks of histories against the rules of the game: what observations show, where steps lead, how episodes start."""
+"""Checks of observations, steps and episode starts against the rules of the game."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from icrl4aht_data.reading.history import History
 
 
 def observation_faults(layout: Layout, history: History) -> Iterator[str]:
-    """Yield a problem if observations show the layout's fixed cells from nowhere in the ego's room; needs no states."""
+    """Yield a problem if an observation does not match the layout's fixed cells; needs no state records."""
     fixed = fixed_channels(layout)
     records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
     records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
@@ -26,11 +26,11 @@ def observation_faults(layout: Layout, history: History) -> Iterator[str]:
 
 
 def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: np.ndarray) -> Iterator[str]:
-    """Replay every step of a history with state records; yields what the rules contradict.
+    """Replay every step of a history with state records, and yield contradictions to the rules.
 
     Args:
         layout: the history's layout.
-        history: the history, whose states are possible.
+        history: the history, with possible states only.
         dones: bool (T,), last steps of episodes.
         rewards: (T,), the recorded rewards.
     """
@@ -43,7 +43,7 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
     following[dones] = ends
     recipe = columns(layout).recipe
     actions = np.stack([history.read("actions"), history.read("teammate_actions")], axis=-1)
-    # A new recipe is drawn at random: the recorded one is given to the rules.
+    # New recipes are random, so the replay takes the recorded ones.
     played = step(layout, states, np.clip(actions, 0, len(ACTIONS) - 1), following[:, recipe])
     wrong = np.flatnonzero((played.state != following).any(axis=-1))
     if len(wrong):

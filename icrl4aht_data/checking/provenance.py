@@ -14,11 +14,11 @@ from icrl4aht_data.format.provenance import Provenance, StreamReturns
 from icrl4aht_data.format.schema import HISTORIES, PROVENANCE, Entry
 from icrl4aht_data.utils.files import json_hash
 
-_ROUNDING = 1e-3  # of the means that a stream filter records
+_ROUNDING = 1e-3  # tolerance of the mean returns that a stream filter records
 
 
 def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[str, Provenance], report: Report) -> None:
-    """Check what provenance says of each task's learner, its streams and their filter.
+    """Check the provenance of each task: learners, streams, filter, noise and expert.
 
     Args:
         index: the release's index.
@@ -42,7 +42,7 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
 
 
 def _check_experts(found: Provenance, entries: Sequence[Entry], report: Report) -> None:
-    """Check that the index has the returns and steps of the labeller that provenance has."""
+    """Check that index and provenance have the same returns and steps of the expert."""
     for entry in entries:
         for name, expected in found.entry_fields().items():
             if (value := getattr(entry, name)) != expected:
@@ -51,7 +51,7 @@ def _check_experts(found: Provenance, entries: Sequence[Entry], report: Report) 
 
 
 def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> Iterator[str]:
-    """Yield what contradicts the index and the task's seed, or itself."""
+    """Yield contradictions within a provenance, and to the index and the task's seed."""
     if None not in (seed, found.seed) and found.seed != seed:
         yield f"seed: expected the task's {seed}, found {found.seed}"
     if found.ego is not None and found.ego_hash not in (None, json_hash(found.ego)):
@@ -67,7 +67,7 @@ def _faults(found: Provenance, entries: Sequence[Entry], seed: int | None) -> It
 
 
 def _noise_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:
-    """Compare the number and the episodes of noise histories with the index; their labeller is the script."""
+    """Check the numbers of noise histories and of their episodes, and that their expert is the script."""
     labeller = found.expert and found.expert.policy_sha256
     if entries[0].source == "noise" and labeller:
         yield f"expert.policy_sha256: expected null, as the script labels noise histories, found {labeller}"
@@ -81,7 +81,7 @@ def _noise_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:
 
 
 def _learner_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]:
-    """Compare the learners' number and environments with the streams that were recorded and those of the index."""
+    """Check the numbers of learners and environments against the recorded streams and the index."""
     learners = found.learners or 1
     last = max(entries, key=lambda entry: entry.learner)
     if last.learner >= learners:
@@ -117,7 +117,7 @@ def _stream_faults(found: Provenance, entries: Sequence[Entry]) -> Iterator[str]
 
 
 def _filter_faults(after: StreamReturns, entries: Iterable[Entry]) -> Iterator[str]:
-    """Compare the mean returns of the kept streams with the index, which has all of them."""
+    """Check the mean returns of the kept streams against the index."""
     members = list(entries)
     for name in ("return_start", "return_end"):
         mean, said = np.mean([getattr(entry, name) for entry in members]), getattr(after, name)

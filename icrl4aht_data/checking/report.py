@@ -1,4 +1,4 @@
-"""The result of verifying a release."""
+"""Report of the verification of a release."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ Level = Literal["quick", "full", "deep"]
 """Depth of a verification, see `verify_release`."""
 
 NamedProgress = Callable[[str, int, int], None]
-"""Called with the name of a stage, the number of items done, and their total."""
+"""Callback that receives the name of a stage, the number of items done, and their total."""
 
-_FINDINGS = 100_000  # a report keeps at most this many
-_SHOWN = 5  # findings that a repr shows
-_LONG = 2000  # characters of a finding
+_FINDINGS = 100_000  # maximum number of findings in a report
+_SHOWN = 5  # number of findings in a repr
+_LONG = 2000  # maximum characters of a finding
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Finding:
 
 @dataclass(repr=False)
 class Report:
-    """The result of `verify_release`.
+    """Result of `verify_release`.
 
     Args:
         root: the release, folder or address.
@@ -79,15 +79,15 @@ class Report:
 
     @property
     def files_at_fault(self) -> set[str]:
-        """Files of the release with a problem."""
+        """Paths of the files with a problem."""
         return {finding.file for finding in self.findings}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the report as JSON: its fields, `ok`, and the level also as booleans `deep` and `quick`."""
+        """Return the report as a JSON object: its fields, `ok`, and booleans `deep` and `quick` for the level."""
         return {"ok": self.ok, **asdict(self), "deep": self.level == "deep", "quick": self.level == "quick"}
 
     def add(self, file: str, problem: str) -> None:
-        """Add a finding; after 100,000 of them, one that says that there are more."""
+        """Add a finding; at 100,000 findings, add a note that there are more and drop the rest."""
         if len(self.findings) < _FINDINGS:
             self.findings.append(Finding(_printable(file), _printable(problem)))
         elif len(self.findings) == _FINDINGS:
@@ -95,13 +95,13 @@ class Report:
 
 
 def _printable(text: str) -> str:
-    """Return a text of limited length, with control characters escaped: they could command a terminal."""
+    """Return a text of limited length with control characters escaped, since terminals would interpret them."""
     text = text if len(text) <= _LONG else f"{text[:_LONG]}..."
     return text if text.isprintable() else text.encode("unicode_escape").decode()
 
 
 def verdict_in_words(report: Report) -> str:
-    """Return whether a release is valid, and what was checked, in one line."""
+    """Return one line with the verdict and the amounts of what was checked."""
     number = len(report.findings)
     verdict = "valid" if report.ok else counted_noun(number, "problem")
     if report.level == "quick":

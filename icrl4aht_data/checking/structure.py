@@ -1,4 +1,4 @@
-"""Checks of a shard as an HDF5 file: whether other HDF5 readers see what `Shard` reads, and no byte is unaccounted."""
+"""Checks of a shard's HDF5 structure: libhdf5 and `Shard` read the same, and the chunk table covers every byte."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from icrl4aht_data.reading.shard import Shard
 
 
 def check_bytes_between(shard: Shard) -> list[str]:
-    """Return faults in the bytes between the chunks, and bytes that the chunk table does not list exactly once."""
+    """Return faults in the HDF5 metadata, and bytes that the chunk table does not cover exactly once."""
     ordered = np.sort(shard.table, order="offset")
     stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
     size = shard.path.stat().st_size
-    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // BETWEEN  # lines that the writer would write
+    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // BETWEEN  # the same rows as the writer makes
     if len(ordered) > most or [0, *stops] != [*starts, size]:
         return [f"the chunk table does not cover the file's {size} bytes, each once"]
     faults = []
@@ -33,12 +33,12 @@ def check_bytes_between(shard: Shard) -> list[str]:
 
 
 def has_grown(shard: Shard) -> bool:
-    """Return whether a shard is far larger than its chunk table says."""
+    """Return whether a shard is far larger than its chunk table says, for example a sparse file."""
     return shard.path.stat().st_size > 2 * int(shard.table["size"].sum(dtype=np.int64)) + 2**20
 
 
 def check_structure(shard: Shard, values: bool = False) -> list[str]:
-    """Return the differences between what another HDF5 reader sees and what `Shard` reads.
+    """Return the differences between what libhdf5 and `Shard` read.
 
     Args:
         shard: the shard.
@@ -50,7 +50,7 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
             if values and not faults:
                 faults = _value_faults(shard, file)
             return faults
-    except Exception as error:  # a damaged file makes h5py raise anything
+    except Exception as error:  # damaged files cause errors of any type in h5py
         return [f"not an HDF5 file as the index describes it: {error}"]
 
 
@@ -83,7 +83,7 @@ def _structure_faults(shard: Shard, file: h5py.File) -> list[str]:
 
 
 def _dataset_faults(shard: Shard, file: h5py.File, entry: Entry, field: Field, stacked: int) -> list[str]:
-    """Return faults in filters, chunks, shape and dtype of a dataset, whose group has `stacked` histories."""
+    """Return faults in filters, chunks, shape and dtype of a dataset in a group with `stacked` histories."""
     faults = []
     dataset = safe_hdf5.member(file, f"{entry.h5_group}/{field.name}")
     used, rows = safe_hdf5.filters(dataset), entry.rows(field)
@@ -107,7 +107,7 @@ def _value_faults(shard: Shard, file: h5py.File) -> list[str]:
             try:
                 ours = shard.read(entry.history_id, field, 0, entry.rows(field))
             except ShardCorruptError:
-                continue  # reported chunk by chunk, and nothing that libhdf5 should inflate
+                continue  # already reported, and unsafe to inflate with libhdf5
             theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
             if not np.array_equal(theirs, ours):
                 faults.append(f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do")

@@ -1,7 +1,6 @@
 """Verification of releases: hashes, checksums, counts and ranges; at level "deep" also rendering and replay.
 
-A release of observations cannot be replayed; level "deep" then checks that each observation shows the layout from some
-cell.
+A release of observations cannot be replayed: level "deep" checks only that each observation matches the layout.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _NOT_RECOMPUTED = {
     "nearest_test": "nearest test teammates, of {count} tasks: taken from meta/provenance.json, not measured again",
     "noise": "noise schedules, of {count} tasks: taken from meta/provenance.json, not compared with the actions",
 }
-"""Values that verification cannot compute -> what a report says of them."""
+"""Value that verification cannot recompute -> note in the report."""
 
 
 def verify_release(
@@ -50,7 +49,7 @@ def verify_release(
     advance: NamedProgress = lambda what, done, total: None,
     **wanted: FilterValues,
 ) -> Report:
-    """Check a release and return a report; problems of the release are reported, never raised.
+    """Verify a release and return a report; problems of the release are reported, not raised.
 
     Args:
         root: a release folder, or an address as in `load_icrl4aht`; the bundled mini release by default. Files of a
@@ -86,7 +85,7 @@ def verify_release(
         _verify(origin, report, advance, wanted)
     except (Icrl4ahtError, OSError) as error:
         if isinstance(error, (EmptySelectionError, UnknownNameError)) and any(wanted.values()):
-            raise  # the caller's mistake, not the release's
+            raise  # wrong arguments are raised, not reported
         report.add("meta", str(error))
     if origin.remote is not None:
         report.fetched_bytes = origin.remote.fetched - before
@@ -104,7 +103,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         chosen = chosen_files(origin, **wanted)
     except (EmptySelectionError, UnknownNameError):
         raise
-    except Icrl4ahtError as error:  # reported after the files, which may explain it
+    except Icrl4ahtError as error:  # reported after problems of files, which may be the cause
         unreadable = error
     if origin.remote is not None and report.level != "quick":
         _fetch(origin.remote, sorted(chosen), report, advance)
@@ -134,7 +133,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
 
 
 def _note_unchecked_values(index: Index, provenance: Mapping[str, Provenance], report: Report) -> None:
-    """Add a note for each kind of value that verification cannot recompute."""
+    """Add notes about the values that verification cannot recompute."""
     for name, note in _NOT_RECOMPUTED.items():
         if name == "oracle_actions":
             count = np.count_nonzero(index.entries.column("has_oracle_actions"))
@@ -145,7 +144,7 @@ def _note_unchecked_values(index: Index, provenance: Mapping[str, Provenance], r
 
 
 def _read_provenance(origin: ReleaseLocation, report: Report) -> dict[str, Provenance] | None:
-    """Return the content of meta/provenance.json; None, and a problem in the report, if it cannot be read."""
+    """Return the content of meta/provenance.json; if it cannot be read, report a problem and return None."""
     try:
         return read_provenance(resolve_inside(origin.folder, PROVENANCE))
     except Icrl4ahtError as error:
@@ -155,10 +154,10 @@ def _read_provenance(origin: ReleaseLocation, report: Report) -> dict[str, Prove
 
 
 def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgress) -> None:
-    """Fetch files, all at once; if one fails, one at a time, so that every damaged one is reported.
+    """Fetch files together; after a failure, fetch them one by one to report every damaged file.
 
     Raises:
-        RemoteError: if the remote cannot be reached: the others would fail as well.
+        RemoteError: if the remote cannot be reached.
     """
     with suppress(RemoteError):
         remote.fetch(names)
@@ -174,8 +173,8 @@ def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgr
 
 
 def _check_shards(index: Index, shards: list[str], report: Report, advance: NamedProgress) -> None:
-    """Check the shards and the histories in them."""
-    local = ReleaseLocation(index.root)  # no remote: files that could not be fetched are reported already
+    """Check shards and their histories."""
+    local = ReleaseLocation(index.root)  # no remote, since files that could not be fetched are already reported
     members = {name: [index.entries[row] for row in index.entries.shard_rows(name).tolist()] for name in shards}
     total = sum(map(len, members.values()))
     for name, entries in members.items():
@@ -185,7 +184,7 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Name
             report.add(name, str(error))
             continue
         faults = check_bytes_between(shard)
-        if not has_grown(shard):  # libhdf5 is not given a file that may have a hole of a terabyte
+        if not has_grown(shard):  # libhdf5 must not open a sparse file of a terabyte
             faults += check_structure(shard, values=report.level == "deep")
         for fault in faults:
             report.add(name, fault)

@@ -1,4 +1,4 @@
-"""`icrl4aht-data browse`: histories as one HTML file to look at."""
+"""Command `icrl4aht-data browse`, which writes or serves an HTML page with histories."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def browse(
     if out is None and overwrite:
         raise click.UsageError("--overwrite replaces a file: give --out FILE with it")
     if out is not None:
-        with suppress(OSError), out.open("rb") as stream:  # a page of this command is written again
+        with suppress(OSError), out.open("rb") as stream:  # a page written by this command may be replaced
             overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
         check_output(out, overwrite)
     matching = load_icrl4aht(root, **wanted_filters(filters))

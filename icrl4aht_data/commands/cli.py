@@ -1,7 +1,7 @@
-"""The program `icrl4aht-data`: its commands are imported when they run, and its errors become exit codes.
+"""Entry point of `icrl4aht-data`, which imports a command only when it runs and turns errors into exit codes.
 
-Exit codes: 0 success; 1 an error, a problem that was found, or the reader of the output has gone; 2 a misused command;
-128 + the signal for a training that a signal stopped, and that was saved.
+Exit codes: 0 success; 1 an error, a problem found, or a closed output pipe; 2 a misused command; 128 + the signal's
+number after a training that a signal stopped and that was saved.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ Completion, in bash (for zsh and fish: zsh_source, fish_source):
 
 @cache
 def all_verbs() -> dict[str, Verb]:
-    """Return every command of this and other installed packages: its words -> its row of the table.
+    """Return command name -> `Verb`, for the commands of this and other installed packages.
 
     Raises:
-        PluginError: for a table that cannot be imported, or for a command that exists already.
+        PluginError: if a package's table cannot be imported, or a command already exists.
     """
     plugins, verbs = Plugins(VERB_GROUP, ()), {verb.name: verb for verb in VERBS}
     for package in plugins.names:
@@ -110,7 +110,7 @@ class VerbGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def _verbs(self) -> dict[str, Verb]:
-        """Return the commands of this group by their last word, in the order of their headings."""
+        """Return last word -> `Verb`, for the commands of a group in the order of their headings."""
         found = {
             name.removeprefix(self._prefix): verb
             for name, verb in all_verbs().items()
@@ -137,10 +137,10 @@ def main() -> None:
 def run(command: click.Command) -> None:
     """Run a command line; errors about its input become one line and an exit code.
 
-    Output that nobody reads is no error message: where the reader of a pipe has gone (`| head`) the command stops
-    quietly with exit code 1, and output that was closed from the start (`>&-`) is dropped.
+    If the reader of a pipe exits (`| head`), the command stops quietly with exit code 1. Output to a stream that is
+    closed from the start (`>&-`) is dropped.
     """
-    for name in ("stdout", "stderr"):  # closed ones are opened on the null device, so that no file gets their number
+    for name in ("stdout", "stderr"):  # open closed streams on the null device, so that no file gets their number
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     try:
@@ -158,7 +158,7 @@ def run(command: click.Command) -> None:
             raise
         _stop(message, 1)
     except SystemExit as stop:
-        if message := getattr(stop, "message", None):  # of a training that was stopped and saved
+        if message := getattr(stop, "message", None):  # a training was stopped by a signal and saved
             click.echo(message, err=True)
         raise
 
@@ -169,7 +169,7 @@ def _stop(message: str, code: int) -> None:
 
 
 def _in_words(error: OSError) -> str:
-    """Return the message with the user's name of the file, not that of the temporary file or lock next to it."""
+    """Return the message for an OSError, with the user's file name instead of that of a temporary file or lock."""
     if error.errno is None or error.filename is None:
         return str(error)
     path = Path(os.fsdecode(error.filename))

@@ -1,12 +1,11 @@
-"""Command-line options made from classes of options, see `icrl4aht_data.utils.options`.
+"""Command-line options generated from option classes, see `icrl4aht_data.utils.options`.
 
     @click.command(cls=TopicCommand)
     @dataclass_options(TrainOptions, "train", default_text={"steps": "the size's"})
     def run(train: dict[str, Any]) -> None:
         options = replace_options(TrainOptions(), train)
 
-Only values that were given on the command line are passed on, so that a command may start from other values than the
-defaults (a profile, a size) without repeating any of them.
+Only values from the command line are passed on, so a command may use other defaults than the class.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 class TopicCommand(click.Command):
-    """Command whose help lists options under the headings that `topic` gave them, and the others under "Options"."""
+    """Command whose help lists options under headings set by `topic`, and other options under "Options"."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         topics: dict[str, list[tuple[str, str]]] = {}
@@ -39,7 +38,7 @@ class TopicCommand(click.Command):
 
 
 def topic(heading: str, *options: Callable[[Any], Any]) -> Callable[[Command], Command]:
-    """Return a decorator that adds options, which the help of a `TopicCommand` lists under a heading."""
+    """Return a decorator that adds options under a heading in the help of a `TopicCommand`."""
 
     def decorate(command: Command) -> Command:
         decorated: Any = command
@@ -54,7 +53,7 @@ def topic(heading: str, *options: Callable[[Any], Any]) -> Callable[[Command], C
 
 
 class OptionValue(click.ParamType):
-    """Value of an option, with the type and bounds of an annotation.
+    """Type of an option whose values have the type and bounds of an annotation.
 
     Args:
         hint: the annotation, such as `Annotated[int, Meta(ge=1)]`.
@@ -81,15 +80,15 @@ class _Field(NamedTuple):
 def dataclass_options(
     kind: type, argument: str, *, exclude: Collection[str] = (), default_text: Mapping[str, str] | None = None
 ) -> Callable[[Command], Command]:
-    """Return a decorator that adds an option for every option field of a dataclass, also of dataclasses in its fields.
+    """Return a decorator that adds an option for every option field of a dataclass and its nested dataclasses.
 
     Args:
         kind: the dataclass. Bool fields become flags, with a `--no-` form if their default is True; tuples become
             options that may be repeated.
         argument: name of the command's argument that receives a dict, field -> value, of the options given by the user,
-            nested as the dataclasses are, see `icrl4aht_data.utils.options.replace_options`.
+            nested like the dataclasses, see `icrl4aht_data.utils.options.replace_options`.
         exclude: names of fields without an option in this command.
-        default_text: field name -> text shown as its default, where the command starts from other values.
+        default_text: field name -> text shown as its default, if the command uses another default.
     """
     chosen = [field for field in _all_fields(kind) if field.path[-1] not in exclude]
     texts = default_text or {}
@@ -113,7 +112,7 @@ def dataclass_options(
 
 
 def _all_fields(kind: type, path: tuple[str, ...] = ()) -> Iterator[_Field]:
-    """Yield the option fields of a dataclass, then those of the dataclasses that are its fields' default factories."""
+    """Yield the option fields of a dataclass, then those of nested dataclasses."""
     hints = option_hints(kind)
     for field in dataclasses.fields(kind):
         if field.name in hints:

@@ -1,4 +1,4 @@
-"""`doctor`: installed versions, devices, folders and settings, and the next step for each problem."""
+"""Diagnosis of an installation: versions, devices, folders and settings, with advice for each problem."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ from icrl4aht_data.utils.system import (
 )
 
 _LEAST_FREE = 2**30
-"""Bytes; a disk with less free space is nearly full."""
+"""Free bytes below which a disk is reported as nearly full."""
 
 _HUB_VARIABLES = ("HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE", "HF_HOME", "XDG_CACHE_HOME")
-"""Environment variables by which the Hub's client chooses its cache."""
+"""Environment variables that set the cache of the Hub's client."""
 
 _JAX_CODE = "import json, jax; print(json.dumps([jax.default_backend(), [d.device_kind for d in jax.local_devices()]]))"
 _JAX_TIMEOUT = 120  # seconds
 
 
 class Problem(NamedTuple):
-    """A problem of the installation.
+    """Problem of an installation.
 
     Attributes:
         problem: description of the problem.
@@ -66,10 +66,10 @@ class Problem(NamedTuple):
 
 
 def diagnose() -> dict[str, Any]:
-    """Examine this installation, without using the network and without leaving anything on disk.
+    """Examine this installation without network access and without leaving files.
 
     Returns:
-        A JSON object: "ok", then for each section a mapping of what was found (sizes in bytes), then "problems".
+        A JSON object: "ok", then a mapping of findings per section (sizes in bytes), then "problems".
     """
     problems: list[Problem] = []
     checks = {
@@ -85,7 +85,7 @@ def diagnose() -> dict[str, Any]:
 
 
 def in_words(found: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a report on the result of `diagnose`, for people."""
+    """Yield the lines of a readable report from the result of `diagnose`."""
     for section in (name for name, facts in found.items() if isinstance(facts, dict)):
         yield section.capitalize()
         longest = max(map(len, found[section]), default=0)
@@ -144,7 +144,7 @@ def _installed(name: str) -> str | None:
 
 
 def _plugins(problems: list[Problem]) -> dict[str, Any]:
-    """Return what other packages register, by group of entry points; teammates and methods are not imported."""
+    """Return the objects that other packages register, by entry-point group; teammates and methods are not imported."""
     facts: dict[str, Any] = {}
     for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, Plugins(METHOD_GROUP, ())):
         try:
@@ -172,8 +172,9 @@ def _devices(problems: list[Problem]) -> dict[str, Any]:
 
 
 def _query_jax() -> str:
-    """Return JAX's backend and devices as JSON, from a separate process: a broken JAX cannot crash this one, and no GPU
-    memory stays allocated."""
+    """Return JAX's backend and devices as JSON.
+
+    Runs in a separate process, so that a broken JAX cannot crash this one and no GPU memory stays allocated."""
     environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     command = [sys.executable, "-P", "-c", _JAX_CODE]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=_JAX_TIMEOUT, check=True)
@@ -198,7 +199,7 @@ def _folders(problems: list[Problem]) -> dict[str, Any]:
 
 
 def _folder(name: str, path: Path, variables: tuple[str, ...], problems: list[Problem]) -> dict[str, Any]:
-    """Return a folder's path, setting, free space and whether it can be written, also if it does not exist yet."""
+    """Return a folder's path, setting, free space and whether it is writable; the folder may not exist yet."""
     free, writable = None, False
     try:
         existing = next(folder for folder in (path, *path.parents) if folder.exists())
@@ -217,10 +218,10 @@ def _folder(name: str, path: Path, variables: tuple[str, ...], problems: list[Pr
 
 
 def _disk_usage(paths: Iterable[Path]) -> int:
-    """Return the bytes that files occupy on disk."""
+    """Return the disk usage of files in bytes."""
     total = 0
     for path in paths:
-        with suppress(OSError):  # removed in the meantime
+        with suppress(OSError):  # just removed by another process
             status = path.lstat()
             total += getattr(status, "st_blocks", 0) * 512 or status.st_size
     return total
@@ -243,7 +244,7 @@ def _bundled(problems: list[Problem]) -> dict[str, Any]:
     report = verify_release(MINI, level="quick")
     problems += [Problem(f"the bundled release, {f.file}: {f.problem}", RESTORE) for f in report.findings]
     facts: dict[str, Any] = {"ok": report.ok}
-    with suppress(Icrl4ahtError):  # what cannot be read is among the findings
+    with suppress(Icrl4ahtError):  # unreadable files are already reported
         info = read_info(MINI)
         names = ("data_version", "format_version", "kind", "histories")
         facts |= {name: getattr(info, name) for name in names}

@@ -1,4 +1,4 @@
-"""Types of arguments, options and progress bars that the commands share."""
+"""Shared types of arguments and options, and shared options, of the commands."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout
 
 
 class Names(click.ParamType):
-    """Choice of one name; the valid names are computed when needed, and errors suggest the nearest one.
+    """Type of a name from a set that is computed when needed; errors suggest the nearest name.
 
     Args:
         name: singular noun for the names, such as "layout".
         valid: returns the valid names.
-        offered: returns those that completion offers; all by default.
+        offered: returns the names that completion offers; all by default.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ TRACK, SPLIT, FAMILY = (
 
 
 class Root(click.ParamType):
-    """Release: a folder, converted to a path, or an address, kept as text.
+    """Type of a release: a folder, converted to a path, or an address, kept as text.
 
     Args:
         remote: accept addresses only.
@@ -76,10 +76,10 @@ class Root(click.ParamType):
 
 
 class Folder(click.Path):
-    """Folder, which need not exist; an empty text, as from an unset shell variable, is an error.
+    """Type of a folder, which need not exist; an empty text, as from an unset shell variable, is an error.
 
     Args:
-        made_by: the command that makes such folders, if the folder has to exist.
+        made_by: the command that makes such folders; if given, the folder has to exist.
     """
 
     def __init__(self, made_by: str | None = None) -> None:
@@ -96,10 +96,10 @@ class Folder(click.Path):
 
 
 class NewFile(click.Path):
-    """File to write, in an existing folder.
+    """Type of a file to write in an existing folder.
 
     Args:
-        suffixes: accepted ends of its name; any by default.
+        suffixes: accepted suffixes of the file name; any by default.
     """
 
     def __init__(self, *suffixes: str) -> None:
@@ -161,10 +161,10 @@ def wanted_filters(filters: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
 
 
 def is_terminal() -> bool:
-    """Whether a person reads the output: on a terminal, not in a file or a pipe."""
+    """Return whether the output is a terminal, not a file or a pipe."""
     return sys.stdout is not None and sys.stdout.isatty()
 
 
 def examples(*lines: str) -> str:
-    """Return a help epilog that shows command lines."""
+    """Return a help epilog with example command lines."""
     return "\n".join(["\b", f"Example{'s' * (len(lines) > 1)}:", *(f"  {line}" for line in lines)])

@@ -147,7 +147,7 @@ def show(
     console = Console(markup=False, highlight=False)
     if history_id is None:
         console.print(facts.pop("summary"), "", layout_table(dataset), "", sep="\n")
-        del facts["layouts"]  # the table has them
+        del facts["layouts"]  # already in the table
     else:
         console.print(repr(dataset[0]), "", sep="\n")
     console.print(facts_table(facts))
@@ -303,7 +303,7 @@ def convert(
     """
     with progress_bars(quiet) as show:
         advance = partial(show, "histories")
-        advance(0, None)  # the total is not known yet
+        advance(0, None)  # the total is unknown before the first history
         if isinstance(root, Path) and (root / HISTORIES_H5).exists():
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
                 raise click.UsageError("published files convert to full, lite or observations, without filters")

@@ -1,4 +1,4 @@
-"""Facts that `list` and `show` print: of the tasks of a selection, and of a selection."""
+"""Summaries of selections and their tasks, which `list` and `show` print."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icrl4aht_data.format.schema import FIELDS, Entry
 from icrl4aht_data.reading.history import LABELS
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
-_IDS_SHOWN = 11  # characters of a task's ids of histories, which the table has room for
+_IDS_SHOWN = 11  # maximum characters of a task's history ids in the table
 
 
 def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
@@ -47,10 +47,10 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 
 def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
-    """Return a table of what `summarize_tasks` returned, two lines a task and a last one with totals.
+    """Return a table of the result of `summarize_tasks`, with two lines per task and a last one with totals.
 
-    Names of teammates fold, so that it fits 80 columns. The column `task` has the end of the id, by which lines of
-    `list | cat`, which have the complete one, can be found, and the ids of histories where they are short.
+    Fits 80 columns: names of teammates wrap, and the column `task` has only the end of the id, and the ids of histories
+    if they are short. `list | cat` prints the complete ids.
     """
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), show_footer=True, row_styles=("", "dim"))
     steps, histories = (sum(task[name] for task in tasks) for name in ("transitions", "histories"))
@@ -86,7 +86,7 @@ def id_ranges(ids: Sequence[int]) -> str:
 
 
 def layout_table(dataset: Dataset) -> Table:
-    """Return a table of a selection, one row a layout and a last one with totals, that fits 80 columns."""
+    """Return a table of a selection that fits 80 columns, with one row per layout and a last one with totals."""
     table = Table(box=None, pad_edge=False, show_footer=True)
     columns = [dataset.column(name) for name in ("return_start", "return_end", "T", "episodes")]
     numbers, tasks = dataset.layout_numbers, dataset.column_codes("task_id")
@@ -107,7 +107,7 @@ def layout_table(dataset: Dataset) -> Table:
 
 
 def facts_table(facts: Mapping[str, Any]) -> Table:
-    """Return a table of names and values, whose values fold; a mapping that contains others has a row for each key."""
+    """Return a table of names and wrapped values; a mapping with nested mappings has one row per key."""
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
@@ -118,7 +118,7 @@ def facts_table(facts: Mapping[str, Any]) -> Table:
 
 
 def _rows(name: str, value: Any, indent: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the rows of a value of JSON; those of keys below it are indented."""
+    """Yield table rows for a JSON value; rows of nested keys are indented."""
     label = indent + name.replace("_", " ")
     if isinstance(value, dict) and (indent or any(isinstance(one, dict | list) for one in value.values())):
         yield label, ""
@@ -129,7 +129,7 @@ def _rows(name: str, value: Any, indent: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _in_words(value: Any) -> str:
-    """A value of JSON as text: lists and mappings with commas, a line for each list in a list."""
+    """Return a JSON value as text: lists and mappings with commas, and one line per nested list."""
     if isinstance(value, dict):
         return ", ".join(f"{name} {_in_words(one)}" for name, one in value.items())
     if isinstance(value, list):
@@ -140,13 +140,13 @@ def _in_words(value: Any) -> str:
 
 
 def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
-    """Return rows as lines of tab-separated values, of which those that are neither text nor number are JSON."""
+    """Return rows as lines of tab-separated values; values other than texts and numbers are printed as JSON."""
     texts = (["" if one is None else one if isinstance(one, str) else json.dumps(one) for one in row] for row in rows)
     return "\n".join("\t".join(row) for row in texts)
 
 
 def describe_selection(dataset: Dataset) -> str:
-    """Return a paragraph about a selection: what it has, how much of it, and how the returns rise."""
+    """Return a paragraph on a selection: content, counts, and the rise of returns."""
     info, (start, end) = dataset.info, (dataset.column(name).mean() for name in ("return_start", "return_end"))
     sizes = ", ".join(
         (
@@ -170,7 +170,7 @@ def describe_selection(dataset: Dataset) -> str:
 
 
 def summarize_selection(dataset: Dataset) -> dict[str, Any]:
-    """Return the facts of a selection, as JSON: where it is, kind, versions, and counts of what it has."""
+    """Return a JSON object with the location, kind, versions and counts of a selection."""
     info, remote, missing = dataset.info, dataset.origin.remote, _missing(dataset)
     content = describe(
         info.kind, info.data_version, info.environment.kept_steps, dataset.entries, info.format_version
@@ -190,7 +190,7 @@ def summarize_selection(dataset: Dataset) -> dict[str, Any]:
 
 
 def _missing(dataset: Dataset) -> list[str]:
-    """Return the parts of a full or lite release that this one does not have, in words."""
+    """Return descriptions of the data that a selection lacks, compared with a full or lite release."""
     without = len(dataset) - int(dataset.column("has_teammate_actions").sum())
     missing = {
         "state records: nothing can be replayed or drawn, obs='state' is refused": not dataset.has_states,

@@ -1,6 +1,6 @@
-"""The commands of `icrl4aht-data` as a table, from which `--help` lists them without importing any.
+"""Table of the commands of `icrl4aht-data`, from which `--help` lists them without importing them.
 
-Another package adds commands by an entry point that names such a table, in a module that imports little:
+Another package adds commands by an entry point to its own table, in a module that imports little:
 
     [project.entry-points."icrl4aht_data.commands"]
     my_package = "my_package.verbs:VERBS"
@@ -11,15 +11,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 VERB_GROUP = "icrl4aht_data.commands"
-"""Group of entry points by which packages add commands."""
+"""Entry-point group of tables of commands."""
 
 
 class Verb(NamedTuple):
-    """One command of the program.
+    """Command or group of commands of the program.
 
     Attributes:
-        name: words that run it, such as "list" or "release build".
-        target: the click command, as "module:attribute"; empty for a group, whose commands have its name as first word.
+        name: words that run the command, such as "list" or "release build".
+        target: the click command, as "module:attribute"; empty for a group, whose commands start with its name.
         section: heading in the list of commands.
         help: one sentence.
     """

@@ -1,1 +1,1 @@
-"""Preparing a release for publication and uploading it to the Hugging Face Hub."""
+"""Preparation of releases for publication, and upload to the Hugging Face Hub."""

@@ -48,7 +48,7 @@ from icrl4aht_data.writing.release_folder import as_path, atomic_folder, check_t
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
 _POLICY = "policy.json"
 _LIBRARIES = {"matplotlib": "plot", "PIL": "plot", "pyarrow": "hf", "mlcroissant": "hf"}
-"""Modules that building needs, and the extras that install them."""
+"""Module required for building -> extra that installs it."""
 
 
 def build_release(
@@ -60,16 +60,16 @@ def build_release(
     published: datetime.date | None = None,
     advance: NamedProgress = lambda what, done, total: None,
 ) -> Path:
-    """Write a release folder with the data of another, and the files that a published release has in addition.
+    """Copy a release and add the files of a published release.
 
     Args:
         source: a release folder; the bundled mini release by default.
         target: the folder to write, which appears when it is complete.
-        link: hard-link the files of `source` instead of copying them, which saves space; changing a file then
-            changes its copy too.
+        link: hard-link the files of `source` instead of copying them, which saves space; later changes of a file then
+            affect both releases.
         overwrite: replace a release at `target`.
-        published: the date for Croissant; today by default.
-        advance: progress of verifying, of copying, and of writing the histories' episodes.
+        published: date of publication for Croissant; today by default.
+        advance: called with the name of a stage, the number of items done, and their total.
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`, or a library is not installed.
@@ -113,7 +113,7 @@ def check_valid(root: Path, advance: NamedProgress = lambda what, done, total: N
         ReleaseError: if there is any problem; names the first ones.
     """
     if not (root / MANIFEST).exists():
-        read_info(root)  # raises an error that suggests other folders, if there is no release
+        read_info(root)  # raises a helpful error if the folder is not a release
     report = verify_release(root, advance=advance)
     if not report.ok:
         first = "; ".join(f"{finding.file}: {finding.problem}" for finding in report.findings[:3])
@@ -156,7 +156,7 @@ def teammate_card(folder: Path) -> str:
 
 
 def _is_made_here(name: str) -> bool:
-    """Return whether building writes a file, so that the source's version is not copied."""
+    """Return whether building writes this file, so that the source's version is not copied."""
     folders = ("figures/", f"{PARQUET_INDEX}/", f"{PARQUET_EPISODES}/")
     is_card = name == RELEASE_CARD or name.endswith(f"/{RELEASE_CARD}")
     return is_card or name in (CARD_TABLES, CROISSANT, *_COPIED_TEXTS) or name.startswith(folders)
@@ -164,14 +164,14 @@ def _is_made_here(name: str) -> bool:
 
 def _copy(source: Path, target: Path, link: bool) -> None:
     if link:
-        with suppress(OSError):  # another file system, or one without hard links
+        with suppress(OSError):  # hard links do not work across file systems, nor on all of them
             os.link(source, target)
             return
     shutil.copyfile(source, target)
 
 
 def _keep_source_card(source: Path, root: Path) -> None:
-    """Keep a card that does not come from the template, which starts with YAML, unless one is kept already."""
+    """Store the source's card as `SOURCE_CARD`, unless it is generated (starts with YAML) or one is already stored."""
     text = read_text(source / RELEASE_CARD) if (source / RELEASE_CARD).is_file() else ""
     if text and not text.startswith("---\n") and not (root / SOURCE_CARD).exists():
         (root / SOURCE_CARD).write_text(text, encoding="utf-8")

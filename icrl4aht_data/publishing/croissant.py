@@ -1,8 +1,8 @@
-"""A release's description in Croissant 1.1, the vocabulary by which dataset search engines and loaders know data.
+"""Description of a release in Croissant 1.1, the metadata format of dataset search engines and loaders.
 
-Every file is a FileObject with its SHA-256, its address relative to the description; the Parquet copies of the index
-and of the episodes are RecordSets with every field described. Croissant does not read HDF5: the shards' arrays are
-described in the text.
+Every file is a FileObject with its SHA-256 and an address relative to croissant.json. The Parquet copies of the index
+and of the episodes are RecordSets with a description of every field. Croissant does not support HDF5, so the
+description text lists the shards' arrays.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _TERMS_OF_1_1 = {
     "description": {"@container": "@language"},
     "name": {"@container": "@language"},
 }
-"""Terms of the standard's JSON-LD context that mlcroissant's default context, which is 1.0's, does not have."""
+"""JSON-LD terms of Croissant 1.1 that mlcroissant's default context (1.0) lacks."""
 
 
 def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
 
     Args:
         root: a release folder with the Parquet copies of its index and, if it has state records, of its episodes.
-        digests: path below `root` -> SHA-256, of the files to describe.
+        digests: path relative to `root` -> SHA-256, for the files to describe.
         published: the date of publication.
 
     Raises:
@@ -113,7 +113,7 @@ def _files(context: mlcroissant.Context, root: Path, digests: Mapping[str, str])
 def _tables(
     context: mlcroissant.Context, info: ReleaseInfo
 ) -> Iterator[tuple[mlcroissant.FileSet, mlcroissant.RecordSet]]:
-    """Yield the Parquet files of the index, and of the episodes if there are any, with the records that they hold."""
+    """Yield file and record sets of the Parquet index and, if there are any, of the Parquet episodes."""
     texts = card_texts("index")
     columns = [(name, texts[name], _TYPES[hint], "3" if hint == _SHAPE else None) for name, hint in ENTRY_HINTS.items()]
     said = "One record per learning history: what it is, and where its arrays are stored."
@@ -137,7 +137,7 @@ def _table(
     key: Sequence[str],
     columns: Iterable[tuple[str, str, str, str | None]],
 ) -> tuple[mlcroissant.FileSet, mlcroissant.RecordSet]:
-    """Return the files of a folder, and the record set that they are.
+    """Return the file set and the record set of a folder of Parquet files.
 
     Args:
         context: the context of all objects.

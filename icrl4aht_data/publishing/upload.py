@@ -1,4 +1,4 @@
-"""Upload of a release folder to a dataset repository of the Hugging Face Hub, compared afterwards and tagged."""
+"""Upload of a release to a dataset repository of the Hugging Face Hub, with a comparison and a tag."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _KEPT = "files sent so far are kept: run the same command to resume"
 
 @dataclass(frozen=True)
 class Upload:
-    """The result, or the plan, of `upload_release`.
+    """Result of `upload_release`, or its plan in a dry run.
 
     Args:
         repo: ORG/REPO.
         tag: the data version's tag.
         url: address of the repository's page.
-        files: path -> bytes, of the complete release.
+        files: path -> size in bytes, for all files of the release.
         done: "already there" if the tag has this content; otherwise "uploaded", or "nothing" in a dry run.
         creates: whether the repository is new.
         private: whether a private repository was requested.
@@ -56,7 +56,7 @@ class Upload:
         return asdict(self) | {"bytes": sum(self.files.values())}
 
     def in_words(self) -> list[str]:
-        """Return lines for people: in a dry run every file, otherwise a summary."""
+        """Return printable lines: all files in a dry run, else a summary."""
         total = f"{len(self.files)} files, {sum(self.files.values()):,} bytes"
         if self.done != "nothing":
             return [f"{self.url}: {self.done}, {total}; tag {self.tag} is commit {self.commit}"]
@@ -75,17 +75,17 @@ def upload_release(
     show: bool = False,
     advance: NamedProgress = lambda what, done, total: None,
 ) -> Upload:
-    """Upload a release, compare the repository's content with its manifest, and tag that commit.
+    """Upload a release, compare the repository with the manifest, and tag the commit.
 
-    Files that are in the repository already are not sent again, so that the same call resumes an interrupted upload.
+    Files that are already in the repository are not sent again, so repeating the call resumes an interrupted upload.
 
     Args:
         folder: the release; it is verified first.
         address: hf://datasets/ORG/REPO; a missing repository is created.
         private: make a new repository private, and accept an existing one only if it is private.
-        dry_run: change nothing.
+        dry_run: only make the plan.
         show: show the client's progress bars.
-        advance: progress of verifying.
+        advance: called while verifying, with the name of a stage, the number of items done, and their total.
 
     Raises:
         ReleaseError: if the release is not valid.
@@ -113,7 +113,7 @@ def upload_release(
 
 
 def _plan(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str], private: bool) -> Upload:
-    """Return the plan with what the repository has; changes nothing."""
+    """Complete the plan with the repository's state, without changing the repository."""
     from huggingface_hub.errors import RepositoryNotFoundError
 
     try:
@@ -144,7 +144,7 @@ def _plan(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str], pri
 
 
 def _send(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str]) -> Upload:
-    """Send the files of a plan, compare what the repository then has, and tag it."""
+    """Upload the files of a plan, compare the repository with the release, and tag the commit."""
     repo = plan.repo
     if plan.creates:
         api.create_repo(repo, repo_type="dataset", private=plan.private, exist_ok=True)
@@ -162,7 +162,7 @@ def _send(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str]) -> 
 
 
 def _tree(api: HfApi, repo: str, revision: str) -> dict[str, RepoFile]:
-    """Return path -> the Hub's size and hashes of the file."""
+    """Return path -> size and hashes of the file on the Hub."""
     from huggingface_hub.hf_api import RepoFile
 
     listed = api.list_repo_tree(repo, recursive=True, revision=revision, repo_type="dataset")
@@ -206,7 +206,7 @@ def _progress_bars(show: bool) -> Iterator[None]:
 
 @contextmanager
 def _wrap_hub_errors(plan: Upload, api: HfApi, remedy: str) -> Iterator[None]:
-    """Raise errors of the Hub's client as `UploadError`, which names the repository, the cause and a remedy."""
+    """Raise errors of the Hub's client as `UploadError` with the repository, the cause and a remedy."""
     from huggingface_hub.errors import HTTPError, LocalTokenNotFoundError  # pyright: ignore[reportPrivateImportUsage]
 
     try:

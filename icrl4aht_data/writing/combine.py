@@ -114,9 +114,7 @@ def _source_card(datasets: Sequence[Dataset]) -> str:
     """Return a card that lists the releases with the hashes of their manifests, followed by their cards."""
     parts, cards = [], []
     for dataset in datasets:
-        listed = read_manifest(
-            dataset.root
-        )  # read before hashing, since it refuses a manifest that is a pipe or too large
+        listed = read_manifest(dataset.root)  # before hashing: refuses a manifest that is a pipe or too large
         parts.append(
             f"* {dataset.root.name}: data version {dataset.info.data_version}, {len(dataset):,} histories, "
             f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}\n"

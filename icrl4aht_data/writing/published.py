@@ -364,9 +364,7 @@ class _PublishedHistory:
             PublishedFormatError: if the array is invalid; with its name, the expected and the found values.
         """
         layout, steps = get_layout(self.line["layout"]), self.line["T"]
-        if (
-            name == "obs" and self.short and self.kind != OBSERVATIONS
-        ):  # for releases with states, missing rows are rendered
+        if name == "obs" and self.short and self.kind != OBSERVATIONS:  # rendered, since states show the missing rows
             return fast_observe(layout, self.read("state"), np.empty((steps, *layout.obs_shape), np.uint8))
         array = self._read_recorded(name)
         if name == "obs" and self.short:

@@ -58,18 +58,14 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             with process_lock(lock_path(target), wait=False):
-                if (
-                    old.exists() and not target.exists()
-                ):  # an earlier process was killed between the two renames in `_replace`
+                if old.exists() and not target.exists():  # a process was killed in `_replace`
                     old.rename(target)
                     check_target(target, overwrite, sources)
                 for leftover in (new, old):
                     shutil.rmtree(leftover, ignore_errors=True)
                 try:
                     new.mkdir()
-                    with explain_full_disk(
-                        target
-                    ):  # outermost, to measure the free space before the temporary folder is removed
+                    with explain_full_disk(target):  # measures free space before `new` is removed
                         yield new
                     check_target(target, overwrite, sources)
                     _replace(target, new, old)
