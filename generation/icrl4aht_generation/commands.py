@@ -139,7 +139,7 @@ def generate(
 
 
 def _profile_with_threads(name: str, threads: int | None) -> Profile:
-    """A profile by name, with XLA limited to its threads or to the given number."""
+    """Return a profile by name, with XLA limited to its threads or to the given number."""
     from icrl4aht_generation.learners.resume import limit_xla_threads
     from icrl4aht_generation.profiles import load_profile
 

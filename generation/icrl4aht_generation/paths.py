@@ -127,7 +127,7 @@ class Paths:
         return (self.manhattan[:, list(self.layout.pots)] == 1).any(axis=1)
 
     def static(self, kind: int) -> np.ndarray:
-        """bool (cells,): cells of a kind."""
+        """Return the mask of cells of a kind, bool (cells,)."""
         return self.layout.kinds == kind
 
 
@@ -205,7 +205,7 @@ class Scene:
         """The move action of the own facing."""
         return jnp.asarray(_ACTION_OF_FACING)[self.state.facings[self.slot].astype(jnp.int32)]
 
-    # What the agents hold.
+    # Items in the agents' hands
 
     @cached_property
     def hand(self) -> UInt8[Array, ""]:
@@ -233,10 +233,10 @@ class Scene:
         """The item byte in the partner's hand."""
         return self.state.hands[1 - self.slot]
 
-    # Masks over cells.
+    # Masks over cells
 
     def _at(self, cells: tuple[int, ...], values: Array) -> Bool[Array, " cells"]:
-        """A mask with one value for each of some cells, False elsewhere."""
+        """Return a mask with one value for each of some cells, False elsewhere."""
         # A gather by a constant table, since a scatter by traced values is slow under vmap.
         number = np.zeros(self.paths.layout.cells, np.int32)
         number[list(cells)] = range(len(cells))
@@ -251,7 +251,7 @@ class Scene:
 
     @cached_property
     def nonfull(self) -> Bool[Array, " cells"]:
-        """Pots that take another ingredient."""
+        """Mask of pots that take another ingredient."""
         return self._at(self.paths.layout.pots, self._raw_and_idle)
 
     @cached_property
@@ -273,7 +273,7 @@ class Scene:
 
     @cached_property
     def staged(self) -> Bool[Array, " cells"]:
-        """Counters with an ingredient."""
+        """Mask of counters with an ingredient."""
         return self._at(self.paths.layout.counters, is_ingredient(self.state.counters))
 
     @cached_property
@@ -294,13 +294,13 @@ class Scene:
         return jnp.maximum(self.counts(self.state.recipe) - self.counts(self.state.pot_items).sum(axis=0), 0)
 
     def counts(self, item: UInt8[Array, "*B"]) -> Int[Array, "*B types"]:
-        """Pieces of each piled ingredient in an item, by ascending id."""
+        """Return the number of pieces of each piled ingredient in an item, by ascending id."""
         # Two bits for each ingredient, above the bits of plate and cooked.
         shift = 2 + 2 * jnp.arange(len(self.paths.layout.ingredients), dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)
 
     def piles_of(self, wanted: Bool[Array, " types"]) -> Bool[Array, " cells"]:
-        """The piles of the wanted ingredient types."""
+        """Return the piles of the wanted ingredient types."""
         layout = self.paths.layout
         mask = jnp.zeros(layout.cells, bool)
         for k, ingredient in enumerate(layout.ingredients):
@@ -331,22 +331,22 @@ class Scene:
     def indicators(self) -> Bool[Array, " cells"]:
         return jnp.asarray(self.paths.static(INDICATOR))
 
-    # Distances and moves.
+    # Distances and moves
 
     @cached_property
     def _target_distance(self) -> Int[Array, " cells"]:
         return jnp.asarray(self.paths.target_distance)[self.me]
 
     def reach(self, mask: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
-        """The cells of the mask that are adjacent to a cell that can be walked to."""
+        """Return the cells of the mask that are adjacent to a cell that can be walked to."""
         return mask & (self._target_distance < UNREACHABLE)
 
     def nearest_distance(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
-        """Distance to the nearest access cell of the mask; UNREACHABLE if there is none."""
+        """Return the distance to the nearest access cell of the mask; UNREACHABLE if there is none."""
         return jnp.min(jnp.where(mask, self._target_distance, UNREACHABLE))
 
     def closest(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
-        """The nearest cell of the mask, the first in reading order among equals. Undefined if none is reachable."""
+        """Return the nearest cell of the mask, ties in reading order. Undefined if none is reachable."""
         return jnp.argmin(jnp.where(mask, self._target_distance, UNREACHABLE))
 
     def _turn_or(self, target: Int[Array, ""], when_facing: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
@@ -357,7 +357,7 @@ class Scene:
         return adjacent, jnp.where(self.facing_action == direction, when_facing, direction)
 
     def first(self, rules: Sequence[Rule]) -> Chosen:
-        """The first rule that applies, with the nearest of its targets."""
+        """Return the first rule that applies, with the nearest of its targets."""
         # All rules are evaluated and one is selected: under vmap a branch would run both sides anyway.
         targets = jnp.stack([rule.targets for rule in rules])
         possible = jnp.stack([rule.when for rule in rules]) & jnp.any(self.reach(targets), axis=-1)
@@ -368,7 +368,7 @@ class Scene:
     def approach(
         self, target: Int[Array, ""], extra: np.ndarray | None = None
     ) -> tuple[Int[Array, ""], Int[Array, ""] | Float[Array, ""]]:
-        """The step towards the target's nearest access cell, and that cell's cost: its distance, plus 100 if the
+        """Return the step towards the target's nearest access cell, and that cell's cost: its distance, plus 100 if the
         partner is on it, plus `extra` (cells,)."""
         access = jnp.asarray(self.paths.access)[target]
         # 100 is more than any path: an occupied access cell is chosen only if there is no other.
@@ -404,7 +404,7 @@ class Scene:
         return (self.ways != self.me) & (self.ways != self.partner)
 
     def sidestep(self, otherwise: Int[Array, ""] | int) -> Int[Array, ""]:
-        """The first free move in search order."""
+        """Return the first free move in search order."""
         return self.best_way(self.free, jnp.zeros(4), otherwise)
 
     def best_way(
@@ -413,12 +413,12 @@ class Scene:
         score: Int[Array, " 4"] | Float[Array, " 4"],
         otherwise: Int[Array, ""] | int = STAY,
     ) -> Int[Array, ""]:
-        """The allowed one of the `ways` with the highest score, the first in search order among equals."""
+        """Return the allowed way with the highest score, ties in search order."""
         best = jnp.argmax(jnp.where(allowed, score, -jnp.inf))
         return jnp.where(jnp.any(allowed), jnp.asarray(_SEARCH_ORDER)[best], otherwise)
 
     def wander(self, stay_score: int = 50) -> Int[Array, ""]:
-        """A step onto a free neighbour, in search order; else stay, or (150) walk into the partner."""
+        """Return a step onto a free neighbour, in search order; else stay, or (150) walk into the partner."""
         target = jnp.asarray(self.paths.layout.moves).astype(jnp.int32)[self.me]
         # Costs as published; `stay_score` between them decides whether it is better to stay than to push.
         scores = [jnp.where(target[a] == self.me, 1000, 100 * (target[a] == self.partner)) for a in _SEARCH_ORDER]
@@ -426,6 +426,6 @@ class Scene:
         return jnp.asarray((*_SEARCH_ORDER, STAY))[best]
 
     def destination(self, action: Int[Array, ""]) -> Int[Array, ""]:
-        """The cell that a move action points at, walls ignored; the own cell for other actions."""
+        """Return the cell that a move action points at, walls ignored; the own cell for other actions."""
         ahead = jnp.asarray(self.paths.neighbours)[self.me, jnp.minimum(action, 3)]
         return jnp.where(action < 4, ahead, self.me)

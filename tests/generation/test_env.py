@@ -62,7 +62,7 @@ def some_keys(number: int) -> jax.Array:
 
 
 def at_goal(state: EnvState) -> EnvState:
-    """Environments of cramped_up changed: the teammate is at the goal with the dish of the current recipe."""
+    """Return environments of cramped_up changed: the teammate is at the goal with the dish of the current recipe."""
     where, recipes = columns(CRAMPED), fields(CRAMPED, state.record).recipe
     records = np.repeat(state_record(CRAMPED, (1, 1, "up"), (3, 2, "down")), len(recipes), axis=0)
     records[:, where.recipe] = recipes
@@ -79,7 +79,7 @@ class Life(NamedTuple):
 
 
 def live(compiled: Compiled, keys: jax.Array, actions: np.ndarray) -> Life:
-    """Steps from the first episode into the third; in the second step of each, every teammate delivers."""
+    """Return steps from the first episode into the third; in the second step of each, every teammate delivers."""
     state, before, steps = compiled.init(keys), [], []
     actions = actions.copy()
     for number in range(len(actions)):
@@ -171,7 +171,7 @@ def test_final_is_the_rules_outcome_and_is_never_reset(life):
 
 
 def test_only_finished_environments_restart(cramped, life):
-    """Environments with unlike clocks in one batch."""
+    """Environments with different clocks in one batch restart separately."""
     clocks = np.arange(N) % MAX_STEPS
     state = life.steps[2].state._replace(clock=jnp.asarray(clocks, jnp.int32))
     step = cramped.step(state, jnp.asarray(life.actions[3]))
@@ -199,7 +199,7 @@ def assert_equal_lives(found: Sequence, expected: Sequence, which: slice) -> Non
 
 
 @pytest.mark.parametrize("number", [0, 1234])
-def test_an_environment_alone_lives_as_in_a_batch(cramped, keys, actions, life, number):
+def test_an_environment_alone_equals_one_in_a_batch(cramped, keys, actions, life, number):
     which = slice(number, number + 1)
     alone = live(cramped, keys[which], actions[:, which])
     assert_equal_lives(alone.steps, life.steps, which)
@@ -275,7 +275,7 @@ def test_recipes_of_ones_own_are_drawn_at_the_start_and_after_deliveries():
     ],
 )
 def in_jax(request: pytest.FixtureRequest):
-    """A layout, and one jitted step with the observations of the state before it."""
+    """Return a layout, and one jitted step with the observations of the state before it."""
     layout = request.param
     return layout, jax.jit(lambda *inputs: (*rules.step(layout, *inputs), observe_both(layout, inputs[0])))
 

@@ -49,7 +49,7 @@ def brute_distances(layout: Layout) -> np.ndarray:
 
 
 def brute_first_step(layout: Layout, origin: int, target: int) -> int:
-    """The first action, right, down, left, up, that starts a shortest path."""
+    """Return the first action, right, down, left, up, that starts a shortest path."""
     left = brute_distances(layout)[origin, target]
     if left in (0, UNREACHABLE):
         return STAY

@@ -38,7 +38,7 @@ presets = ["default", "high_inertia"]
 
 @pytest.fixture
 def changed(tmp_path) -> Callable[[str, str], str]:
-    """The path of a profile file with one text replaced by another."""
+    """Return the path of a profile file with one text replaced by another."""
 
     def write(old: str, new: str) -> str:
         assert VALID.count(old) == 1

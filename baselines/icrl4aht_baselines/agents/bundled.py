@@ -32,7 +32,7 @@ MODEL_CARD = "README.md"
 BUNDLE = "bundle.json"
 """File name of a bundled model's way of playing, in the folder NAME: {"sampled": whether it draws its actions}."""
 
-_LARGEST = 2 * 10**6  # bytes of a bundled model's parameters
+_LARGEST = 2 * 10**6  # maximum size of a bundled model's parameters, in bytes
 
 
 class BundledModel(NamedTuple):
@@ -110,7 +110,7 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampl
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
     config = json.loads((run / CONFIG).read_text(encoding="utf-8"))
-    if not is_address(config["histories"]["root"]):  # a path of the machine that trained it
+    if not is_address(config["histories"]["root"]):  # a path on the training machine, without meaning elsewhere
         config["histories"]["root"] = Path(config["histories"]["root"]).name
     (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
     Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)

@@ -42,7 +42,7 @@ class PlayMode(NamedTuple):
     Attributes:
         acting: how it remembers, see `ACTING`.
         greedy: whether it takes its most probable action, as published, or draws one.
-        forget: whether its memory is cleared at the start of each episode, which cuts its context off.
+        forget: whether its memory is cleared at the start of each episode, which limits its context to the episode.
     """
 
     acting: Acting = "cached"

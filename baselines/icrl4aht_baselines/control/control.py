@@ -56,7 +56,7 @@ class ControlCheck(NamedTuple):
     """One check of the control.
 
     Attributes:
-        world, method: what was trained where.
+        world, method: the world, and the method trained in it.
         quantity: what is measured, followed by "at least" or "at most", the direction of the limit.
         value: measured.
         limit: bound of the value.

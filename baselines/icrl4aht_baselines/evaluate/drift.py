@@ -54,7 +54,7 @@ def measure_drift(
 
     Args:
         method, params, context: the model, see `agents.egos.learned`.
-        tasks: B of them.
+        tasks: the B tasks.
         protocol: also sets the number of episodes.
         channels: channels of the observations that the model takes.
 

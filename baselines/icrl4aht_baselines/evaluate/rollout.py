@@ -24,7 +24,7 @@ from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 
-_EGO_STEPS, _TEAMMATE_STEPS = 2, 3  # streams of keys within an episode, next to those of the agents' slots
+_EGO_STEPS, _TEAMMATE_STEPS = 2, 3  # key streams within an episode, distinct from those of the agent slots
 
 
 class RolloutState(NamedTuple):
@@ -102,7 +102,7 @@ class EvaluationRollout:
     def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, EpisodeBatch]:
         """Return the state after one episode of every task, and the episode. To be jitted by the caller."""
         mate = self.teammates[0]
-        # Teammates start each episode afresh from its key; egos keep their memory, and only their keys are new.
+        # Teammates restart in each episode from its key; egos keep their memory and get new keys.
         keys = self.env.episode_key(state.env)
         memories = jax.vmap(mate.init)(mate_params, _fold_all(keys, TEAMMATE))
         ego_keys, mate_keys = _fold_all(keys, _EGO_STEPS), _fold_all(keys, _TEAMMATE_STEPS)

@@ -46,7 +46,7 @@ class StepOutput(NamedTuple):
 
 
 class WindowMemory(NamedTuple):
-    """Memory of an acting ego: the steps of its window, and what the trunk computed from them alone.
+    """Memory of an acting ego: the steps of its window, and the trunk's memory of these steps.
 
     Attributes:
         tokens: float32 (K, D), the window's steps in order, at the front.
@@ -107,7 +107,7 @@ class StepModel(nn.Module):
         return self.head(feature), WindowMemory(tokens.at[steps].set(token), steps + 1, states)
 
     def _with_room(self, memory: WindowMemory) -> WindowMemory:
-        """Return the memory, in which a full window has lost its oldest steps and their part in what was computed.
+        """Return the memory, dropping the oldest steps of a full window and recomputing the trunk's memory.
 
         A kept step's keys and values were computed when it could still see the steps that go, so all are computed
         again, as if the kept steps were all that ever happened.
@@ -169,7 +169,7 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
     def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
         steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)
         targets = jnp.asarray(batch.target_actions)
-        # What was taken is the next step's previous action; after the last step `next_obs_loss` predicts nothing.
+        # The action taken is the next step's previous action; the last step has none and is not predicted.
         taken = jnp.roll(steps.prev_action, -1, axis=1)
         output: StepOutput = run_model(model, options, params, key, steps, taken)
         total = mean_of_rows(cross_entropy(output.head, targets, options.label_smoothing), mask)

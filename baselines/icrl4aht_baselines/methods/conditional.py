@@ -1,4 +1,4 @@
-"""A change of an ego's memory that is needed only now and then."""
+"""A conditional change of an ego's memory that is computed only when a row of the batch needs it."""
 
 from __future__ import annotations
 

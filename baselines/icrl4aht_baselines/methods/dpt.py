@@ -77,7 +77,7 @@ class DPTMemory(NamedTuple):
 
 
 class DPT(nn.Module):
-    """Transitions and queries to policies.
+    """Model that maps a context of transitions and a query to a policy.
 
     `finished_episodes_only`: an acting ego's context grows by complete episodes, as in the paper; otherwise by steps.
     """
@@ -139,7 +139,7 @@ class DPT(nn.Module):
     def _answer_from_tokens(self, query: Array, buffer: RingBuffer, complete: Array) -> Array:
         """Compute the answer from the tokens of the complete context."""
         window, valid = buffer.last(len(buffer.tokens) - KEPT_STEPS, complete)
-        sequence = jnp.append(window, query[None], axis=0).at[valid].set(query)  # tokens behind it are not seen
+        sequence = jnp.append(window, query[None], axis=0).at[valid].set(query)  # the query sees none behind it
         return self.trunk(sequence[None])[0, valid]
 
     def _cache_context(

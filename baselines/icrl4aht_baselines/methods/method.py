@@ -1,4 +1,4 @@
-"""Parts that all methods share: the world a model acts in, what trainer and egos need of a method, and losses.
+"""Parts that all methods share: `World`, the interface `Method` for trainer and egos, and losses.
 
 Shapes: `B` batch size, `L` length of a window, `K` length of a context, `A` number of actions, `N` entries of an
 observation, `F` features.
@@ -137,10 +137,10 @@ def make_next_obs_head(options: ModelOptions, world: World) -> NextObsHead | Non
 
 
 def check_no_teammate_loss(name: str, options: ModelOptions) -> None:
-    """Check that a method that predicts nothing of the teammate is not asked to.
+    """Check that a method without a prediction of the teammate's action is not given its loss.
 
     Raises:
-        OptionError: if it is.
+        OptionError: if `teammate_loss` is set.
     """
     if options.teammate_loss:
         raise OptionError(f"teammate_loss = True: {name} does not predict the teammate's action; leave it out")

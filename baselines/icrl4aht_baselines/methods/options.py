@@ -16,7 +16,7 @@ Positions = Literal["none", "rope"]
 
 
 class ModelSize(NamedTuple):
-    """Values of `ModelOptions`, and of a training, that make up a size.
+    """Values of `ModelOptions` and `TrainOptions` of a named model size.
 
     Attributes:
         steps: training steps.

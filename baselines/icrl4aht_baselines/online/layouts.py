@@ -1,4 +1,4 @@
-"""Layouts outside the benchmark to play on, from which a model learns the game and not one map."""
+"""Layouts outside the benchmark, on which a model learns the game rather than one map."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _rearranged(layout: Layout, rng: np.random.Generator) -> tuple[str, ...]:
 
 
 def _touches(layout: Layout, cell: int, room: np.ndarray) -> bool:
-    """Whether an agent in a room can face a cell."""
+    """Return whether an agent in a room can face a cell."""
     x, y = cell % layout.width, cell // layout.width
     neighbours = {(y + dy) * layout.width + x + dx for dx, dy in STEP.values() if 0 <= x + dx < layout.width}
     return not neighbours.isdisjoint(room.tolist())

@@ -87,9 +87,9 @@ def prepare_play(
     """Return the training of a method that plays with the teammates of a release's histories, and of other tasks.
 
     Args:
-        name: of the method.
-        model: its architecture.
-        options: of the training; `batch_size` is the number of tasks that are played at once.
+        name: name of the method.
+        model: architecture of the model.
+        options: options of the training; `batch_size` is the number of tasks that are played at once.
         play: hyper-parameters of playing and learning.
         histories: the histories whose teammates and layouts are played.
         tasks: tasks with more teammates, heuristics. Those on other layouts are left out.
@@ -261,7 +261,7 @@ def _rearranged_groups(
     ends = [round(versions * k / len(kinds)) for k in range(len(kinds) + 1)]
     for (kind, mates), first, end in zip(kinds.items(), ends, ends[1:], strict=False):
         own = layouts[first:end]
-        if not own:  # fewer versions than kinds
+        if not own:  # there may be fewer versions than kinds
             continue
         count = max(len(own), round(tasks * len(own) / versions))
         where = [own[task % len(own)] for task in range(count)]

@@ -88,7 +88,7 @@ def run_all(program: SharedProgram, shared: int, *arguments: Any) -> Any:
         program: the program.
         shared: number of leading arguments that are the same for all functions; the others have a leading axis
             (members,), and so has the result.
-        arguments: of the functions.
+        arguments: arguments of the functions.
     """
     axes = (0, *[None] * shared, *[0] * (len(arguments) - shared))
     return jax.vmap(program.run, in_axes=axes)([jnp.asarray(one) for one in program.constants], *arguments)

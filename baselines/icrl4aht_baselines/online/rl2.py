@@ -217,7 +217,7 @@ class _Player:
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits[:-1]), action[..., None], axis=-1)[..., 0]
         return Sequences(
             seen=jax.tree.map(lambda leaf: leaf[:-1], seen),
-            reset=jnp.zeros(reward.shape, bool),  # within an episode the recurrent state is never cleared
+            reset=jnp.zeros(reward.shape, bool),  # the recurrent state is never reset within an episode
             action=action,
             log_prob=log_prob,
             value=value[:-1],
@@ -422,7 +422,7 @@ class PlayTrainer:
         return jax.jit(self._initial_state)()
 
     def state_like(self) -> Any:
-        """Return shapes and dtypes of the state, to restore a checkpoint by."""
+        """Return the shape s and dtypes of the state, to restore a checkpoint by."""
         return jax.eval_shape(self._initial_state)
 
     def _initial_state(self) -> PlayState:

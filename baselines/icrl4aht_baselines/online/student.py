@@ -80,10 +80,10 @@ def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> P
     Args:
         policy: the agent.
         length: T, steps of an episode.
-        labeller: another agent that sees the same; by default the labels are what the agent does without the noise.
+        labeller: another agent with the same inputs; by default the labels are the agent's actions without noise.
 
     Raises:
-        OptionError: if the labeller sees something else than the agent.
+        OptionError: if the labeller takes other inputs than the agent.
     """
     if labeller is not None and labeller.sees != policy.sees:
         raise OptionError(
@@ -169,7 +169,7 @@ def record_histories(
 
 
 class Teammates(NamedTuple):
-    """Teammates of a release, and what it says of them.
+    """Teammates of a release, and their recorded reference returns.
 
     Attributes:
         tasks: one task for each teammate, numbered as a student task.
@@ -301,7 +301,7 @@ def collect_release(
 def _save_part(folder: Path, recorded: RecordedHistories) -> None:
     """Write the arrays of a group of tasks into a folder, which appears when it is complete."""
     partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a killed process
+    shutil.rmtree(partial, ignore_errors=True)  # left by a killed run
     partial.mkdir()
     for name, array in recorded._asdict().items():
         np.save(partial / f"{name}.npy", array)
@@ -324,7 +324,7 @@ def _check_settings(path: Path, settings: dict[str, Any]) -> None:
 def _student_task(
     task: Task, number: int, folder: Path, labels: ExpertLabels, config: NoiseConfig, teammates: Teammates
 ) -> NewTask:
-    """A task with the histories of one group that belong to it, which are read when they are written."""
+    """Return a task with the histories of one group that belong to it, which are read when they are written."""
     first = number * config.histories
 
     def load() -> Iterator[NewHistory]:

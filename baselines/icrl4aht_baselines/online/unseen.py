@@ -1,4 +1,4 @@
-"""Return on layouts that no model was trained on: whether a model knows the game, or its training layouts.
+"""Returns on layouts that no model was trained on, to measure generalization to new layouts.
 
 Shapes: `V` layouts, `E` episodes.
 """
@@ -33,14 +33,14 @@ def unseen_returns(
     episodes: int,
     played: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> dict[str, dict[Cell, Float[np.ndarray, "V E"]]]:
-    """Play on rearranged versions of the tasks' layouts, with the teammates of the tasks, under the protocol `seeded`.
+    """Play tasks on rearranged versions of their layouts, under the protocol `seeded`.
 
     Args:
         egos: agent -> function from a layout to its policy.
-        tasks: with heuristic teammates.
-        versions: of each layout.
-        episodes: of each ego on each version with each teammate.
-        played: called with what is played, the episodes played and all episodes, for progress.
+        tasks: tasks with heuristic teammates.
+        versions: number of rearranged versions of each layout.
+        episodes: episodes of each ego on each version with each teammate.
+        played: called with (description, episodes played, episodes), for progress.
 
     Returns:
         Agent -> layout and family -> returns on each version with a teammate of the family.
@@ -78,7 +78,7 @@ def _returns(
         for layout, task in zip(layouts, tasks, strict=True)
     ]
     keys = jnp.stack([task_key(number, task.task_id) for number, task in enumerate(tasks)])[:, None]
-    params = rollouts[0].ego.params  # those of a model, which are the same on every layout
+    params = rollouts[0].ego.params  # a model's parameters are the same on every layout
     state = jax.eval_shape(rollouts[0].start, keys[0])
     totals = np.zeros((len(layouts), episodes))
     for program in shared_programs([one.episode for one in rollouts], params, rollouts[0].teammate_params, state):

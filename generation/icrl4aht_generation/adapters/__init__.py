@@ -1,1 +1,1 @@
-"""The environment for other libraries: Gymnasium, PettingZoo and JaxMARL."""
+"""Environments for other libraries: Gymnasium, PettingZoo and JaxMARL."""

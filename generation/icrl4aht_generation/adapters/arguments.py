@@ -1,4 +1,4 @@
-"""Checks of what callers give to the environments of other libraries."""
+"""Validation of arguments passed to the adapters for other libraries."""
 
 from __future__ import annotations
 

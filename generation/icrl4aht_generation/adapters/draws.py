@@ -1,4 +1,4 @@
-"""Keys that recorded episodes were drawn from, found again from the task's seed."""
+"""Recover the random keys of recorded episodes from the task's seed."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[
 
 
 def _key(dataset: Dataset, entry: Entry, episode: int) -> tuple[Key[Array, ""], int]:
-    """The key of the environment that an episode was played in, and the episode's number there."""
+    """Return the key of the environment that an episode was played in, and the episode's number there."""
     task = dataset.history_task(entry.history_id)
-    if entry.source == "noise":  # an environment for each episode
+    if entry.source == "noise":  # noise histories play each episode in an environment of its own
         return noisy_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
     ego = dataset.provenance.get(task.task_id, Provenance()).ego
     if entry.source != "ppo" or ego is None:

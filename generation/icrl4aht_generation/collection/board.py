@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 
 class TaskBoard:
-    """Sums what executors report about single tasks.
+    """Progress display that sums the reports of single tasks.
 
     Args:
         show: function of `progress_bars`.
@@ -20,7 +20,7 @@ class TaskBoard:
         self._show()
 
     def show_running(self, name: str, updates: int, steps_per_second: float) -> None:
-        """Show that a task has done this many updates."""
+        """Show the number of updates that a running task has done."""
         self._running[name] = updates, steps_per_second
         self._show()
 

@@ -24,7 +24,7 @@ from icrl4aht_generation.learners.network import ActorCritic
 
 
 def stream_returns(rewards: np.ndarray) -> np.ndarray:
-    """float64 (N, E): returns of every episode's kept steps.
+    """Return the sum of rewards over each episode's kept steps, float64 (N, E).
 
     Args:
         rewards: int8 (N, T).
@@ -33,7 +33,7 @@ def stream_returns(rewards: np.ndarray) -> np.ndarray:
 
 
 def best_streams(returns: np.ndarray, keep: int, least_improvement: float | None = None) -> np.ndarray:
-    """int (n,), n <= keep: numbers of the streams with the highest end + improvement, best first, ties by number.
+    """Return the numbers of the streams with the highest end + improvement, best first: int (n,), n <= keep.
 
     Args:
         returns: (N, E), episode returns of a learner's streams.
@@ -50,10 +50,10 @@ def best_streams(returns: np.ndarray, keep: int, least_improvement: float | None
 def select_streams(
     returns: Sequence[np.ndarray], keep: int, least_improvement: float | None = None
 ) -> list[np.ndarray]:
-    """Streams of each of a task's learners, `keep` of all together, see `best_streams`.
+    """Select up to `keep` streams from all learners of a task together; see `best_streams`.
 
-    The learners have as many as each other where they have enough: every turn each learner gives its next best stream,
-    and the learners whose streams are better give theirs first.
+    Streams are divided equally among learners with enough of them: in each round every learner adds its next best one,
+    starting with the learner whose stream is best.
 
     Args:
         returns: for each learner (N, E), episode returns of its streams.
@@ -74,12 +74,12 @@ def select_streams(
 
 
 def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: float | None = None) -> StreamFilter:
-    """Mean returns at the start and at the end of learning, before the filter and after it.
+    """Return mean returns at the start and at the end of learning, before the filter and after it.
 
     Args:
         before: (N, E), episode returns of all streams.
         after: (n, E), those of the selected streams.
-        least_improvement: what the selected streams had to improve by.
+        least_improvement: minimum improvement of the selected streams.
     """
     sides = []
     for part in (before, after):
@@ -117,7 +117,7 @@ def oracle_labels(layout: Layout, states: Iterable[np.ndarray], actions: Iterabl
     """Yield the scripted oracle's action at every step of each stream.
 
     The oracle follows every episode from its first step: it remembers the recorded states and the actions that the ego
-    took, and says at each state what it would do now.
+    took, and chooses its own action at each state.
 
     Args:
         layout: the layout.
@@ -133,18 +133,18 @@ def oracle_labels(layout: Layout, states: Iterable[np.ndarray], actions: Iterabl
 
 
 def _by_episode(stream: np.ndarray) -> jax.Array:
-    """(T, ...) -> (100, E, ...)."""
+    """Reshape (T, ...) to (100, E, ...): step in the episode first."""
     return jnp.asarray(stream.reshape(-1, KEPT_STEPS, *stream.shape[1:]).swapaxes(0, 1))
 
 
 def _by_step(labels: jax.Array) -> np.ndarray:
-    """(100, E) -> (T,)."""
+    """Reshape (100, E) to (T,), the inverse of `_by_episode`."""
     return np.asarray(labels).swapaxes(0, 1).reshape(-1)
 
 
 @lru_cache(maxsize=8)
 def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array], jax.Array]:
-    """A function of parameters and records (100, E, S) to greedy actions, int8 (100, E); for all egos of a layout."""
+    """Return a compiled map from parameters and records (100, E, S) to greedy actions, int8 (100, E)."""
     network = ActorCritic(widths)
 
     @jax.jit
@@ -159,7 +159,7 @@ def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array
 
 @lru_cache(maxsize=8)
 def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """A function of records (100, E, S) and the ego's actions (100, E) to the oracle's actions, int8 (100, E)."""
+    """Return a compiled map from records (100, E, S) and ego actions (100, E) to oracle actions, int8 (100, E)."""
     return jax.jit(lambda records, taken: follow_oracle(layout, records, taken).astype(jnp.int8))
 
 
@@ -174,7 +174,7 @@ def follow_oracle(layout: Layout, records: jax.Array, taken: jax.Array) -> jax.A
     Returns:
         int32 (T, E).
     """
-    script, key = oracle(layout), jax.random.key(0)  # which draws nothing
+    script, key = oracle(layout), jax.random.key(0)  # the key has no effect: the oracle draws nothing
     act = jax.vmap(script.act, in_axes=(None, 0, 0, None))
 
     def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:

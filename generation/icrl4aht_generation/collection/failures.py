@@ -1,4 +1,4 @@
-"""failed.jsonl: the units of work of a rebuild that failed, and why; `task_id` is the name of the artefact."""
+"""The log failed.jsonl of failed units of work and their errors; `task_id` is the name of the artefact."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FAILED = "failed.jsonl"
 class FailureLog:
     """One line per failed task that still has no artefact. Collectors may share the file.
 
-    On a full disk, changes wait until one of the next can be written.
+    On a full disk, changes are kept in memory until a later write succeeds.
     """
 
     def __init__(self, path: Path) -> None:
@@ -25,7 +25,7 @@ class FailureLog:
 
     @property
     def is_written(self) -> bool:
-        """Whether no change waits for room on the disk."""
+        """Whether all changes have been written to the disk."""
         return not self._waiting
 
     def add(self, outcome: TaskOutcome) -> None:

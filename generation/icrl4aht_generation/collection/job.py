@@ -17,7 +17,7 @@ from icrl4aht_generation.profiles.work import Work
 
 
 class CollectionError(Icrl4ahtError):
-    """Some tasks have no finished artefact."""
+    """Error: some tasks have no finished artefact."""
 
 
 def _functions(source: str) -> tuple[Callable[..., bool], Callable[..., bool]]:
@@ -61,11 +61,11 @@ class CollectionJob:
     wait: bool
 
     def folder(self, work: Work) -> Path:
-        """Folder of the artefact."""
+        """Return the folder of the artefact."""
         return self.artefacts / work.name
 
     def is_finished(self, work: Work) -> bool:
-        """Whether the artefact is complete and unchanged."""
+        """Return whether the artefact is complete and unchanged."""
         return _functions(work.source)[1](self.folder(work), work, self.profile)
 
     def __call__(self, work: Work, on_update: UpdateCallback = lambda update, metrics: None) -> Literal["done", "busy"]:

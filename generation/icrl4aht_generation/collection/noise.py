@@ -65,11 +65,11 @@ from icrl4aht_generation.teammates.registry import build_teammate
 NOISE = "noise"
 """Name of the array of chances in an artefact."""
 
-_LINE_BYTES = 200  # of a history, in the metrics and in the timing
+_LINE_BYTES = 200  # field of a history's number, in metrics and timing
 
 
 def noise_array_shapes(layout: Layout, histories: int, episodes: int) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Shape and dtype of every array of an artefact: the fields of `NoisyEpisodes` by history, and `noise`."""
+    """Return shapes and dtypes of an artefact's arrays: the fields of `NoisyEpisodes` by history, and `noise`."""
     return array_shapes(layout, histories, episodes) | {
         "oracle_actions": ((histories, episodes * KEPT_STEPS), "int8"),
         NOISE: ((histories, episodes), "float32"),
@@ -77,7 +77,7 @@ def noise_array_shapes(layout: Layout, histories: int, episodes: int) -> dict[st
 
 
 def noise_bytes(layout: Layout, config: NoiseConfig) -> int:
-    """Size of an artefact."""
+    """Return the size of an artefact."""
     shapes = noise_array_shapes(layout, config.histories, config.episodes).values()
     return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes) + config.histories * _LINE_BYTES
 
@@ -119,7 +119,7 @@ def run_noise(
         save_seconds: least time between two saves.
 
     Returns:
-        Whether there was anything to do; False if the artefact was finished before.
+        False if the artefact was already finished, otherwise True.
 
     Raises:
         BusyError: if another process works on this task.
@@ -144,7 +144,7 @@ def _record(
     needed = noise_bytes(task.layout, config)
 
     def play(number: int) -> NoisyEpisodes:
-        # The last piece plays its last episode again and again, so that all pieces have one size.
+        # The last piece repeats its last episode: equal sizes share one compilation.
         episodes = np.minimum(number * EPISODES_AT_ONCE + np.arange(EPISODES_AT_ONCE), schedules.size - 1)
         history, episode = np.divmod(episodes, config.episodes)
         played = play_noisy_episodes(task.layout, teammate, task.seed, history, episode, schedules[history, episode])
@@ -206,7 +206,7 @@ class NoiseWriter:
             self._started = time.perf_counter()
 
     def write(self, first: int, played: NoisyEpisodes) -> dict[str, float] | None:
-        """Write episodes from number `first` on; those behind the last one are left out.
+        """Write episodes from number `first` on, and ignore those after the task's last episode.
 
         Returns:
             The timing, with the number of the last complete history as `update`; None if no further one is complete.

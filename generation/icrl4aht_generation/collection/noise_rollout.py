@@ -77,8 +77,8 @@ class NoisyChoice(NamedTuple):
     """Actions of the noisy ego in one step of M environments.
 
     Attributes:
-        action: int32 (M,), what it does.
-        clean: int32 (M,), what the oracle would do.
+        action: int32 (M,), the action taken.
+        clean: int32 (M,), the oracle's action.
     """
 
     action: Int[Array, " M"]
@@ -114,7 +114,7 @@ def noisy_episode_keys(seed: int, history: np.ndarray, episode: np.ndarray) -> K
 
 
 def _keys(seed: int) -> Key[Array, " 2"]:
-    """Keys of a task: of its schedules, and of its episodes."""
+    """Return two keys of a task: of its schedules, and of its episodes."""
     return jax.random.split(jax.random.key(seed))
 
 
@@ -152,7 +152,7 @@ def _compiled(layout: Layout, teammate: Policy) -> Callable[..., NoisyEpisodes]:
 
 
 def _noisy_oracle(env: Environment, chance: Float[Array, " M"]) -> Player:
-    """The oracle as agent 0 of M environments, each with its own chance of a random action.
+    """Return the oracle as agent 0 of M environments, each with its own chance of a random action.
 
     It remembers the action that was taken, as an observer of the episode would; so the recorded states and actions
     determine what it would do at every state.

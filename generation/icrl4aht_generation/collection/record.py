@@ -32,7 +32,7 @@ class HistoryArrays(NamedTuple):
 
 
 def array_shapes(layout: Layout, histories: int, episodes: int) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Shape and dtype of every field of `HistoryArrays`."""
+    """Return the shape and dtype of every field of `HistoryArrays`."""
     n, size = histories, record_size(layout)
     steps = (n, episodes * KEPT_STEPS)
     return {

@@ -37,7 +37,7 @@ def _attempt(job: CollectionJob, work: Work, board: TaskBoard, attempts: int) ->
     for attempt in range(1, attempts + 1):
         try:
             return TaskOutcome(work, job(work, on_update), attempt)
-        except Exception as error:  # whatever it is, the other tasks continue
+        except Exception as error:  # any error: the other tasks continue
             outcome = TaskOutcome(work, "failed", attempt, f"{type(error).__name__}: {error}", traceback.format_exc())
     return outcome
 
@@ -52,7 +52,7 @@ def collect_tasks(
 ) -> None:
     """Make every artefact under out/artefacts.
 
-    Tasks that another collector works on are left to it, and waited for at the end.
+    Tasks that another collector is running are skipped, and awaited at the end.
 
     Args:
         tasks: the units of work.
@@ -108,7 +108,7 @@ def collect_tasks(
 def _run_all(
     job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
 ) -> Generator[TaskOutcome]:
-    """Run every task, then again, waiting, those that another collector worked on."""
+    """Run every task, then wait for those that another collector was running."""
     execute = run_in_process if options.executor == "local" else run_on_ray
     for wait in (False, True):
         busy: list[Work] = []

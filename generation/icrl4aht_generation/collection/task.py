@@ -50,7 +50,7 @@ UpdateCallback = Callable[[int, dict[str, float]], None]
 
 
 def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Learner:
-    """The untrained ego of a task. `suite` is the folder of learned teammates."""
+    """Return the untrained ego of a task. `suite` is the folder of learned teammates."""
     teammate = build_teammate(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
     return Learner(Environment(task.layout), teammate, profile.ego_on(task.layout.name))
 
@@ -77,7 +77,7 @@ def run_task(
         save_seconds: least time between two saves of the learner's state.
 
     Returns:
-        Whether there was anything to do; False if the artefact was finished before.
+        False if the artefact was already finished, otherwise True.
 
     Raises:
         BusyError: if another process works on this task.
@@ -101,7 +101,7 @@ def make_artefact(folder: Path, wait: bool, is_finished: Callable[[Path], bool],
         make: makes it in a folder, or resumes it there.
 
     Returns:
-        Whether there was anything to do.
+        False if the artefact was already finished, otherwise True.
 
     Raises:
         BusyError: if another process works on it.
@@ -110,7 +110,7 @@ def make_artefact(folder: Path, wait: bool, is_finished: Callable[[Path], bool],
         if is_finished(folder):
             return False
         partial = partial_folder(folder)
-        if not is_finished(partial):  # else it was killed just before it was renamed
+        if not is_finished(partial):  # otherwise a run was killed just before the renaming
             make(partial)
         publish_artefact(partial, folder)
         return True
@@ -174,10 +174,10 @@ def pipelined(
 
 
 def saved_progress(saved: StateFile) -> int:
-    """Return the number of pieces that were saved under the same settings; 0 in a folder that is then empty."""
+    """Return the number of pieces saved under the same settings; if there are none, empty the folder and return 0."""
     try:
         done = saved.progress
-    except OtherSettingsError:  # a changed profile or version: an unfinished artefact is no loss
+    except OtherSettingsError:  # made by another profile or version, so it cannot be resumed
         done = None
     if done is None:
         shutil.rmtree(saved.path.parent, ignore_errors=True)
@@ -187,9 +187,9 @@ def saved_progress(saved: StateFile) -> int:
 
 @contextmanager
 def readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
-    """Turn the errors of a full disk into one that names the folder and what it needs.
+    """Turn errors of a full disk into a `DiskFullError` that names the folder and the needed space.
 
-    An artefact that has no saved state to resume from is removed then.
+    An artefact without a saved state to resume from is removed.
 
     Raises:
         DiskFullError: if the disk is full.
@@ -206,6 +206,6 @@ def readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
 
 
 def learner_key(work: Work) -> Any:
-    """The typed key of a learner: the task's seed decides the first one's, the others' are independent of it."""
+    """Return the typed key of a learner: the task's seed decides the first one's, the others' are independent of it."""
     key = jax.random.key(work.task.seed)
     return jax.random.fold_in(key, work.learner) if work.learner else key

@@ -43,16 +43,16 @@ METADATA, LEARNER = "metadata.json", "learner.safetensors"
 FILTER_CURVES, LABELLER_RETURNS = "filter.png", "labeller_returns.json"
 """Files that packing adds: a picture of the stream filter, and what the ego's checkpoints earn as labellers."""
 
-_LINE_BYTES = 600  # of an update, in the metrics and in the timing
+_LINE_BYTES = 600  # field of an update's number, in metrics and timing
 
 
 def partial_folder(folder: Path) -> Path:
-    """Path of an artefact that is not finished."""
+    """Return the path of an artefact that is not finished."""
     return folder.with_name(f"{folder.name}.partial")
 
 
 def checkpoint_path(folder: Path, number: int) -> Path:
-    """Folder of the ego's checkpoint of this number in an artefact."""
+    """Return the folder of the ego's checkpoint of this number in an artefact."""
     return folder / "checkpoints" / f"c{number}"
 
 
@@ -98,7 +98,7 @@ def is_artefact_finished(folder: Path, settings: dict[str, Any], files: list[str
 
     Args:
         folder: the folder.
-        settings: what the artefact depends on.
+        settings: settings that the artefact depends on.
         files: its hashed files, sorted.
     """
     try:
@@ -129,14 +129,14 @@ def check_room(partial: Path, needed: int) -> None:
     """Check that a disk has room for an artefact.
 
     Raises:
-        DiskFullError: if it has not.
+        DiskFullError: if there is too little space.
     """
     if needed > shutil.disk_usage(partial).free:
         raise disk_full(partial, needed)
 
 
 def disk_full(partial: Path, needed: int) -> DiskFullError:
-    """Return the error for an unfinished artefact whose disk has not the space it needs."""
+    """Return the error for a disk without enough space for an unfinished artefact."""
     free = shutil.disk_usage(partial if partial.exists() else partial.parent).free
     folder = partial.with_name(partial.name.removesuffix(".partial"))
     return DiskFullError(
@@ -157,7 +157,7 @@ def write_metadata(partial: Path, settings: dict[str, Any], files: list[str]) ->
 
     Args:
         partial: the artefact.
-        settings: what it depends on, and what else is known of its origin.
+        settings: settings that it depends on, and further facts about its origin.
         files: its hashed files, sorted.
     """
     metadata = settings | {
@@ -236,7 +236,7 @@ class ArtefactWriter:
         return line | timing
 
     def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
-        """Keep the ego after so many updates, if it is one of `checkpoint_updates`; on the disk when this returns.
+        """Write and sync a checkpoint of the ego if this number of updates is among `checkpoint_updates`.
 
         Call before the state after these updates is saved, so that a resumed task has all checkpoints.
         """
@@ -267,7 +267,7 @@ class ArtefactWriter:
 
 
 def last_timing(folder: Path) -> dict[str, float] | None:
-    """The last line of an artefact's timing, finished or not; None if there is none yet."""
+    """Return the last line of an artefact's timing, finished or not; None if there is none yet."""
     for path in (partial_folder(folder) / TIMING, folder / TIMING):
         try:
             with path.open("rb") as stream:

@@ -1,7 +1,7 @@
-"""A scripted ego that sees the complete state: an estimate of how much an ego can matter, next to `stay` and `random`.
+"""Scripted ego that sees the complete state, to estimate how much an ego can add to the return of `stay`.
 
 It is agent 0. It fills one pot at a time with the ingredients that the recipe still needs, fetches the plate so that it
-arrives when the soup is done, and delivers only soups of the current recipe; any other soup goes onto a counter until
+arrives when the soup is done, and delivers only soups of the current recipe; it puts other soups on a counter until
 its recipe comes up. With a second pot it cooks ahead. It learns what to expect of the teammate by watching: it leaves
 the work to one that cooks and delivers, and forestalls one that does only half of that. It hands nothing over, which no
 layout rewards, never presses a button, and stays in layouts where it cannot matter. It is deterministic.
@@ -180,7 +180,7 @@ def oracle(layout: Layout) -> Policy:
 
 
 def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
-    """Return the memory with what this state shows; its `action` is still the last one."""
+    """Return the memory updated by a state; `action` remains the previous action."""
     layout, new = scene.paths.layout, scene.state
     old = unpack(layout, last.record)
     same = jnp.all(new.pot_items == old.pot_items) & (new.recipe == old.recipe)
@@ -204,7 +204,7 @@ def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
 
 
 class OracleView(NamedTuple):
-    """One state as the ego reads it; arrays are traced.
+    """Features of one state from the ego's point of view; arrays are traced.
 
     Attributes:
         facts: facts of the layout.
@@ -361,7 +361,7 @@ class Subgoal(NamedTuple):
     Attributes:
         when: bool (), whether the subgoal applies.
         cost: int32 (cells,), cost of going to each cell in steps; NEVER for cells that do not serve it.
-        reason: what it is good for; only read by people.
+        reason: purpose of the subgoal, for readers of the code.
     """
 
     when: Bool[Array, ""]

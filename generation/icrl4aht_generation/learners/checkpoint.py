@@ -31,7 +31,7 @@ POLICY_CHECKPOINTS = 5
 
 
 def checkpoint_updates(config: PPOConfig) -> tuple[int, ...]:
-    """Numbers of updates after which a checkpoint is kept, ascending; the last one is the end of training.
+    """Return the number s of updates after which a checkpoint is kept, ascending; the last one is the end of training.
 
     Fewer than `POLICY_CHECKPOINTS` if there are fewer updates.
     """
@@ -53,7 +53,7 @@ def write_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str
     """Write policy.safetensors and policy.json into an existing folder, and sync them to the disk."""
     weights = {name: np.asarray(w) for name, w in flatten_dict(params, sep="/").items()}
     stored = _without_zero_rows(weights)
-    (folder / POLICY_WEIGHTS).write_bytes(to_bytes(stored))  # `save_file` has errors of its own for a full disk
+    (folder / POLICY_WEIGHTS).write_bytes(to_bytes(stored))  # `save_file` raises its own error for a full disk
     shapes = {name: list(w.shape) for name, w in weights.items()}
     content = card | {"widths": asdict(network.widths), "partners": network.partners, "shapes": shapes}
     (folder / POLICY_CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
@@ -90,7 +90,7 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
         expected = card["shapes"]
         weights = _with_zero_rows(load_file(folder / POLICY_WEIGHTS), expected)
         tree = unflatten_dict(weights, sep="/")
-    except Exception as error:  # three libraries read what may be any bytes, and each has errors of its own
+    except Exception as error:  # the file may be damaged, and each of three libraries raises its own errors
         raise _no_checkpoint(folder, repr(error)) from error
     shapes = {name: list(w.shape) for name, w in weights.items()}
     if shapes != expected or "params" not in tree:
@@ -99,7 +99,7 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
 
 
 def _without_zero_rows(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Weights as they are stored: of a matrix that is mostly rows of zeros, the other rows and their numbers.
+    """Return the weights as stored: matrices that are mostly rows of zeros become their other rows and row numbers.
 
     The kernel of encoder `mlp` is one: most entries of the flat window are always 0 on a layout.
     """
@@ -115,7 +115,7 @@ def _without_zero_rows(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _with_zero_rows(stored: dict[str, np.ndarray], shapes: dict[str, list[int]]) -> dict[str, np.ndarray]:
-    """The weights of a file, see `_without_zero_rows`; `shapes` are the complete ones.
+    """Return the weights of a file, see `_without_zero_rows`; `shapes` are the complete ones.
 
     Raises:
         ValueError, IndexError, KeyError: if rows and shapes do not fit.

@@ -19,7 +19,7 @@ EncoderKind = Literal["paper", "words", "mlp"]
 see `learners.encoder`. `mlp`: one dense layer of the flat window, in place of the convolutions.
 """
 
-# Larger values in a file are a mistake, or meant to exhaust memory.
+# Larger values are a mistake, or an attack that exhausts memory.
 _Width = Annotated[int, Meta(ge=1, le=2**13)]
 _Layers = Annotated[tuple[_Width, ...], Meta(max_length=16)]
 

@@ -158,7 +158,7 @@ def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
 
 
 def encoding_log(seen: Seen) -> dict[str, Array]:
-    """Return what a training log says of an encoder's input: the share of observations that differ, if known."""
+    """Return the log entries of an encoder's input: the share of distinct observations, if known."""
     return {"distinct_observations": seen.groups / seen.group.size} if isinstance(seen, GroupedWords) else {}
 
 

@@ -57,7 +57,7 @@ def recurrent_states(
 
 
 def _scan_states(hidden, gates, reset, recurrent, bias):
-    """The states, and what their gradient needs."""
+    """Return the states, and the residuals for their gradient."""
     width = recurrent.shape[0]
 
     def step(hidden, inputs):
@@ -75,7 +75,7 @@ def _scan_states(hidden, gates, reset, recurrent, bias):
 
 
 def _states_gradient(saved, to_states):
-    """Gradients of all inputs, in up to half the time of those that JAX derives.
+    """Return the gradients of all inputs, in up to half the time of JAX's automatic ones.
 
     The loop computes only what depends on the step after it; all else, the weights' gradient above all, is one
     operation over all steps.

@@ -140,7 +140,7 @@ class PPO:
     def learn(
         self, params: Any, optimizer: optax.OptState, played: Sequences, key: Key[Array, ""]
     ) -> tuple[Any, optax.OptState, dict[str, Array]]:
-        """Updates a policy with `config.epochs` passes over the sequences of one roll-out.
+        """Update a policy with `config.epochs` passes over the sequences of one roll-out.
 
         Minibatches are of equal size; the remaining sequences are skipped, different ones in every epoch.
 

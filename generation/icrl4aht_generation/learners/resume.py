@@ -38,15 +38,15 @@ _SUFFIX = ".safetensors"
 
 
 class BusyError(OptionError):
-    """Another process works in this folder."""
+    """Error: another process is using this folder."""
 
 
 class OtherSettingsError(OptionError):
-    """A saved state belongs to a training of other settings."""
+    """Error: the saved state was made with other settings."""
 
 
 def xla_threads() -> int | None:
-    """Number of threads that XLA splits one operation over on this CPU; None on other platforms.
+    """Return the number of threads that XLA splits one operation over on this CPU; None on other platforms.
 
     It decides the order of floating-point sums, and so the bits of everything that is trained. XLA reads it once, when
     JAX is first used: from `PJRT_NPROC` or `NPROC`, otherwise from the CPU cores that this process may use.
@@ -54,7 +54,7 @@ def xla_threads() -> int | None:
     if jax.default_backend() != "cpu":
         return None
     for name in _XLA_THREADS:
-        with suppress(ValueError):  # XLA ignores what is no number
+        with suppress(ValueError):  # XLA ignores values that are not numbers
             return max(1, int(os.environ.get(name, "")))
     return len(os.sched_getaffinity(0))
 
@@ -75,7 +75,7 @@ def limit_xla_threads(threads: int) -> None:
 
 
 def software_versions() -> dict[str, str | int | None]:
-    """Versions and threads that a resumed training needs to reach the bits of an uninterrupted one."""
+    """Return the versions and threads that a resumed training needs to reach the bits of an uninterrupted one."""
     return {
         "jax": jax.__version__,
         "platform": jax.default_backend(),
@@ -85,7 +85,7 @@ def software_versions() -> dict[str, str | int | None]:
 
 
 def differing_settings(found: Mapping[str, Any], expected: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Settings that differ, by dotted name: (found, expected), None for a missing one. Tuples equal JSON's lists."""
+    """Settings that differ, by dotted name: (found, expected), None for a missing one. Tuples equal lists."""
     one, other = _flat(json.loads(json.dumps(found))), _flat(json.loads(json.dumps(expected)))
     names = sorted(one.keys() | other.keys())
     return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
@@ -97,7 +97,7 @@ def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
     Args:
         folder: need not exist; its parent is made.
-        wait: until another process releases the lock, instead of raising.
+        wait: whether to wait until another process releases the lock, instead of raising.
 
     Raises:
         BusyError: if another process holds the lock.
@@ -192,7 +192,7 @@ class StateFile:
             multihost_utils.sync_global_devices(f"saved {self.path.name}")
 
     def load(self, like: Any, part: str = "") -> Any:
-        """The saved state.
+        """Return the saved state.
 
         Args:
             like: a pytree of arrays or `jax.ShapeDtypeStruct`s with the state's structure, shapes and dtypes; leaves
@@ -250,7 +250,7 @@ class Checkpoints:
         return steps[-1] if steps else None
 
     def at(self, step: int) -> StateFile:
-        """The checkpoint of a step."""
+        """Return the checkpoint of a step."""
         return StateFile(self.folder / f"{step}{_SUFFIX}", self.settings)
 
     def save(self, state: Any, step: int) -> None:
@@ -261,7 +261,7 @@ class Checkpoints:
                 self.at(old).path.unlink()
 
     def load(self, like: Any, part: str = "") -> tuple[Any, int]:
-        """The last checkpoint's state, or a part of it, and its step; see `StateFile.load`.
+        """Return the last checkpoint's state, or a part of it, and its step; see `StateFile.load`.
 
         Raises:
             OptionError: if there is no checkpoint, and as `StateFile.load`.
@@ -343,7 +343,7 @@ def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _named_leaves(tree: Any, part: str = "") -> dict[str, Any]:
-    """Leaves by path: "params/actor/kernel" for attributes, items and indices alike."""
+    """Return the leaves by path: "params/actor/kernel" for attributes, items and indices alike."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves]
     named = {"/".join(filter(None, (part, name))): leaf for name, (_, leaf) in zip(names, leaves, strict=True)}
@@ -353,13 +353,13 @@ def _named_leaves(tree: Any, part: str = "") -> dict[str, Any]:
 
 
 def _file_bytes(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> bytes:
-    """A safetensors file whose bytes are a function of its content."""
+    """Return a safetensors file whose bytes are a function of its content."""
     # The library writes metadata in a random order, so they are put into the header of a file that has none. And it is
     # not `save_file`, which has errors of its own for a full disk.
     content = to_bytes(arrays)
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.dumps({"__metadata__": metadata} | json.loads(content[8:end]), separators=(",", ":")).encode()
-    header += b" " * (-len(header) % 8)  # the arrays are aligned
+    header += b" " * (-len(header) % 8)  # safetensors aligns the arrays by padding the header with spaces
     return b"".join([len(header).to_bytes(8, "little"), header, memoryview(content)[end:]])
 
 

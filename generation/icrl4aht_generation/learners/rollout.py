@@ -151,7 +151,7 @@ def roll_out(
 
 
 def _reset_memory(player: Player, memory: Any, state: EnvState, done: Bool[Array, " N"]) -> Any:
-    """The player's memory, with that of a new episode in the slots whose environment is `done`."""
+    """Return the player's memory, with that of a new episode in the slots whose environment is `done`."""
     ended = done[player.agent_slots % done.shape[0]]
 
     def select(new: Array, old: Array) -> Array:  # the mask is on the leading axis; leaves may be typed keys
@@ -168,7 +168,7 @@ def network_player(
     partner: Any,
     greedy: bool | Array = False,
 ) -> Player:
-    """A player that acts by one policy of the network, or by several at once.
+    """Return a player that acts by one policy of the network, or by several at once.
 
     Args:
         env: the environment.
@@ -208,7 +208,7 @@ def network_player(
 def policy_player(
     env: Environment, policy: Policy, params: Any, agent: int, envs: int, *, own_params: bool = False
 ) -> Player:
-    """A player that does not learn, as one agent of every environment.
+    """Return a player that does not learn, as one agent of every environment.
 
     Its memory is a function of the episode's own key, so that an episode does not depend on the others of the batch.
 
@@ -236,7 +236,7 @@ def policy_player(
 
 
 def random_player(agent: int, envs: int) -> Player:
-    """A player that draws uniformly from the six actions, as one agent of every environment."""
+    """Return a player that draws uniformly from the six actions, as one agent of every environment."""
 
     def act(memory, state: EnvState, key):
         return Choice(jax.random.randint(key, (envs,), 0, len(ACTIONS)), jnp.zeros(envs), jnp.zeros(envs)), memory

@@ -1,7 +1,7 @@
 """Cost of a rebuild, estimated before it starts: exact counts of steps and bytes, and hours within a factor of about 2.
 
-What takes the time is the network, so its forward pass is measured here. How many passes an update needs follows from
-the hyper-parameters. What has little influence is stored: the speed of the environment, and the time to compile.
+The network takes most of the time, so its forward pass is measured here. The number of passes of an update follows from
+the hyper-parameters. Stored figures suffice for the speed of the environment and the time to compile.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class RebuildCost:
         return asdict(self)
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield (quantity, value) of what the profile has, in the order to be printed."""
+        """Yield the rows of the printed table, (quantity, value)."""
         for field in fields(self):
             value, name = getattr(self, field.name), field.name.replace("_", " ")
             if field.name.endswith("_bytes"):
@@ -202,7 +202,7 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
 
     jax.block_until_ready(forward(params, records))
     times = []
-    for _ in range(3):  # the fastest of a few: other programs may use the machine
+    for _ in range(3):  # the fastest of a few, since other programs may slow some down
         began = time.perf_counter()
         jax.block_until_ready(forward(params, records))
         times.append(time.perf_counter() - began)

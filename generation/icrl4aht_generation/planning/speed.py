@@ -40,7 +40,7 @@ def learner_speed(learner: Learner, seed: int = 0) -> dict[str, float]:
 
 
 def _seconds(function: Any, *arguments: Any) -> float:
-    """Time of the fastest of a few calls, after one to compile."""
+    """Return the time of the fastest of a few calls, after one that compiles."""
     jax.block_until_ready(function(*arguments))
     times = []
     for _ in range(_ROUNDS):

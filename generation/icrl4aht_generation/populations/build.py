@@ -51,7 +51,7 @@ def build_suite(
 ) -> list[TeammateSelection]:
     """Train what is unfinished, then write manifests of tasks with the teammates of every finished population.
 
-    Populations that another process trains are left to it, and waited for at the end.
+    Populations that another process is training are skipped, and awaited at the end.
 
     Args:
         profile: sizes of the populations.
@@ -66,7 +66,7 @@ def build_suite(
     Raises:
         OptionError: if matplotlib is not installed.
     """
-    check_can_draw()  # before the long work, not after it
+    check_can_draw()  # fail before the long training, not after it
     for name in chain(*algorithms.values()):
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)
@@ -89,7 +89,7 @@ def build_suite(
 
 
 def population_runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], seed: int) -> list[PopulationRun]:
-    """The populations by these algorithms of each layout, each with a seed of its own."""
+    """Return the populations by these algorithms of each layout, each with a seed of its own."""
     config = profile.teammates
     return [
         PopulationRun(
@@ -105,7 +105,7 @@ def population_runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], s
 
 
 def training_layouts() -> list[str]:
-    """The layouts of all training tasks."""
+    """Return the layouts of all training tasks."""
     return list(dict.fromkeys(name for track in TRACKS for name in track_layouts(track, "train")))
 
 
@@ -229,7 +229,7 @@ def _distances_picture(out: Path, layout: str) -> Path:
 
 
 def _matrix_table(title: str, corner: str, names: Sequence[str], values: np.ndarray, form: str) -> Table:
-    """A square matrix with the same names for rows and columns."""
+    """Return a square matrix with the same names for rows and columns."""
     table = Table(title=title)
     table.add_column(corner)
     for name in names:

@@ -31,7 +31,7 @@ def cross_play_returns(
     episodes: int = EPISODES_PER_PAIR,
     greedy: bool = False,
 ) -> np.ndarray:
-    """Mean returns of all pairs over episodes of 400 steps.
+    """Return mean returns of all pairs over episodes of 400 steps.
 
     Args:
         layout: the layout.
@@ -61,7 +61,7 @@ def paired_returns(
     episodes: int = EPISODES_PER_PAIR,
     greedy: bool = False,
 ) -> np.ndarray:
-    """Mean returns float64 (A,) of ego i with teammate i; arguments as in `cross_play_returns`."""
+    """Return mean returns float64 (A,) of ego i with teammate i; arguments as in `cross_play_returns`."""
     pairs = tuple(range(jax.tree.leaves(egos)[0].shape[0]))
     play = _compiled(layout, network.widths, network.partners, pairs, pairs, episodes, greedy)
     return np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64)
@@ -71,7 +71,7 @@ def paired_returns(
 def _compiled(
     layout: Layout, widths: Widths, partners: int, first: tuple, second: tuple, episodes: int, greedy: bool
 ) -> Callable[[Any, Any, jax.Array], jax.Array]:
-    """A function of both stacks and a key that returns the mean return of each pair (first[k], second[k])."""
+    """Return a function of both stacks and a key that returns the mean return of each pair (first[k], second[k])."""
     env, network = Environment(layout), ActorCritic(widths, partners)
     n = len(first) * episodes
     policies = [np.repeat(np.array(side), episodes) for side in (first, second)]

@@ -25,7 +25,7 @@ _EPISODES = 2
 def actions_on_common_states(
     layout: Layout, policies: Sequence[Policy], seed: int = 0, steps: int = EPISODE_STEPS
 ) -> np.ndarray:
-    """Actions of every policy, as the teammate, on the same states.
+    """Return actions of every policy, as the teammate, on the same states.
 
     The states are those of roll-outs with a uniformly random ego and each policy in turn as the teammate, two episodes
     each. Every policy acts on every state; its memory follows the episode that it observes.
@@ -40,12 +40,12 @@ def actions_on_common_states(
 
 
 def hamming_distances(actions: np.ndarray) -> np.ndarray:
-    """Share of states on which two policies act differently: int (P, N) -> float64 (P, P)."""
+    """Return the share of states on which two policies act differently: int (P, N) -> float64 (P, P)."""
     return (actions[:, None] != actions[None]).mean(axis=-1)
 
 
 def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]]) -> np.ndarray:
-    """Mean distances of families, over all pairs of their policies: (P, P) -> float64 (F, F).
+    """Return mean distances of families, over all pairs of their policies: (P, P) -> float64 (F, F).
 
     Within a family, pairs of a policy with itself count too, as in the paper's formula.
     """
@@ -53,7 +53,7 @@ def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]
 
 
 def _play(env: Environment, numbers: list[int], family: Policy, key: Any) -> jax.Array:
-    """Records uint8 (T, policies x 2, S) of a random ego with each policy of the family."""
+    """Return records uint8 (T, policies x 2, S) of a random ego with each policy of the family."""
     n = len(numbers) * _EPISODES
 
     @jax.jit

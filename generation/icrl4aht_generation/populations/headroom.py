@@ -1,5 +1,5 @@
-"""Measure whether an ego matters with learned teammates: what the reference egos and the policy that a teammate was
-trained with earn with it."""
+"""Returns of the reference egos with learned teammates, and of the policy that each teammate was
+trained with."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceE
 
 
 def _partner(folder: Path) -> Path:
-    """Folder of the policy that a checkpoint, m<k>/c<n>, was trained with."""
+    """Return the folder of the policy that a checkpoint, m<k>/c<n>, was trained with."""
     response = folder.parent.parent / RESPONSES / folder.parent.name
     return response if response.is_dir() else folder
 
@@ -64,7 +64,7 @@ def _paired_return(layout: Layout, ego: Policy, mate: Policy) -> float:
 
 @lru_cache(maxsize=8)
 def _compiled(layout: Layout, ego: Policy, mate: Policy) -> Callable[[Any, Any], jax.Array]:
-    """A function of both policies' parameters that returns the returns, float32 (REFERENCE_EPISODES,)."""
+    """Return a function of both policies' parameters that returns the returns, float32 (REFERENCE_EPISODES,)."""
     env = Environment(layout, KEPT_STEPS)
 
     @jax.jit

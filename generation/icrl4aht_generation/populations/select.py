@@ -73,7 +73,7 @@ def select_teammates(
 
 
 def _members_in_turn(points: Sequence[SuiteCheckpoint]) -> list[SuiteCheckpoint]:
-    """The first of each member in the given order, then the second of each, and so on."""
+    """Return the first of each member in the given order, then the second of each, and so on."""
     seen: Counter[int] = Counter()
     turns = []
     for point in points:
@@ -93,7 +93,7 @@ def _return_as_teammate(suite: Path, point: SuiteCheckpoint) -> float:
 
 
 def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str) -> list[Task]:
-    """One task per teammate, each with a seed that does not depend on the rest of the suite."""
+    """Return one task per teammate, each with a seed that does not depend on the rest of the suite."""
     tasks = []
     for selection in selections:
         first = 10_000 * (layout_number(selection.layout) + 1) + 1_000 * ALGORITHMS.index(selection.algorithm)

@@ -181,7 +181,7 @@ def train_population(
         save_seconds: least time between two saves.
 
     Returns:
-        Whether there was anything to do; False if the population was finished before.
+        False if the population was already finished, otherwise True.
 
     Raises:
         BusyError: if another process trains into this folder.
@@ -217,7 +217,7 @@ class _PopulationTraining:
         self._finish()
 
     def _resume(self) -> tuple[int, PopulationState | None]:
-        """Number of updates done over all stages, and the state after them; None at the start."""
+        """Return the number of updates done over all stages, and the state after them; None at the start."""
         done = self.saved.progress
         if done is None:  # remove the checkpoints of a run that was killed before its first save
             for folder in (*self.folder.glob("m[0-9]*"), self.folder / RESPONSES):
@@ -261,7 +261,7 @@ class _PopulationTraining:
                 self.saved.save(state, done)
 
     def _line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
-        """A line of the log; means over no episodes are left out."""
+        """Return a line of the log; means over no episodes are left out."""
         values = {name: float(value) for name, value in metrics.items()}
         if not values["episodes"]:
             del values["self_play"], values["cross_play"]
@@ -359,7 +359,7 @@ def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
 
 
 def population_threads(suite: Path, layout: str, algorithm: str) -> int | None:
-    """Number of XLA threads that trained a suite's population; None if the suite does not say."""
+    """Return the number of XLA threads that trained a suite's population; None if the suite does not say."""
     try:
         content = json.loads((suite / layout / algorithm / POPULATION).read_text(encoding="utf-8"))
         return content["software"]["xla_threads"]
@@ -370,7 +370,7 @@ def population_threads(suite: Path, layout: str, algorithm: str) -> int | None:
 def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:
     """Yield the checkpoints of a population's members, by member and checkpoint.
 
-    Without those of CoMeDi's first policy, which is trained as FCP's are (see `SuiteCheckpoint.is_member`).
+    CoMeDi's first policy is excluded, since it is trained by plain self-play (see `SuiteCheckpoint.is_member`).
 
     Raises:
         OptionError: if the population is not finished.
@@ -386,7 +386,7 @@ def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Suit
 
 
 def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:
-    """Mean returns float64 (K, K) of a population's final policies with each other.
+    """Return mean returns float64 (K, K) of a population's final policies with each other.
 
     Args:
         suite: the suite's folder.

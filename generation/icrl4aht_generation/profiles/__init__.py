@@ -25,7 +25,7 @@ FOLDER = Path(__file__).parent
 
 Value = TypeVar("Value")
 _Names = tuple[str, ...]
-_Return = Annotated[float, Meta(ge=-1e6, le=1e6)]  # finite
+_Return = Annotated[float, Meta(ge=-1e6, le=1e6)]  # a finite number
 
 
 class _Release(Struct, forbid_unknown_fields=True):
@@ -71,12 +71,12 @@ class _ProfileFile(Struct, forbid_unknown_fields=True):
 
 
 def profile_names() -> list[str]:
-    """Names of the shipped profiles."""
+    """Return the names of the shipped profiles."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
 def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile: None) -> Profile:
-    """A profile by name, or by the path of a TOML file.
+    """Return a profile by name, or by the path of a TOML file.
 
     Args:
         name: the name or the path.
@@ -180,7 +180,7 @@ def _sampled(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...
 
 
 def _teammates(values: dict[str, Any]) -> TeammateConfig:
-    """[teammates] holds the sizes of the suite next to the hyper-parameters of its policies."""
+    """Split section [teammates] into the sizes of the suite and the hyper-parameters of its policies."""
     sizes = {name: values[name] for name in ("members", "train", "heldout") if name in values}
     rest = {name: value for name, value in values.items() if name not in sizes}
     ppo = replace_options(TeammateConfig().ppo, rest, "teammates.")
@@ -188,7 +188,7 @@ def _teammates(values: dict[str, Any]) -> TeammateConfig:
 
 
 def _by_layout(key: str, value: Mapping[str, Value] | Value, layouts: tuple[str, ...]) -> dict[str, Value]:
-    """Layout -> value, which is one for all layouts, or a table of some of them."""
+    """Return layout -> value, which is one for all layouts, or a table of some of them."""
     if not isinstance(value, Mapping):
         return dict.fromkeys(layouts, value)
     found = dict(zip(_layouts(key, list(value)), value.values(), strict=True))

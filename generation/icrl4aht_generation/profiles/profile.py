@@ -1,4 +1,4 @@
-"""What a profile says: the sizes of a rebuild and the units of work that it consists of."""
+"""Profile: the sizes of a rebuild, and the artefacts to be made."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class SampledConfig:
     validation: dict[str, int]
 
     def training(self, layout: str, source: str) -> list[dict[str, Any]]:
-        """The training teammates of a source on a layout.
+        """Return the training teammates of a source on a layout.
 
         Raises:
             OptionError: if there are fewer draws that differ from the test instances.
@@ -84,7 +84,7 @@ class SampledConfig:
         return [entry for entry, _ in (drawn[: self.ppo[layout]] if source == "ppo" else drawn)]
 
     def validating(self, layout: str) -> list[dict[str, Any]]:
-        """The validation teammates on a layout.
+        """Return the validation teammates on a layout.
 
         Raises:
             OptionError: if there are fewer draws that differ from the test instances.
@@ -98,7 +98,7 @@ class Profile:
     """The size of a rebuild.
 
     Attributes:
-        name: of the profile's file.
+        name: name of the profile's file.
         ego: hyper-parameters of the egos.
         teammates: the learned teammates.
         data_version: version of the release, SemVer.
@@ -173,15 +173,15 @@ class Profile:
             raise OptionError(f"profile {self.name} with the given options: {error}") from error
 
     def ego_on(self, layout: str) -> PPOConfig:
-        """Hyper-parameters of the egos on a layout (short name)."""
+        """Return the hyper-parameters of the egos on a layout (short name)."""
         return self.ego_layouts.get(layout, self.ego)
 
     def updates(self, work: Work) -> int:
-        """Number of updates of a learner, or of histories of the source "noise": the units of its progress."""
+        """Return the units of progress: updates of a learner, or histories of the source "noise"."""
         return self.ego_on(work.task.layout.name).updates if work.source == "ppo" else self.noise.histories
 
     def works(self, learned: Sequence[Task] = ()) -> list[Work]:
-        """The units of work, by source and layout.
+        """Return the units of work, by source and layout.
 
         Args:
             learned: training tasks with learned teammates, see `populations.select.make_tasks`.
@@ -198,7 +198,7 @@ class Profile:
         return works
 
     def works_of(self, tasks: Sequence[Task], sources: Mapping[str, str]) -> list[Work]:
-        """The units of work of given tasks.
+        """Return the units of work of given tasks.
 
         Args:
             tasks: the tasks.
@@ -222,7 +222,7 @@ class Profile:
         return self.learners if source == "ppo" else 1
 
     def tasks_on(self, layout: str, source: str) -> int:
-        """Number of tasks of a source on a layout, if every population has enough good teammates."""
+        """Return the number of tasks of a source on a layout, if every population has enough good teammates."""
         learned = len(self.algorithms.get(layout, ())) * self.teammates.train
         return len(self._heuristic_tasks(layout, source)) + learned
 
@@ -249,14 +249,14 @@ class Profile:
 
 
 def _sampled_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:
-    """A seed that no other task has, and that does not depend on the rest of the profile."""
+    """Return a seed that no other task has, and that does not depend on the rest of the profile."""
     family = list(HEURISTIC_KINDS).index(entry["family"])
     first = LAYOUT_NAMES.index(layout) * _LAYOUT_SEEDS + family * _FAMILY_SEEDS + entry["base_seed"] * _DRAW_SEEDS
     return _first_seed(source) + first + entry["theta_id"]
 
 
 def _of_source(task: Task, source: str) -> Task:
-    """A task with a preset or a learned teammate as one of a source: those of "ppo" keep their seed."""
+    """Return a task with a preset or a learned teammate as one of a source: those of "ppo" keep their seed."""
     if source == "ppo":
         return task
     seed = _first_seed(source) + _UNSAMPLED_SEEDS + task.seed

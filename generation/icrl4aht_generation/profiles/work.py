@@ -1,4 +1,4 @@
-"""Units of collection: what a process makes at a time."""
+"""Unit of work of a collection: one artefact, made by one process."""
 
 from __future__ import annotations
 

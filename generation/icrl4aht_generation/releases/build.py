@@ -69,7 +69,7 @@ def build_releases(
         OptionError: if `out` has files that no rebuild makes, if something but a release of this profile is at
             out/<kind>, or if matplotlib is not installed.
     """
-    check_can_draw()  # before the long work, not after it
+    check_can_draw()  # fail before the long training, not after it
     for kind in kinds:
         check_release_folder(out / kind, profile)
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
@@ -107,7 +107,7 @@ def build_releases(
 def train_teammates(
     profile: Profile, suite: Path, seed: int, console: Console
 ) -> tuple[list[Work], dict[str, ReferenceEgos], list[LeftOutTask]]:
-    """The units of work of a profile, for which its learned teammates are trained first.
+    """Return the units of work of a profile, for which its learned teammates are trained first.
 
     Returns:
         The units; task id -> how much an ego matters with learned teammates; the tasks that are not collected, because

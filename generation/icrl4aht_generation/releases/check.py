@@ -39,7 +39,7 @@ class Comparison:
     xla_threads: tuple[list[int], list[int]] = ([], [])
 
     def to_json(self) -> dict[str, Any]:
-        """The fields, and whether the folders are equal."""
+        """Return the fields, and whether the folders are equal."""
         return {"equal": not self.differences, **asdict(self)}
 
 
@@ -74,7 +74,7 @@ def _files(root: Path) -> set[str]:
 
 
 def _xla_threads(root: Path, names: set[str]) -> list[int]:
-    """The numbers of XLA threads in records of tasks, populations and releases."""
+    """Return the numbers of XLA threads in records of tasks, populations and releases."""
     records = [root / name for name in names if name.endswith((METADATA, POPULATION, PROVENANCE))]
     found = {number for path in records for number in re.findall(rb'"xla_threads":\s*(\d+)', path.read_bytes())}
     return sorted(map(int, found))
@@ -84,7 +84,7 @@ def _describe_difference(a: Path, b: Path) -> str:
     if a.suffix == ".npy":
         try:
             return _describe_arrays(np.load(a, mmap_mode="r"), np.load(b, mmap_mode="r"))
-        except ValueError:  # one of them is not an array
+        except ValueError:  # one of the files is not an array
             pass
     sizes = a.stat().st_size, b.stat().st_size
     ours, theirs = np.memmap(a, np.uint8, "r") if sizes[0] else (), np.memmap(b, np.uint8, "r") if sizes[1] else ()

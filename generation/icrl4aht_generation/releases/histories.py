@@ -1,4 +1,4 @@
-"""The histories of a task that a release keeps, and why it keeps none of others."""
+"""Selection of the histories that a release keeps of each task."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class TaskHistories(NamedTuple):
         return np.concatenate([own[streams] for own, streams in zip(self.returns, self.streams, strict=True)])
 
     def left_out(self, reason: str) -> LeftOutTask:
-        """Return the note about the task if the release is without it."""
+        """Return the note about a task that the release leaves out."""
         start, end = (round(float(ends.mean()), 3) for ends in curve_ends(self.recorded))
         learners = len(self.folders) if self.source == "ppo" else 0
         layout, name = self.task.layout.name, teammate_name(self.task)
@@ -71,7 +71,7 @@ def select_histories(
         artefacts: folder of the finished artefacts.
         works: the task's units of work.
         profile: the profile.
-        facts: what is known of the teammate.
+        facts: facts about the teammate.
         headroom: whether the ego matters with any teammate of the profile on this layout.
     """
     task, source = works[0].task, works[0].source

@@ -1,4 +1,4 @@
-"""Which checkpoint of an ego labels its task's histories, by what the checkpoints earn with the task's teammate.
+"""Choice of the ego checkpoint that labels a task's histories, by returns with the task's teammate.
 
 The labeller is the last checkpoint, the paper's, unless an earlier one earns clearly more when it acts greedily, as
 labellers do. A policy that was trained to draw its actions can repeat the action "stay" when it always takes the most
@@ -38,8 +38,8 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.releases.remembered import measured_once
 from icrl4aht_generation.teammates.registry import build_teammate
 
-_LEAST_GAIN = 2.0  # what an earlier checkpoint must earn more: a tenth of a delivery per episode
-_STANDARD_ERRORS = 2.0  # and by how many standard errors of the difference
+_LEAST_GAIN = 2.0  # minimum gain of an earlier checkpoint: a tenth of a delivery per episode
+_STANDARD_ERRORS = 2.0  # minimum gain in standard errors of the difference
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class CheckpointReturns(msgspec.Struct):
 
 
 def choose_labeller(folders: Sequence[Path], task: Task, suite: Path) -> Labeller:
-    """Choose the checkpoint that labels the histories of a task: of each learner's choice the one that earns most.
+    """Choose the checkpoint that labels the histories of a task: the best of the learners' choices.
 
     Args:
         folders: the finished artefacts of the task's learners.
@@ -124,7 +124,7 @@ def learner_labeller(folder: Path, task: Task, suite: Path) -> Labeller:
 
 
 def choose_checkpoint(returns: np.ndarray) -> int:
-    """Number of the checkpoint that labels: the last one, or the best of those that earn clearly more.
+    """Return the number of the checkpoint that labels: the last one, or the best of those that earn clearly more.
 
     An earlier checkpoint earns clearly more if the mean of its differences to the last one, episode by episode, is at
     least 2 (a delivery is worth 20) and above two standard errors of that mean.
@@ -139,7 +139,7 @@ def choose_checkpoint(returns: np.ndarray) -> int:
     if not clearly.any():
         return len(returns) - 1
     best = np.where(clearly, means, -np.inf)
-    return len(best) - 1 - int(np.argmax(best[::-1]))  # of equal ones the latest
+    return len(best) - 1 - int(np.argmax(best[::-1]))  # the latest among equals
 
 
 def _measure(checkpoints: list[Path], task: Task, suite: Path) -> CheckpointReturns:
@@ -156,7 +156,7 @@ def _measure(checkpoints: list[Path], task: Task, suite: Path) -> CheckpointRetu
 
 @lru_cache(maxsize=8)
 def _compiled(layout: Layout, widths: Widths, teammate: Policy) -> Callable[..., jax.Array]:
-    """A function of the ego's parameters, whether it acts greedily, the teammate's parameters and a key.
+    """Return a function of the ego's parameters, whether it acts greedily, the teammate's parameters and a key.
 
     It returns the returns, float32 (LABEL_EPISODES,), of the first `KEPT_STEPS` steps of episodes, which are the same
     ones for all egos. One compilation serves all teammates of one family on one layout.

@@ -1,6 +1,6 @@
 """Facts about the teammates of a release: returns of the reference egos with them, and the nearest test teammate.
 
-Those of drawn teammates are in the table `teammates/draws.jsonl`, those of a release's teammates in its provenance.
+Facts about drawn teammates are in `teammates/draws.jsonl`, those about a release's teammates in its provenance.
 Others are measured once; the measurements are kept next to the artefacts, in hidden files `.<layout>.teammates.json`.
 """
 
@@ -43,7 +43,7 @@ class TeammateFacts(NamedTuple):
 
     @property
     def matters(self) -> bool:
-        """Whether the ego matters with it."""
+        """Whether an ego can raise the return with this teammate."""
         return self.references.matters
 
 
@@ -91,7 +91,7 @@ def recorded_provenance(suite: Path) -> dict[str, Provenance]:
 
 
 def _settings(layout: str, tasks: Sequence[Task]) -> dict[str, Any]:
-    """What measurements depend on."""
+    """Return the settings that measurements depend on."""
     known = {"layout": layout, "teammates": [task.teammate for task in tasks], "episodes": REFERENCE_EPISODES}
     return software_versions() | {"version": version("icrl4aht-data")} | known
 
@@ -126,7 +126,7 @@ def _measure(
 
 
 def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path) -> dict[str, NearestTest]:
-    """task id -> nearest test teammate; nothing on layouts without training tasks."""
+    """Return the nearest test teammate by task id; empty on layouts without training tasks."""
     if not tasks or layout.name not in TESTED_ON:
         return {}
     near = nearest_test(layout, [_build(task, suite) for task in tasks])

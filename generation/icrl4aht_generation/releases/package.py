@@ -64,7 +64,7 @@ def package_release(
         suite: folder of the learned teammates.
         kind: kind of the release.
         advance: called after each task with 0, when its histories are chosen, and with 1, when it is written.
-        facts: task id -> what is known of its teammate; by default it is looked up and measured.
+        facts: task id -> facts about its teammate; by default they are looked up or measured.
         left_out: tasks that were not collected, for the list in meta/info.json.
 
     Raises:
@@ -102,7 +102,7 @@ def package_release(
 
 
 def _by_task(works: Sequence[Work]) -> dict[str, list[Work]]:
-    """task id -> its units of work."""
+    """Return the units of work by task id."""
     tasks: dict[str, list[Work]] = {}
     for work in works:
         tasks.setdefault(work.task.task_id, []).append(work)
@@ -135,7 +135,7 @@ def bundle_release(release: Path) -> Path:
 
 
 def recorded_sources(release: Path) -> dict[str, str]:
-    """task id -> source, as a release says; empty for a folder that is none."""
+    """Return the source of each task id from a release's provenance; empty if the folder is not a release."""
     path = release / PROVENANCE
     recorded = read_provenance(path) if path.is_file() else {}
     return {task_id: made.source or "ppo" for task_id, made in recorded.items()}
@@ -183,7 +183,7 @@ def _new_task(
 
 
 def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
-    """A task of the source "noise", whose labels are the actions of its script."""
+    """Return a task of the source "noise", whose labels are the actions of its script."""
     earned = made.references
     expert = ExpertLabels(
         policy_sha256=None,
@@ -202,7 +202,7 @@ def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files:
 
 
 def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: Path, files: dict[str, Path]) -> NewTask:
-    """A task of the source "ppo", whose labels are the greedy actions of a checkpoint."""
+    """Return a task of the source "ppo", whose labels are the greedy actions of a checkpoint."""
     task = found.task
     for number, folder in enumerate(found.folders):
         title = f"{task.layout.name} with {task.teammate_kind}" + f", learner {number}" * (len(found.folders) > 1)

@@ -1,4 +1,4 @@
-"""Measurements that are kept in a file with what they depend on, and are made again when that changes."""
+"""Measurements cached in a JSON file with the settings that they depend on."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ T = TypeVar("T")
 
 
 def measured_once(path: Path, settings: dict[str, Any], kind: type[T], measure: Callable[[], T]) -> T:
-    """Return the measurements in a JSON file; where there are none of these settings, measure and write them.
+    """Return the measurements cached in a JSON file; measure and write them if its settings differ.
 
     Args:
         path: the file.
         settings: what the measurements depend on.
         kind: their type, which msgspec checks.
-        measure: makes them.
+        measure: function that measures them.
     """
     try:
         content = msgspec.json.decode(read_text(path))  # unlike `json`, it refuses NaN
         if content["settings"] == json.loads(json.dumps(settings)):
             return msgspec.convert(content["measured"], kind)
     except (IndexFormatError, KeyError, TypeError, msgspec.MsgspecError):
-        pass  # damaged, or of another version
+        pass  # damaged, or written by another version
     measured = measure()
     with atomic_write(path) as partial:
         partial.write_bytes(msgspec.json.encode({"settings": settings, "measured": measured}))

@@ -155,7 +155,7 @@ def _act_along(layout: Layout, family: Policy, records: Array, key: Key[Array, "
 
 
 def distances_to_tests(common: CommonStates, actions: np.ndarray) -> np.ndarray:
-    """Distances of teammates to the test instances: int8 (teammates, T, N) -> float64 (teammates, instances)."""
+    """Return distances of teammates to the test instances: int8 (teammates, T, N) -> float64 (teammates, instances)."""
     return np.stack(
         [
             (common.family_states(actions, number) != tested).mean(axis=(1, 2))

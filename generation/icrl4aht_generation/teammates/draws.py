@@ -1,4 +1,4 @@
-"""Drawn heuristic teammates: which ones training and validation tasks may have.
+"""Sampled heuristic teammates for training and validation tasks.
 
 `draws.jsonl` has one line per draw, measured by `icrl4aht-data research draws`, so that tasks are known without any
 simulation. Most parameters that decide how a heuristic acts are in no published range, so that many draws from the
@@ -39,9 +39,9 @@ _VALIDATION_SEED, _VALIDATION_TEAMMATES = 1, 4
 
 _DIVERSE_SEEDS = {"train": 2, "validation": 3}
 
-_DIVERSE_TEAMMATES = {"train": 12, "validation": 3}  # of each layout and family, at most
+_DIVERSE_TEAMMATES = {"train": 12, "validation": 3}  # maximum for each layout and family
 
-_DIVERSE_DISTANCE = 0.1  # least distance of a diverse draw to every test instance, of all families
+_DIVERSE_DISTANCE = 0.1  # minimum distance of a diverse draw to the test instances of all families
 
 
 def ranges_of(base_seed: int) -> str:
@@ -87,7 +87,7 @@ class Draw(NamedTuple):
 
     @property
     def admissible(self) -> bool:
-        """Whether it acts unlike every test instance of its family; if it is diverse, of all families, and more so."""
+        """Whether the draw acts differently from every test instance of its family (of all families if diverse)."""
         return self.nearest_counted[0] >= _least_distance(self.base_seed)
 
     @property
@@ -99,7 +99,7 @@ class Draw(NamedTuple):
 
     @property
     def like_another_family(self) -> bool:
-        """Whether it acts like a test instance of another family."""
+        """Whether the draw acts like a test instance of another family."""
         return self.other_distance < SAME_BEHAVIOUR
 
     @property
@@ -110,7 +110,7 @@ class Draw(NamedTuple):
 
     @property
     def headroom(self) -> bool:
-        """Whether the ego matters."""
+        """Whether an ego can raise the return with this teammate."""
         return self.spread >= LEAST_HEADROOM
 
 
@@ -170,7 +170,7 @@ def drawn_teammates(
 
 
 def validation_tasks(track: str) -> list[Task]:
-    """Tasks of the split `validation`, for choosing models: up to four teammates of each training layout, of seed 1.
+    """Return the tasks of split `validation`, for model selection: up to four per training layout, seed 1.
 
     Layouts on which every draw of that seed acts like a test instance have none.
     """
@@ -184,7 +184,7 @@ def validation_tasks(track: str) -> list[Task]:
 
 
 def diverse_tasks(track: str, split: str) -> list[Task]:
-    """Tasks with diverse teammates on the training layouts of a track, for models that learn by playing.
+    """Return tasks with diverse teammates on a track's training layouts, for models that learn by playing.
 
     Up to twelve of each layout and family for training, three for validation, each of another behaviour.
 
@@ -213,7 +213,7 @@ def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
 
 
 def _equal(theta: Mapping[str, float], other: Mapping[str, float]) -> bool:
-    """Whether two parameter sets are equal up to the last digit, in which compilations of a draw may differ."""
+    """Return whether two parameter sets are equal up to the last digit, in which compilations of a draw may differ."""
     return theta.keys() == other.keys() and all(math.isclose(theta[name], other[name], rel_tol=1e-6) for name in theta)
 
 
@@ -228,7 +228,7 @@ def hosted_families(layout: str, base_seed: int = 0) -> list[str]:
 
 
 def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
-    """The draws of a family that may be chosen, in the order in which they are; at least one.
+    """Return the draws of a family that may be chosen, in order of preference; at least one.
 
     Those that act like a test instance of another family come last.
     """
@@ -253,13 +253,13 @@ def _usable(layout: str, family: str, base_seed: int) -> list[Draw]:
 
 
 def _has_headroom(layout: str, base_seed: int) -> bool:
-    """Whether any admissible draw of the layout has headroom."""
+    """Return whether any admissible draw of the layout has headroom."""
     draws = (draw for family in HEURISTIC_FAMILIES for draw in read_draws(layout, family, base_seed))
     return any(draw.admissible and draw.headroom for draw in draws)
 
 
 def _reason(layout: str, family: str, base_seed: int) -> str:
-    """Why no draw of a family may be used on a layout."""
+    """Return why no draw of a family may be used on a layout."""
     draws = read_draws(layout, family, base_seed)
     if not draws:
         return "it has no draws there; `icrl4aht-data research draws` measures them"
@@ -286,7 +286,7 @@ def _bundled_draws() -> dict[tuple[str, str, int], tuple[Draw, ...]]:
 
 
 def read_draws_table(path: Path) -> list[Draw]:
-    """The draws of a table, in its order.
+    """Return the draws of a table, in its order.
 
     Raises:
         TaskFormatError: names the file and the line.

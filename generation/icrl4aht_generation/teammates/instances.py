@@ -102,7 +102,7 @@ INSTANCES = 5
 
 
 def published_thetas(layout: str, family: str) -> list[dict[str, Any]]:
-    """The published parameter sets t0..t4 of a family on a layout (short name)."""
+    """Return the published parameter sets t0..t4 of a family on a layout (short name)."""
     sets = (_CRAMPED if layout == "cramped_down" else _FAMILIES)[family]
     return [{name: _published(values[t], family) for name, values in sets.items()} for t in range(INSTANCES)]
 
@@ -115,7 +115,7 @@ def _published(value: float, family: str) -> float:
 
 
 def published_task(layout: str, teammate: str) -> Task:
-    """The test task of a layout, of the test or the training split, with a teammate such as "H3/t1".
+    """Return the test task of a layout, of the test or the training split, with a teammate such as "H3/t1".
 
     Raises:
         UnknownNameError: for an unknown layout, family or instance.
@@ -132,7 +132,7 @@ def published_task(layout: str, teammate: str) -> Task:
 
 
 def published_tasks(track: str) -> list[Task]:
-    """The published test tasks of a track, by layout, family and instance."""
+    """Return the published test tasks of a track, by layout, family and instance."""
     return [
         make_task(
             track,

@@ -27,7 +27,7 @@ _CRITIC = ("critic", "critic_hidden")
 
 
 def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Policy:
-    """A checkpoint as a policy for either agent; its recurrent state is reset at each episode.
+    """Return a checkpoint as a policy for either agent; its recurrent state is reset at each episode.
 
     Args:
         layout: the layout.
@@ -52,7 +52,7 @@ def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Po
 
 
 def build_untrained(layout: Layout, widths: Widths) -> Policy:
-    """A policy with initial parameters, for measuring speed."""
+    """Return a policy with initial parameters, for measuring speed."""
     init, act = _functions(widths, "greedy")
     params = ActorCritic(widths, critic=False).untrained(jax.random.key(0), layout.channels)
     return Policy(params, init, act, "observation")
@@ -61,7 +61,7 @@ def build_untrained(layout: Layout, widths: Widths) -> Policy:
 def build_learned_entry(
     layout: Layout, teammate: dict[str, Any], suite: Path | None, action: Action = "greedy"
 ) -> Policy:
-    """The policy of a task's teammate entry of kind "rl".
+    """Return the policy of a task's teammate entry of kind "rl".
 
     Args:
         layout: the layout.
@@ -90,7 +90,7 @@ def build_learned_entry(
 
 @lru_cache(maxsize=16)
 def _functions(widths: Widths, action: Action):
-    """`init` and `act`, one pair for all checkpoints of one shape, so that they share compilations."""
+    """Return `init` and `act`, shared by all checkpoints of one shape, which so share compilations."""
     network = ActorCritic(widths, critic=False)
 
     def init(params, key: Key[Array, ""]) -> Array:
@@ -111,6 +111,6 @@ def _shapes(network: ActorCritic, layout: Layout) -> dict[str, Any]:
 
 
 def _differing(one: Any, other: Any) -> dict[str, Any]:
-    """The shapes in one tree that differ from the other's, by path."""
+    """Return the shapes in one tree that differ from the other's, by path."""
     others = flatten_dict(other, sep="/")
     return {name: shape for name, shape in flatten_dict(one, sep="/").items() if others.get(name) != shape}

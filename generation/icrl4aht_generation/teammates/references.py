@@ -87,7 +87,7 @@ def reference_egos(layout: Layout) -> dict[str, Policy]:
 def player_in_some(
     env: Environment, policy: Policy, params: Any, agent: int, envs: np.ndarray, total: int, *, own_params: bool = False
 ) -> Player:
-    """A player that does not learn, as one agent of some of the environments.
+    """Return a player that does not learn, as one agent of some of the environments.
 
     Args:
         env: the environment.

@@ -33,7 +33,7 @@ _JITTER = 0.2
 
 
 def heuristic_teammate(family: str, preset: str, theta_id: int) -> dict[str, Any]:
-    """The teammate entry of a heuristic's preset, every parameter explicit.
+    """Return the teammate entry of a heuristic's preset, every parameter explicit.
 
     Raises:
         UnknownNameError: for a family or preset that does not exist.
@@ -46,7 +46,7 @@ def heuristic_teammate(family: str, preset: str, theta_id: int) -> dict[str, Any
 
 
 def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) -> dict[str, Any]:
-    """A teammate entry with preset and parameters drawn by the string `family:theta_id:split:base_seed`.
+    """Return a teammate entry with preset and parameters drawn by the string `family:theta_id:split:base_seed`.
 
     Published tasks do not come from here: their manifests state every parameter (paper, App. B.2, train and test
     ranges).
@@ -105,7 +105,7 @@ def build_teammate(
     noise: Noise = "seeded",
     suite: Path | None = None,
 ) -> Policy:
-    """The policy of a task's teammate entry; learned ones act greedily.
+    """Return the policy of a task's teammate entry; learned ones act greedily.
 
     Args:
         layout: the layout.
@@ -128,7 +128,7 @@ def build_teammate(
 
 
 def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
-    """The teammate of a history, as it played.
+    """Return the teammate of a history, as it played.
 
     Raises:
         OptionError: if the release does not hold the teammate's checkpoint.

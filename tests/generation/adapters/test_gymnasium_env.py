@@ -76,7 +76,7 @@ def bundled(**filters) -> tuple:
 
 
 def play_recorded(env, history, start: int, steps: int) -> tuple[list, list, list, list]:
-    """Observations, states, rewards and the teammate's actions that a history's actions lead to."""
+    """Return observations, states, rewards and the teammate's actions that a history's actions lead to."""
     observations, states, rewards, teammate = [], [], [], []
     for action in history.actions[start : start + steps]:
         observation, reward, terminated, truncated, info = env.step(action)
@@ -115,7 +115,7 @@ def test_recorded_actions_lead_to_the_recorded_history(filters):
 
 
 @pytest.mark.parametrize("source", ["ppo", "noise"])
-def test_heuristics_repeat_what_they_drew(source):
+def test_recovered_keys_reproduce_heuristics(source):
     """With the keys of a recorded episode, the teammate's policy plays as recorded without a script."""
     dataset, history = bundled(layout="demo_wide", source=source, teammate_family=["H1", "H2", "H3", "H4"])
     recovered = dataset.recover_environment(history.entry.history_id)

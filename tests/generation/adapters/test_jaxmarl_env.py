@@ -20,8 +20,8 @@ from icrl4aht_data.overcooked.observe import observe_both
 N, STEPS, LENGTH = 4, 30, 12
 
 
-def test_it_has_what_the_base_class_asks_for():
-    """Every method that JaxMARL's base class leaves to environments is there, and what it returns fits the spaces."""
+def test_it_implements_the_base_class():
+    """Every abstract method of JaxMARL's base class is implemented, and its results fit the spaces."""
     env = JaxMARLEnv("demo_wide", channels="canonical")
     assert isinstance(env, MultiAgentEnv)
     obs, state = env.reset(jax.random.PRNGKey(0))
@@ -36,7 +36,7 @@ def test_it_has_what_the_base_class_asks_for():
 
 
 @pytest.mark.slow
-def test_a_learners_loop_steps_it_as_our_environment_plays():
+def test_a_vmapped_training_loop_equals_our_environment():
     """The loop of JaxMARL's IPPO: its wrapper, vmapped over environments and scanned over steps, with resets."""
     env, layout = JaxMARLEnv("cramped_up", max_steps=LENGTH), get_layout("cramped_up")
     logged = LogWrapper(env, replace_info=False)

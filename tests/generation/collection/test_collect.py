@@ -1,4 +1,4 @@
-"""A task's artefact: killed at any moment and resumed, it is that of an uninterrupted run."""
+"""Collection of one task: killed and resumed runs write the artefact of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def stop_after(update: int):
 
 
 @pytest.mark.slow
-def test_killed_at_three_random_moments_the_artefact_is_the_same(built, tmp_path):
+def test_runs_killed_at_random_write_the_same_artefact(built, tmp_path):
     folder = tmp_path / artefact(built / "a").name
     command = ["-c", COLLECT, str(built / "tiny.toml"), str(folder), "0.1"]
     seed = int(os.environ.get("KILL_SEED", "7"))
@@ -79,7 +79,7 @@ def test_killed_at_three_random_moments_the_artefact_is_the_same(built, tmp_path
     assert not partial_folder(folder).exists()
 
 
-def test_what_came_after_the_last_save_is_done_again(built, task, tmp_path):
+def test_updates_after_the_last_save_are_repeated(built, task, tmp_path):
     folder = tmp_path / "task"
     with pytest.raises(KeyboardInterrupt):
         run_task(task, folder, stop_after(6), save_seconds=0)
@@ -108,7 +108,7 @@ def test_killed_after_the_last_update(built, task, tmp_path, monkeypatch):
     assert not compare_rebuilds(folder, artefact(built / "a")).differences
 
 
-def test_killed_before_it_got_its_name(built, task, tmp_path):
+def test_killed_before_renaming(built, task, tmp_path):
     folder = tmp_path / "task"
     shutil.copytree(artefact(built / "a"), partial_folder(folder))
     (partial_folder(folder) / LEARNER).write_bytes(b"no longer needed")
@@ -134,7 +134,7 @@ def test_a_partial_of_other_settings_is_started_again(built, task, tmp_path, mon
     assert firsts == [3, 0]
 
 
-def test_a_damaged_state_is_named_not_guessed_at(task, tmp_path):
+def test_a_damaged_state_is_an_error(task, tmp_path):
     partial = partial_folder(tmp_path / "task")
     partial.mkdir()
     (partial / LEARNER).write_bytes(b"junk")
@@ -142,7 +142,7 @@ def test_a_damaged_state_is_named_not_guessed_at(task, tmp_path):
         run_task(task, tmp_path / "task")
 
 
-def test_a_finished_task_is_left_alone(built, task, tmp_path):
+def test_a_finished_task_is_unchanged(built, task, tmp_path):
     folder = tmp_path / "task"
     shutil.copytree(artefact(built / "a"), folder)
     before = (folder / METADATA).stat().st_mtime_ns

@@ -1,4 +1,4 @@
-"""Collecting on a full disk: a clear error, no signal, nothing left behind."""
+"""Collection on a full disk: a clear error, no SIGBUS, no leftover files."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ def test_arrays_are_allocated_not_sparse(task: Given, tmp_path):
         assert path.read_bytes() == (tmp_path / "saved.npy").read_bytes()
 
 
-def test_a_limit_that_only_the_allocation_meets_leaves_nothing(task: Given, tmp_path):
+def test_a_failed_allocation_leaves_no_files(task: Given, tmp_path):
     with file_size_limit(64 * 1024), pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
         run_task(*task, tmp_path / "task", never)
     assert not partial_folder(tmp_path / "task").exists()
 
 
-def test_a_disk_that_fills_up_keeps_what_can_be_resumed(task: Given, tmp_path):
+def test_a_full_disk_keeps_the_saved_state(task: Given, tmp_path):
     def fill(update, metrics):
         if update == 6:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

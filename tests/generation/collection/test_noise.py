@@ -1,4 +1,4 @@
-"""Noise histories: who acts when, one key an episode, and the same bits however a task is cut into pieces."""
+"""Noise histories: actions, keys of episodes, and results that do not depend on the sizes of pieces."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def profile(tmp_path_factory) -> Profile:
 
 @pytest.fixture(scope="module")
 def made(profile, short_pieces, tmp_path_factory) -> Path:
-    """A finished artefact."""
+    """Return a finished artefact."""
     folder = tmp_path_factory.mktemp("noise") / WORK.name
     assert run_noise(WORK, profile, folder)
     return folder
@@ -103,13 +103,13 @@ def test_every_step_follows_the_rules(arrays):
     assert len(np.unique(states[:, 0], axis=0)) > 30, "episodes start in states of their own"
 
 
-def test_the_oracle_acts_but_for_the_noise(arrays):
-    """A random action is one of six, so it is the oracle's once in six times."""
+def test_actions_are_the_oracles_except_for_noise(arrays):
+    """One in six random actions equals the oracle's."""
     clean = (arrays["actions"] == arrays["oracle_actions"]).reshape(40, 100)
     expected = 1 - arrays["noise"].reshape(40, 1) * 5 / 6
     assert clean[expected[:, 0] == 1].all()
     assert abs(clean.mean() - expected.mean()) < 4 * np.sqrt((expected * (1 - expected)).sum() / 40 / 4000)
-    noisy = arrays["actions"].reshape(40, 100)[~clean]  # none of six actions is the oracle's at every step
+    noisy = arrays["actions"].reshape(40, 100)[~clean]  # the action differs from the oracle's at some step
     assert (np.bincount(noisy, minlength=6) > 0.1 * len(noisy)).all()
 
 
@@ -119,7 +119,7 @@ def test_labels_are_those_of_an_oracle_that_watches_the_episode(arrays):
 
 
 def test_an_episode_is_a_function_of_its_numbers(arrays):
-    """One with others in the batch is the one among those of its task."""
+    """An episode is the same in a mixed batch as in its task."""
     mate = build_teammate(LAYOUT, MATE)
     history, episode = np.array([3, 1, *[0] * 14]), np.array([2, 9, *range(14)])
     chance = arrays["noise"][history, episode % 10]
@@ -140,7 +140,7 @@ def test_the_bits_do_not_depend_on_the_piece(made, profile, tmp_path, monkeypatc
 
 
 def test_schedules():
-    """The formula, ranges, and a draw for every history that no other history changes."""
+    """Schedules follow the formula and ranges, and each history's draw is independent of the others."""
     linear = noise_schedules(NoiseConfig(histories=2, episodes=11), 0)
     np.testing.assert_allclose(linear, [np.linspace(1, 0, 11)] * 2, atol=1e-6)
     steep = NoiseConfig(histories=1, episodes=11, begin=(0.2, 0.2), finish=(0.6, 0.6), power=(2, 2), end=(0.1, 0.1))
@@ -171,7 +171,7 @@ def test_stopped_and_resumed(made, profile, tmp_path, history):
     assert not partial_folder(folder).exists()
 
 
-def test_what_came_after_the_last_save_is_made_again(made, profile, tmp_path):
+def test_pieces_after_the_last_save_are_repeated(made, profile, tmp_path):
     folder = tmp_path / WORK.name
     with pytest.raises(KeyboardInterrupt):
         run_noise(WORK, profile, folder, stop_after(2), save_seconds=0)
@@ -210,7 +210,7 @@ def test_a_full_disk(profile, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_histories_with_a_learned_teammate(profile, tmp_path):
-    """It acts greedily on its own observations, and a resumed task has the bits of an uninterrupted one."""
+    """A learned teammate acts greedily on its observations, and a resumed task equals an uninterrupted one."""
     save(tmp_path / "suite/member", LAYOUT)
     mate = entry(tmp_path / "suite", "member")
     work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")

@@ -27,7 +27,7 @@ ENVS = 3
 UNTOUCHED = 99  # no action, no reward and no record byte below
 
 
-# Keeping.
+# Recording
 
 
 def make_config(length: int, updates: int) -> PPOConfig:
@@ -78,7 +78,7 @@ def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> record.HistoryAr
 @pytest.mark.parametrize(
     ("length", "updates"), [(256, 5), (256, 4), (96, 13), (7, 120), (900, 2), (400, 2), (100, 9), (100, 10)]
 )
-def test_keep_equals_a_loop_over_steps(length, updates):
+def test_recording_equals_a_loop_over_steps(length, updates):
     config = make_config(length, updates)
     rollouts = random_rollouts(length, updates)
     expected = kept_by_loop(rollouts, config)
@@ -91,7 +91,7 @@ def test_keep_equals_a_loop_over_steps(length, updates):
         assert getattr(found, name).dtype == array.dtype
 
 
-def test_keeping_twice_changes_nothing_and_order_does_not_matter():
+def test_recording_is_idempotent_and_independent_of_order():
     config = make_config(96, 9)
     rollouts = random_rollouts(96, 9)
     once, again = empty_histories(config), empty_histories(config)
@@ -103,7 +103,7 @@ def test_keeping_twice_changes_nothing_and_order_does_not_matter():
         np.testing.assert_array_equal(getattr(again, name), array, err_msg=name)
 
 
-# Choosing.
+# Selection of streams
 
 
 def rewards_of(returns: list[list[int]]) -> np.ndarray:
@@ -149,7 +149,7 @@ def test_equal_streams_come_in_the_order_of_their_numbers():
 
 
 def learner(*improvements: int) -> np.ndarray:
-    """Returns (N, 10) of streams that start at 0 and improve by this."""
+    """Return the returns (N, 10) of streams that start at 0 and improve by this."""
     return np.array([[0.0] * 5 + [float(improvement)] * 5 for improvement in improvements])
 
 
@@ -169,12 +169,12 @@ def test_streams_are_shared_out_among_learners(learners, keep, expected):
     assert [streams.tolist() for streams in curate.select_streams(learners, keep, 5.0)] == expected
 
 
-# Labelling.
+# Labels
 
 
 @pytest.fixture(scope="module")
 def labelled():
-    """Two streams of two episodes; the labels, and every step's logits under three ways to carry the memory."""
+    """Return two streams of two episodes; the labels, and every step's logits under three ways to carry the memory."""
     widths = Widths(pointwise=(8,), spatial=(8,), dense=32, gru=16, head=16)
     network = ActorCritic(widths)
     rng = np.random.default_rng(3)
@@ -217,7 +217,7 @@ def test_labels_equal_the_network_stepped_through_each_episode(labelled):
 
 
 def test_labels_need_the_memory_and_its_restart(labelled):
-    """The data would show it if the memory were dropped at every step, or carried into the next episode."""
+    """Logits differ if the memory is dropped at every step or carried into the next episode."""
     labels, logits = labelled
     without, across = (logits[way].argmax(axis=-1) for way in ("step", "never"))
     assert (np.stack(labels) != without).mean() > 0.1
@@ -227,7 +227,7 @@ def test_labels_need_the_memory_and_its_restart(labelled):
 
 @pytest.mark.slow
 def test_oracle_labels_are_what_the_oracle_does():
-    """Where the oracle is the ego it does what the labels say, in every episode from the first step on."""
+    """If the oracle is the ego, the labels equal its actions in every step."""
     envs, episodes = 3, 2
     env = Environment(LAYOUT, 100)
     players = [policy_player(env, oracle(LAYOUT), (), EGO, envs), random_player(TEAMMATE, envs)]

@@ -63,7 +63,7 @@ def failing(monkeypatch, *errors: Exception | None) -> list[int]:
     return calls
 
 
-def test_a_task_that_raises_is_reported_and_the_others_are_done(tasks, tmp_path, monkeypatch):
+def test_a_failing_task_is_reported_and_others_finish(tasks, tmp_path, monkeypatch):
     calls = failing(monkeypatch, ZeroDivisionError("no steps"))
     with pytest.raises(CollectionError, match=r"1 of 2 tasks have no artefact: .*_s0_.*failed\.jsonl has the reasons"):
         collect(tasks, tmp_path)
@@ -102,14 +102,14 @@ def test_an_interrupt_is_no_failure(tasks, tmp_path, monkeypatch):
     assert not failures(tmp_path)
 
 
-def test_a_task_that_another_collector_is_at_comes_last(tasks, tmp_path, monkeypatch):
+def test_tasks_of_another_collector_come_last(tasks, tmp_path, monkeypatch):
     calls = failing(monkeypatch, BusyError("busy"))
     assert "another collector works on it" in collect(tasks, tmp_path)
     assert calls == [0, 1, 0]
 
 
 def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
-    """The other one finishes its task; it is not done again."""
+    """A task that the other collector finishes is not repeated."""
     work, profile = tasks[0][0], tasks[1]
     folder = tmp_path / "artefacts" / work.name
     folder.parent.mkdir()
@@ -122,7 +122,7 @@ def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
 
 
 def test_a_full_disk_ends_one_task(tasks, pair, tmp_path, monkeypatch):
-    """The first of two tasks meets it; the second is finished, and the list of failures says so."""
+    """The first task fails on the full disk, the second finishes, and the failure is logged."""
     works, profile = tasks
     second = tmp_path / "artefacts" / works[1].name
     shutil.copytree(pair / "artefacts" / second.name, partial_folder(second))
@@ -168,7 +168,7 @@ def test_two_collectors_at_once_do_each_task_once(built, pair, tmp_path):
 
 
 def listening(process: psutil.Process) -> set[str]:
-    """The addresses that a process and its children listen on."""
+    """Return the addresses that a process and its children listen on."""
     found = set()
     for child in [process, *process.children(recursive=True)]:
         try:

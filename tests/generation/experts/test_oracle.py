@@ -1,4 +1,4 @@
-"""The scripted ego: it makes no mistakes, and earns more than H4 in its agent slot."""
+"""The scripted oracle: no wrong deliveries, and a higher return than H4 as the ego."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CONTRASTING = ("coord_ring", "asymm_right")
 
 
 def by_layout(*names: str) -> list[Any]:
-    """Parameters of a test: contrasting layouts by default, the others in the slow suite."""
+    """Return parameters of a test: contrasting layouts by default, the others in the slow suite."""
     return [pytest.param(name, marks=[] if name in CONTRASTING else [pytest.mark.slow]) for name in names]
 
 
@@ -54,7 +54,7 @@ def h4(layout: Layout) -> Policy:
 
 @cache
 def episodes(agent: str, layout: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Records uint8 (N, T, S), actions (N, T, 2) and rewards (N, T) of all episodes of a layout."""
+    """Return records uint8 (N, T, S), actions (N, T, 2) and rewards (N, T) of all episodes of a layout."""
     tasks = [t for t in TASKS if t.layout.name == layout and t.teammate_family == FAMILY_ON[layout]]
     make = h4 if agent == "h4" else AGENTS[agent]
     played = list(play_tasks(make, tasks, SHORT))

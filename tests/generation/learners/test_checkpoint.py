@@ -1,4 +1,4 @@
-"""Policies on disk: what is written is read back to the bit, and rows of zeros take no space."""
+"""Checkpoints: policies are restored exactly, and rows of zeros take no space."""
 
 import json
 
@@ -43,7 +43,7 @@ def test_rows_of_zeros_take_no_space(policy, tmp_path):
 
 
 def test_complete_matrices_are_read_too(policy, tmp_path):
-    """Earlier versions wrote them."""
+    """Checkpoints of earlier versions, with rows of zeros, are read."""
     network, params = policy
     save_policy(tmp_path / "p", network, params, {})
     path = tmp_path / "p" / POLICY_WEIGHTS

@@ -66,7 +66,7 @@ def test_compact_inputs_give_the_results_of_observations(kind):
 
 
 def test_only_entries_of_the_layouts_have_random_initial_weights():
-    """On another layout with as many channels, an entry that was never seen in training adds nothing."""
+    """Entries that a layout never has start with zero weights, so they add nothing on another layout."""
     obs, view = jnp.asarray(observe(LAYOUT, RECORDS, 0)), CompactView("mlp", (LAYOUT,))
     kernels = {}
     for name, module, seen in (

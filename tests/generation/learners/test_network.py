@@ -46,7 +46,7 @@ class PlainActorCritic(nn.Module):
 
 
 def plain_names(params: Any, widths: Widths) -> dict[str, Any]:
-    """The parameters, or their gradients, under the names of the plain form."""
+    """Return the parameters, or their gradients, under the names of the plain form."""
     tree = jax.tree.map(np.asarray, params["params"])
     encoder, gru = tree["encoder"], tree["gru"]
     plain: dict[str, Any] = {name: tree[name] for name in ("actor_hidden", "actor", "critic_hidden", "critic")}
@@ -77,7 +77,7 @@ class Case(NamedTuple):
 
 
 def make_case(widths: Widths) -> Case:
-    """Random parameters, none of them zero, and a sequence with three resets."""
+    """Return random parameters, none of them zero, and a sequence with three resets."""
     network = ActorCritic(widths)
     rng = np.random.default_rng(1)
     shape = (STEPS, ENVS, 5, 5, CHANNELS)
@@ -101,7 +101,7 @@ def paper() -> Case:
 
 @pytest.fixture(scope="module")
 def small() -> Case:
-    """Other numbers of layers, and widths that are not all alike."""
+    """Return a case with other numbers of layers and unequal widths."""
     return make_case(Widths(pointwise=(6,), spatial=(3, 5), dense=11, gru=7, head=9))
 
 
@@ -111,7 +111,7 @@ def apply(small):
 
 
 def assert_close(found: Any, expected: Any, what: str = "") -> None:
-    """Nowhere further off than `TOLERANCE` times the largest value."""
+    """Compare arrays, to `TOLERANCE` times the largest value."""
     size = np.abs(np.asarray(expected)).max()
     assert size > 0, what
     np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE * size, err_msg=what)
@@ -164,7 +164,7 @@ def test_a_sequence_with_a_reset_equals_two_sequences(small, apply):
 
 
 def test_initial_weights(small):
-    """Orthogonal, of the published code's scales; every bias zero."""
+    """Initial weights are orthogonal with the published scales, and biases are zero."""
     init = jax.jit(small.network.init)
     params = init(jax.random.key(0), small.hidden, small.obs, small.reset)
     tree = plain_names(params, small.network.widths)["params"]

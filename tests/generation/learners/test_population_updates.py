@@ -26,7 +26,7 @@ def part(tree: Any, number: int) -> Any:
 
 @pytest.fixture(scope="module")
 def learn(lbrdiv):
-    """The compiled update of one policy."""
+    """Return the compiled update of one policy."""
     return jax.jit(lbrdiv.population.ppo.learn)
 
 
@@ -56,7 +56,7 @@ class Updated(NamedTuple):
 
 
 def updated(algorithm: Algorithm, learning: bool = True) -> Updated:
-    """The second update, in which the warm-up of the learning rate is over.
+    """Return the second update, in which the warm-up of the learning rate is over.
 
     Without `learning` the policies stay as they are, which compiles in a third of the time.
     """
@@ -88,7 +88,7 @@ def comedi() -> Updated:
 
 @pytest.fixture(scope="module")
 def comedi_play() -> Updated:
-    """An update of CoMeDi without learning."""
+    """Return an update of CoMeDi without learning."""
     return updated(CoMeDi(), learning=False)
 
 
@@ -130,7 +130,7 @@ def test_metrics_separate_self_play_from_cross_play(either):
 
 @pytest.mark.slow
 def test_an_update_learns_each_policys_sequences_with_its_weights_and_partners(lbrdiv, learn):
-    """Policy by policy, each from its own slots of the roll-out."""
+    """Compare with one update per policy on its own slots."""
     trained, before = lbrdiv.population, lbrdiv.before
     assignment = trained.assignment
     key = jax.random.split(jax.random.fold_in(before.key, before.update), 3)[1]

@@ -58,7 +58,7 @@ class Diary(NamedTuple):
     """Memory of the scripted teammate."""
 
     offset: jax.Array  # from the episode's key
-    steps: jax.Array  # it has acted in the episode
+    steps: jax.Array  # number of its steps in the episode
 
 
 def begin(params, key) -> Diary:
@@ -98,13 +98,13 @@ def frozen(untrained) -> LearnerState:
 
 @pytest.fixture(scope="module")
 def learning(frozen) -> LearnerState:
-    """A learner in the middle of its schedule; otherwise equal to `frozen`."""
+    """Return a learner in the middle of its schedule; otherwise equal to `frozen`."""
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
     return frozen._replace(optimizer=counted(frozen.optimizer, steps // 2))
 
 
 def counted(optimizer: Any, steps: int) -> Any:
-    """The optimizer's state, its counters set."""
+    """Return the optimizer's state, its counters set."""
     return jax.tree.map(lambda x: jnp.full_like(x, steps) if jnp.issubdtype(x.dtype, jnp.integer) else x, optimizer)
 
 
@@ -127,7 +127,7 @@ def play(update: UpdateFunction, state: LearnerState, updates: int) -> Played:
 
 @pytest.fixture(scope="module")
 def played(update, frozen) -> Played:
-    """40 roll-outs of one policy."""
+    """Return 40 roll-outs of one policy."""
     return play(update, frozen, 40)
 
 
@@ -137,7 +137,7 @@ def trained(update, untrained) -> Played:
 
 
 def joined(rollouts: list[Rollout]) -> Rollout:
-    """Successive roll-outs as one."""
+    """Return successive roll-outs as one."""
     return jax.tree.map(lambda *parts: np.concatenate(parts), *rollouts)
 
 
@@ -157,7 +157,7 @@ def egos_sequences(state: LearnerState, rollout: Rollout) -> Sequences:
 
 
 def plain_advantage(reward, value, done, last_value, gamma: float, lam: float) -> np.ndarray:
-    """GAE by a loop over envs and steps."""
+    """Return GAE by a loop over environments and steps."""
     out = np.zeros(reward.shape)
     for n in range(reward.shape[1]):
         trace, following = 0.0, last_value[n]
@@ -188,7 +188,7 @@ def test_generalised_advantage(gamma, lam):
 
 
 def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log-probabilities and values as the loss has them, read from its derivatives.
+    """Return log-probabilities and values as the loss has them, read from its derivatives.
 
     At unchanged parameters the ratio is the derivative of the policy loss by the old log-probability, over the
     advantage; the value is the target less the derivative of the value loss by the target.
@@ -283,8 +283,8 @@ def test_the_ego_is_scored_by_its_own_shaped_rewards(played):
     assert not joint.shaped[..., TEAMMATE].any()
 
 
-def test_the_teammates_parameters_travel_in_the_state(update, frozen, played):
-    """So that one compiled update serves every teammate of a family."""
+def test_the_teammates_parameters_are_in_the_state(update, frozen, played):
+    """One compiled update serves every teammate of a family."""
     state, rollout, _ = update(frozen._replace(teammate={"turn": jnp.uint32(1)}))
     first = played.rollouts[0].actions[0, :, TEAMMATE]
     np.testing.assert_array_equal(rollout.actions[0, :, TEAMMATE], (first + 1) % 4)
@@ -294,7 +294,7 @@ def test_the_teammates_parameters_travel_in_the_state(update, frozen, played):
 # Schedules.
 
 
-def test_shaping_weight_goes_linearly_to_zero(played):
+def test_shaping_weight_falls_linearly_to_zero(played):
     found = [metrics["shaping"] for metrics in played.metrics]
     expected = [1 - n / 30 if n < 30 else 0 for n in range(len(found))]  # 32 of 960 steps an update
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)

@@ -41,7 +41,7 @@ SETTINGS = {"ego": {"rate": 0.1, "layers": (1, 2)}, "seed": 3}
 
 
 def state() -> State:
-    """A pytree with every kind of leaf and node that a training's state may have."""
+    """Return a pytree with every kind of leaf and node that a training's state may have."""
     params = {"kernel": jnp.arange(6.0).reshape(2, 3).T, "empty": jnp.zeros((0, 4)), "nothing": ()}
     keys = {"one": jax.random.key(5), "many": jax.random.split(jax.random.key(3), 4)}
     record, ended = jnp.arange(256, dtype=jnp.uint8), jnp.array([True, False])
@@ -123,7 +123,7 @@ class TestStateFile:
         assert [path.name for path in file.path.parent.iterdir()] == ["s.safetensors"]
 
     def test_equal_states_give_equal_bytes(self, file):
-        """The library itself writes the metadata in a random order."""
+        """Files do not depend on the library's random order of metadata."""
         contents = set()
         for _ in range(8):
             file.save(state(), 7)
@@ -145,7 +145,7 @@ class TestStateFile:
         assert_equal(found, saved)
         assert all(leaf.sharding == device for leaf in jax.tree.leaves(found))
 
-    def test_a_save_that_is_cut_short_leaves_the_one_before(self, file, monkeypatch):
+    def test_an_interrupted_save_keeps_the_previous_one(self, file, monkeypatch):
         file.save(state(), 1)
 
         def cut(path, content):
@@ -229,7 +229,7 @@ def test_when_to_save(monkeypatch):
     assert [update for update in range(1, 8) if interval.due(update)] == [3, 6, 7]
 
 
-def test_a_folder_has_one_owner(tmp_path):
+def test_a_folder_is_locked_by_one_process(tmp_path):
     with run_lock(tmp_path / "run"):
         with pytest.raises(BusyError, match="run: another process works in this folder"), run_lock(tmp_path / "run"):
             pass

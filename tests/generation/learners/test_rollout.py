@@ -80,11 +80,11 @@ def marked(state: EnvState, done: jax.Array) -> EnvState:
 class Played(NamedTuple):
     start: RolloutCarry
     carry: RolloutCarry  # after the last step
-    rollout: Rollout  # of both halves
+    rollout: Rollout  # of both roll-outs
 
 
 def play(players: list[Player], restart: Any = None) -> Played:
-    """Two roll-outs, one after the other, as one; NumPy."""
+    """Return two roll-outs, one after the other, as one; NumPy."""
     more = () if restart is None else (restart,)
     run = jax.jit(lambda carry, key: roll_out(ENV, players, carry, STEPS, key, *more))
     start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), ENVS))
@@ -105,7 +105,7 @@ def restarted() -> Played:
 
 @pytest.fixture(scope="module")
 def params() -> Any:
-    """Parameters of three policies, leaves (3, ...), whose action probabilities are far from uniform."""
+    """Return parameters of three policies, leaves (3, ...), whose action probabilities are far from uniform."""
     obs = jnp.zeros((1, 1, 5, 5, LAYOUT.channels), jnp.uint8)
     shapes = jax.eval_shape(
         NETWORK.init, jax.random.key(0), NETWORK.initial_hidden(1), obs, jnp.ones((1, 1), bool), jnp.zeros(1, int)
@@ -116,7 +116,7 @@ def params() -> Any:
 
 @pytest.fixture(scope="module")
 def apply():
-    """One step of the network at M slots."""
+    """Return one step of the network at M slots."""
 
     def apply(params, hidden, obs, partner):
         outputs: Any = NETWORK.apply(params, hidden, obs[None], jnp.zeros((1, obs.shape[0]), bool), partner)
@@ -145,7 +145,7 @@ def test_actions_reach_their_agents(played):
         np.testing.assert_array_equal(choice.action, played.rollout.actions[:, env, agent])
 
 
-def test_the_game_is_played_with_these_actions(played):
+def test_the_rollout_equals_single_environment_steps(played):
     """Step by step through the environment itself."""
     step = jax.jit(ENV.step)
     state = played.start.env
@@ -201,7 +201,7 @@ def test_only_players_of_an_ended_episode_restart():
 
 
 def test_returns_are_sums_over_the_episode_across_roll_outs(played):
-    """Rewards are rare in such play: these are made up, one for every step."""
+    """Rewards are synthetic, one for every step, since scripted play earns few."""
 
     class Paying(Environment):
         def step(self, state, actions):
@@ -222,7 +222,7 @@ def test_returns_are_sums_over_the_episode_across_roll_outs(played):
 
 def test_the_restart_hook_changes_first_states_and_no_others(played, restarted):
     first, rollout = played.rollout.record, restarted.rollout
-    np.testing.assert_array_equal(rollout.record[:EPISODE], first[:EPISODE])  # the hook came later
+    np.testing.assert_array_equal(rollout.record[:EPISODE], first[:EPISODE])  # the hook acts only at later starts
     for start in (5, 10, 15):
         swapped_positions = first[start].copy()
         swapped_positions[:, :2] = first[start, :, 1::-1]

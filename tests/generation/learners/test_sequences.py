@@ -15,7 +15,7 @@ press."""
 
 
 def rollout() -> Rollout:
-    """Steps of two environments with these rewards; agent a has the shaped reward a + 1 in every step."""
+    """Return steps of two environments with these rewards; agent a has the shaped reward a + 1 in every step."""
     size = (len(REWARDS), 2)
     zeros, choices = jnp.zeros(size), jnp.zeros((len(REWARDS), 4))
     return Rollout(
@@ -31,7 +31,7 @@ def rollout() -> Rollout:
 
 
 def test_a_wrong_delivery_is_forgiven_as_long_as_rewards_are_shaped():
-    """Also one together with presses of a button, which alone are not forgiven; for both agents."""
+    """A wrong delivery is forgiven for both agents, with or without button presses; presses alone are not."""
     slots = np.arange(4)  # both agents of both environments
     agents = np.repeat([EGO, TEAMMATE], 2)
     for weight, forgiven in ((1.0, 20), (0.25, 5), (0.0, 0)):

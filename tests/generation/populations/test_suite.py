@@ -99,7 +99,7 @@ def population(root: Path, algorithm: str) -> Path:
 
 
 def weights(folder: Path) -> dict[str, str]:
-    """The hash of every policy of a population."""
+    """Return the hash of every policy of a population."""
     return {str(path.relative_to(folder)): file_hash(path) for path in sorted(folder.rglob(POLICY_WEIGHTS))}
 
 
@@ -253,7 +253,7 @@ def test_a_population_learns_the_same_on_two_devices(tmp_path):
 
 
 def made_up(root: Path, returns: dict[tuple[int, int], float], algorithm: str = "fcp") -> Path:
-    """A suite with these returns as teammates by (member, checkpoint); every weight file differs."""
+    """Return a suite with these returns as teammates by (member, checkpoint); every weight file differs."""
     folder = population(root, algorithm)
     for (member, checkpoint), greedy in returns.items():
         params = {"params": {"x": np.array([member, checkpoint, ALGORITHMS.index(algorithm)], np.float32)}}

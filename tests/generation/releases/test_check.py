@@ -23,7 +23,7 @@ def test_equal_folders(built):
     assert f"{built / 'a'}: made with {xla_threads()} XLA thread" in result.output
 
 
-def test_other_numbers_of_threads_are_said(tmp_path):
+def test_different_thread_counts_are_reported(tmp_path):
     for name, records in (("a", {"t0": {"xla_threads": 1}, "t1": {"xla_threads": 2}}), ("b", {"t0": {}})):
         (tmp_path / name / "meta").mkdir(parents=True)
         (tmp_path / name / "meta/provenance.json").write_text(json.dumps(records))
@@ -33,7 +33,7 @@ def test_other_numbers_of_threads_are_said(tmp_path):
     assert f"{tmp_path / 'b'}: made with an unknown number of XLA threads" in output
 
 
-def test_what_differs_is_said(built, tmp_path):
+def test_differences_are_reported(built, tmp_path):
     ours = artefact(built / "a")
     theirs = tmp_path / "other"
     shutil.copytree(ours, theirs)

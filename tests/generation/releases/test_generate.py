@@ -90,7 +90,7 @@ def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
 
 
 def test_an_artefact_of_an_earlier_version_is_made_again(built, tmp_path):
-    """Artefacts had no checkpoints, and the final ego in the folder itself."""
+    """Earlier artefacts had no folder of checkpoints."""
     profile = load_profile(str(built / "tiny.toml"))
     folder = tmp_path / "copy"
     shutil.copytree(artefact(built / "a"), folder)
@@ -105,7 +105,7 @@ def test_an_artefact_of_an_earlier_version_is_made_again(built, tmp_path):
     assert not artefacts.is_task_finished(folder, profile.works()[0], profile)
 
 
-def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_path):
+def test_damaged_or_different_artefacts_are_unfinished(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
     (work,) = profile.works()
     folder = tmp_path / "copy"
@@ -121,7 +121,7 @@ def test_a_damaged_or_different_artefact_is_not_taken_for_finished(built, tmp_pa
     assert not artefacts.is_task_finished(folder, work, profile)
 
 
-def test_a_folder_in_the_way_is_not_lost(built, tmp_path):
+def test_an_existing_folder_is_not_overwritten(built, tmp_path):
     shutil.copytree(built / "a" / "artefacts", tmp_path / "artefacts")
     (tmp_path / "lite").mkdir()
     (tmp_path / "lite" / "notes.txt").write_text("mine")
@@ -170,7 +170,7 @@ def no_distances():
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory) -> Path:
-    """A rebuild with learned teammates, all of which pass the selection. Read only."""
+    """Return a rebuild with learned teammates, all of which pass the selection. Read only."""
     profile = tmp_path_factory.mktemp("learned") / "learned.toml"
     out = profile.parent / "out"
     profile.write_text(LEARNED)
@@ -181,7 +181,7 @@ def learned(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_learned_teammates_come_with_the_release_and_play_as_they_played(learned):
+def test_released_learned_teammates_reproduce_actions(learned):
     """On the observations of a complete recorded episode, the rebuilt teammate takes the recorded actions."""
     dataset = load_icrl4aht(learned / "lite")
     assert [task.teammate_kind for task in dataset.entries[::3]] == ["fcp", "brdiv"]
@@ -258,7 +258,7 @@ def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
 
 
 @pytest.mark.slow
-def test_teammates_that_are_all_too_bad(learned, tmp_path):
+def test_all_teammates_below_the_threshold(learned, tmp_path):
     shutil.copytree(learned / "suite", tmp_path / "suite")
     with pytest.raises(
         CollectionError, match=r"no checkpoint of fcp, brdiv exceeds the return of 20 .*raise teammates"

@@ -35,11 +35,11 @@ from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.tiny import artefact
 
-# The choice.
+# Choice of the checkpoint
 
 
 def in_episodes(*means: float, spread: float = 0.0) -> np.ndarray:
-    """Returns (C, E) with these means, and differences between checkpoints of this standard deviation."""
+    """Return the returns (C, E) with these means, and differences between checkpoints of this standard deviation."""
     noise = np.random.default_rng(0).normal(size=(len(means), LABEL_EPISODES)) * spread / np.sqrt(2)
     return np.array(means)[:, None] + noise - noise.mean(axis=1, keepdims=True)
 
@@ -49,7 +49,7 @@ def test_the_last_checkpoint_labels_unless_an_earlier_one_earns_clearly_more():
     assert choose_checkpoint(in_episodes(0, 0, 0, 0, 0)) == 4
     assert choose_checkpoint(in_episodes(7)) == 0
     assert choose_checkpoint(in_episodes(0, 5, 16.9, 3, 0)) == 2
-    assert choose_checkpoint(in_episodes(9, 5, 9, 3, 0)) == 2  # of equal ones the latest
+    assert choose_checkpoint(in_episodes(9, 5, 9, 3, 0)) == 2  # the latest among equals
 
 
 def test_clearly_means_two_more_and_two_standard_errors():
@@ -60,16 +60,16 @@ def test_clearly_means_two_more_and_two_standard_errors():
     assert choose_checkpoint(in_episodes(5, 0, spread=error * np.sqrt(LABEL_EPISODES) * 1.2)) == 1
 
 
-# The measurement.
+# Measured returns
 
 
 @pytest.fixture
 def task(built, tmp_path):
-    """The task of `built`, its profile, and a copy of its artefact, packed before."""
+    """Return the task of `built`, its profile, and a copy of its artefact, packed before."""
     profile = load_profile(str(built / "tiny.toml"))
     folder = tmp_path / "artefacts" / artefact(built / "a").name
     shutil.copytree(artefact(built / "a"), folder)
-    for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # what was measured of the teammate
+    for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # facts about the teammate
         shutil.copy(kept, folder.parent)
     return profile.works()[0].task, profile, folder
 
@@ -155,7 +155,7 @@ def test_measured_returns_are_those_of_a_loop_over_steps(task, tmp_path):
     assert measured(folder)["greedy"][4] == returns.tolist()
 
 
-# Where it is written down.
+# Records of the labeller
 
 
 def test_index_provenance_and_card_state_the_labeller(built):
@@ -217,7 +217,7 @@ def test_the_card_marks_labels_that_earn_less_than_half_of_the_end(task, tmp_pat
 
 @pytest.fixture
 def with_policies(task, tmp_path) -> Path:
-    """A release with the policies of the labellers."""
+    """Return a release with the policies of the labellers."""
     chosen, profile, folder = task
     return package_release(
         folder.parent, tmp_path / "with", [Work(chosen)], replace(profile, policies=True), tmp_path, "lite"

@@ -89,7 +89,7 @@ def pack(tmp_path: Path, profile: Profile, works: Sequence[Work], facts: dict[st
 
 @pytest.fixture
 def two_learners(built, profile, tmp_path) -> list[Work]:
-    """Two learners of one task: one with three streams that rise, one with one."""
+    """Return two learners of one task: one with three streams that rise, one with one."""
     (task,) = make_tasks(profile, 1)
     works = [Work(task, "ppo", learner) for learner in range(2)]
     make_learner(built, works[0], tmp_path / "artefacts", [10, 4, 20, 15], 5.0)
@@ -136,7 +136,7 @@ def test_streams_are_kept_as_before_where_no_teammate_leaves_headroom(two_learne
     assert "No headroom: on demo_wide" in (root / "README.md").read_text()
 
 
-def test_tasks_that_teach_nothing_are_left_out_with_their_numbers(built, two_learners, profile, tmp_path):
+def test_tasks_without_headroom_are_left_out(built, two_learners, profile, tmp_path):
     flat = make_tasks(profile, 2)[1]
     works = [*two_learners, *(Work(flat, "ppo", learner) for learner in range(2))]
     for work in works[2:]:

@@ -29,7 +29,7 @@ UNCACHED = draws._bundled_draws.__wrapped__
 
 
 def draw(family: str, theta_id: int, behaviour: int = 0, *, base_seed=0, distance=0.5, oracle=30.0) -> Draw:
-    """A draw on demo_wide with which stay earns 1 and random 2."""
+    """Return a draw on demo_wide with which stay earns 1 and random 2."""
     return Draw(
         "demo_wide", family, base_seed, theta_id, "H3/t0", distance, behaviour, 1.0, 2.0, oracle, "H1/t1", distance
     )
@@ -123,7 +123,7 @@ def test_diverse_tasks_act_unlike_every_test_instance_and_each_other(track):
     assert len(set(thetas)) == len(thetas)  # none is in both splits
 
 
-# Which draws, in which order.
+# Order of draws
 
 
 def test_families_take_turns_and_behaviours_come_first(monkeypatch, tmp_path):

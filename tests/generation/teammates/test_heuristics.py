@@ -77,7 +77,7 @@ NOISE = """
 
 
 def stacked(family: str, thetas: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Parameters with a leading axis over thetas."""
+    """Return parameters with a leading axis over thetas."""
     defaults = HEURISTIC_FAMILIES[family].defaults
     dtypes = {name: np.int32 if isinstance(default, int) else np.float32 for name, default in defaults.items()}
     return {name: np.array([theta[name] for theta in thetas], dtype) for name, dtype in dtypes.items()}

@@ -29,7 +29,7 @@ STEPS, ENVS = 5, 3
 
 
 def save(folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partners: int = 0, seed: int = 0) -> Any:
-    """A checkpoint of random weights, far from uniform; its parameters."""
+    """Return a checkpoint of random weights, far from uniform; its parameters."""
     network = ActorCritic(widths, partners)
     obs = jnp.zeros((1, 1, 5, 5, layout.channels), jnp.uint8)
     args = jax.random.key(0), network.initial_hidden(1), obs, jnp.ones((1, 1), bool), jnp.zeros(1, jnp.int32)
@@ -57,7 +57,7 @@ def entry(suite: Path, name: str) -> dict[str, Any]:
 
 
 def states(steps: int, seed: int) -> np.ndarray:
-    """uint8 (steps, ENVS, S)."""
+    """Return random state records, uint8 (steps, ENVS, S)."""
     return random_records(LAYOUT, steps * ENVS, np.random.default_rng(seed)).reshape(steps, ENVS, -1)
 
 
@@ -72,7 +72,7 @@ def logits_of(params: Any, partners: int, record: np.ndarray, slot: int) -> np.n
 
 
 def played(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
-    """Actions (T, N) of a policy in N environments with these states, step by step."""
+    """Return actions (T, N) of a policy in N environments with these states, step by step."""
     player = policy_player(Environment(LAYOUT), policy, policy.params, slot, ENVS)
     act = jax.jit(player.act)
     zero = jnp.zeros(ENVS, jnp.int32)
@@ -84,7 +84,7 @@ def played(policy: Any, record: np.ndarray, slot: int) -> np.ndarray:
     return np.array(actions)
 
 
-# Playing.
+# Actions
 
 
 @pytest.mark.parametrize("slot", [EGO, TEAMMATE])

@@ -40,7 +40,7 @@ class CoMeDi:
     mixed_play_weight: float = 1.0
 
     def assignment(self, environments: int) -> Assignment:
-        """One member's environments.
+        """Return the assignment of one member's environments.
 
         Raises:
             ValueError: if their number is not a multiple of 8.

@@ -25,7 +25,7 @@ class FCP:
     members: int
 
     def assignment(self, environments: int) -> Assignment:
-        """One term per member: its own return."""
+        """Return the assignment, with one term per member: its own return."""
         member = np.repeat(np.arange(self.members), environments)
         # The slots of both agents are samples of one return, and the policy learns from both.
         both = np.stack([member, member])

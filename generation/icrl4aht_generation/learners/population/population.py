@@ -51,7 +51,7 @@ class Assignment(NamedTuple):
     starts_from: np.ndarray
 
     def agent_slots(self, policy: int) -> tuple[np.ndarray, np.ndarray]:
-        """Slots of a policy, int: those that it learns from, and the others."""
+        """Return the slots of a policy, int: those that it learns from, and the others."""
         own = self.policy.ravel() == policy
         counts = self.term.ravel() >= 0
         return (own & counts).nonzero()[0], (own & ~counts).nonzero()[0]
@@ -260,7 +260,7 @@ class Population:
         return after, losses | metrics
 
     def _players(self, params: Any) -> list[Player]:
-        """One player per group."""
+        """Return one player per group."""
         return [
             network_player(
                 self.env,
@@ -283,7 +283,7 @@ class Population:
         return restart if (source >= 0).any() else lambda state, done: state
 
     def _learn(self, state: PopulationState, players: list[Player], carry: RolloutCarry, rollout: Rollout, key: Array):
-        """Parameters and optimizer states of all policies after learning from the roll-out, and mean losses."""
+        """Return all policies' parameters and optimizer states after learning from the roll-out, and mean losses."""
         weight = self._slot_weights(state.memory)
         shaping = shaping_weight(self.config, state.update)
         params, optimizer, losses = state.params, state.optimizer, []
@@ -300,7 +300,7 @@ class Population:
             played = played._replace(partner=partner, weight=weight[slots][None])
 
             def by_policy(leaf, shape=group.agent_slots.shape, counting=group.counting):
-                """(T, G * M, ...) -> (G, T, counting, ...)."""
+                """Reshape (T, G * M, ...) to (G, T, counting, ...)."""
                 return jnp.moveaxis(leaf.reshape(leaf.shape[0], *shape, *leaf.shape[2:]), 1, 0)[:, :, :counting]
 
             # From the old parameters of all: no policy sees what another has learned in this update.
@@ -312,7 +312,7 @@ class Population:
         return params, optimizer, jax.tree.map(lambda *parts: jnp.concatenate(parts).mean(), *losses)
 
     def _learn_by_policy(self, group: PolicyGroup) -> Callable[..., Any]:
-        """`PPO.learn` with a leading axis of policies, sharded over as many devices as divide them evenly."""
+        """Apply `PPO.learn` to each policy, sharded over as many devices as divide them evenly."""
         learn, devices = jax.vmap(self.ppo.learn), jax.devices()
         # `shard_map` needs equal parts, so three policies on two devices stay on one.
         count = max(n for n in range(1, len(devices) + 1) if len(group.agent_slots) % n == 0)
@@ -339,7 +339,7 @@ class Population:
         return raw * scale[policy]
 
     def _returns(self, rollout: Rollout) -> tuple[Float[Array, "P P"], Bool[Array, "P P"]]:
-        """Mean return of the episodes that ended, by ego and teammate, and whether there was one."""
+        """Return mean return of the episodes that ended, by ego and teammate, and whether there was one."""
         size = (self.assignment.policies,) * 2
         pairs = tuple(self.assignment.policy)
         # Several environments play one pair: `at[].add` sums over them, where an assignment would keep the last.
@@ -348,7 +348,7 @@ class Population:
         return total / jnp.maximum(ended, 1), ended > 0
 
     def _metrics(self, rollout: Rollout) -> dict[str, Array]:
-        """Mean returns of the episodes that ended, in self-play and in cross-play; 0 if none did."""
+        """Return mean returns of the episodes that ended, in self-play and in cross-play; 0 if none did."""
 
         def mean_return(envs: np.ndarray) -> Array:
             done = rollout.done & envs

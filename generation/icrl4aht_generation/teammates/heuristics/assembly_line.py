@@ -30,12 +30,12 @@ class AssemblyMemory(NamedTuple):
 
 
 def begin_assembly_line(key: Key[Array, ""]) -> AssemblyMemory:
-    """Memory at the start of an episode."""
+    """Return the memory at the start of an episode."""
     return AssemblyMemory(key)
 
 
 def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int[Array, ""], AssemblyMemory]:
-    """One step of an H3 teammate."""
+    """Take one step of an H3 teammate."""
     following, u = draw(memory.key)
     idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
     makes_room = _makes_room(scene)
@@ -48,7 +48,7 @@ def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int
 
 
 def _off_beat(scene: Scene) -> Array:
-    """float32 scalar, 0 to 0.9: factor of the chance to hesitate, a fixed pattern over the cells."""
+    """Return the factor of the chance to hesitate, float32 in 0..0.9: a fixed pattern over the cells."""
     y, x = np.divmod(np.arange(scene.paths.layout.cells), scene.paths.layout.width)
     return jnp.asarray(((7 * x + 13 * y) % 10 / 10).astype(np.float32))[scene.me]
 
@@ -87,7 +87,7 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
 
 
 def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
-    """The step towards a target; agent 1 stays if it leads onto the partner's cell or an adjacent one."""
+    """Return the step towards a target; agent 1 stays if it leads onto the partner's cell or an adjacent one."""
     step, _ = scene.approach(target)
     if scene.slot == 0:
         return step
@@ -103,7 +103,7 @@ def _needed_piles(scene: Scene) -> Bool[Array, " cells"]:
 
 
 def _handoff_counters(scene: Scene, params) -> Bool[Array, " cells"]:
-    """Empty counters for an ingredient that no pot takes, by style; every empty one if the style has none."""
+    """Return empty counters for an ingredient that no pot takes, by style; every empty one if the style has none."""
     layout = scene.paths.layout
     y, x = np.divmod(np.arange(layout.cells), layout.width)
     middle_x, middle_y = int(x[layout.walkable].mean()), int(y[layout.walkable].mean())
@@ -130,7 +130,7 @@ def _makes_room(scene: Scene) -> Bool[Array, ""]:
 
 
 def _step_aside(scene: Scene) -> Int[Array, ""]:
-    """Straight away from the adjacent partner; else sideways, right before left, down before up; else stay."""
+    """Step straight away from the adjacent partner; else sideways, right before left, down before up; else stay."""
     from_partner = jnp.asarray(scene.paths.neighbours)[scene.me] == scene.partner  # above, below, left, right
     across = from_partner[2] | from_partner[3]
     # Scores of right, down, left, up.
@@ -142,7 +142,7 @@ def _step_aside(scene: Scene) -> Int[Array, ""]:
 
 
 def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, key: Key[Array, ""]):
-    """The action after a wrong move or a walk home, and the key chain after their draws."""
+    """Return the action after a wrong move or a walk home, and the key chain after their draws."""
     errs = slips & (u < params["wrong_action_prob"])
     key, own = extra_split(key, errs)
     wrong = jax.random.bits(jax.random.split(own)[1]) & 3
@@ -166,8 +166,8 @@ ASSEMBLY_LINE = Heuristic(
         "role_mode": FLEX,
         "handoff_style": AT_POTS,
         "plate_urgency": 0.5,
-        "prestage_bias": 0.3,  # without effect: read by no rule
-        "start_cook_bias": 0.7,  # without effect: pots start by themselves
+        "prestage_bias": 0.3,  # a published parameter that no rule reads
+        "start_cook_bias": 0.7,  # a published parameter without effect, since pots start by themselves
         "hesitation_prob": 0.0,
         "wrong_action_prob": 0.0,
         "task_abandon_prob": 0.0,

@@ -95,7 +95,7 @@ class Heuristic:
         return integral and 0 <= float(value) <= self._highest(name)
 
     def describe(self, name: str) -> str:
-        """The valid values of a parameter in words, such as "a number in 0..1"."""
+        """Return the valid values of a parameter in words, such as "a number in 0..1"."""
         kind = "an integer" if isinstance(self.defaults[name], int) else "a number"
         highest = self._highest(name)
         return f"{kind} from 0" if math.isinf(highest) else f"{kind} in 0..{highest:g}"
@@ -108,7 +108,7 @@ class Heuristic:
 
 @lru_cache(maxsize=64)
 def _functions(heuristic: Heuristic, layout: Layout, slot: int, noise: Noise):
-    """`init` and `act` of a policy."""
+    """Return `init` and `act` of a policy."""
     paths = Paths(layout)
 
     # Cached, so that policies of one family are the same functions, and JAX compiles them once.

@@ -55,10 +55,10 @@ class Noises(NamedTuple):
     """Decisions of the step's draws, bool scalars.
 
     Attributes:
-        idles: it does nothing.
-        presses: it presses the button, if it considers that.
-        errs: it fetches the wrong ingredient.
-        blocks: it walks to a busy cell instead of fetching an ingredient.
+        idles: whether it does nothing.
+        presses: whether it presses the button, if it considers that.
+        errs: whether it fetches the wrong ingredient.
+        blocks: whether it walks to a busy cell instead of fetching an ingredient.
     """
 
     idles: Bool[Array, ""]
@@ -68,12 +68,12 @@ class Noises(NamedTuple):
 
 
 def begin_recipe_aware_button(key: Key[Array, ""]) -> ButtonMemory:
-    """Memory at the start of an episode."""
+    """Return the memory at the start of an episode."""
     return ButtonMemory(key, jnp.int32(0), jnp.uint8(0), jnp.int32(_NEVER))
 
 
 def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple[Int[Array, ""], ButtonMemory]:
-    """One step of an H1 teammate."""
+    """Take one step of an H1 teammate."""
     memory = _look(scene, memory)
     following, u = draw(memory.key)
     unsure = (memory.recipe == 0) | (memory.clock - memory.seen > params["refresh_interval"])
@@ -91,7 +91,7 @@ def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple
 
 
 def _look(scene: Scene, memory: ButtonMemory) -> ButtonMemory:
-    """The memory with the recipe, if the layout has an indicator (seen or not) or the button is lit."""
+    """Return the memory with the recipe, if the layout has an indicator (seen or not) or the button is lit."""
     shown = jnp.any(jnp.asarray(scene.paths.static(INDICATOR))) | scene.button_lit
     return memory._replace(
         recipe=jnp.where(shown, scene.state.recipe, memory.recipe),
@@ -161,12 +161,12 @@ def _wants_plate(scene: Scene, params, role: Role) -> Bool[Array, ""]:
 
 
 def _decoded(scene: Scene) -> np.ndarray:
-    """bool (types,): the piled types that H1 recognizes in an item; not the fourth, id 3 (published quirk)."""
+    """Return the piled types that H1 recognizes in an item, bool (types,); not id 3 (published quirk)."""
     return np.array(scene.paths.layout.ingredients) < 3
 
 
 def _missing(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P types"]:
-    """Ingredients of the recipe that are missing in each pot; 0 for pots that take no more."""
+    """Return ingredients of the recipe that are missing in each pot; 0 for pots that take no more."""
     missing = jnp.maximum(scene.counts(recipe) - scene.counts(scene.state.pot_items), 0)
     takes = scene.nonfull[np.array(scene.paths.layout.pots)]
     return missing * takes[:, None] * _decoded(scene)
@@ -184,11 +184,11 @@ def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
 
 
 def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], cramped: bool) -> Int[Array, ""]:
-    """Id of the ingredient to fetch, -1 for none. In a cramped layout, the agents fetch different ones."""
+    """Return the id of the ingredient to fetch, -1 for none. In a cramped layout, the agents fetch different ones."""
     ids = jnp.asarray(scene.paths.layout.ingredients)
     missing = _missing(scene, recipe).sum(axis=0) > 0
     second = cramped and scene.slot == 1
-    # Without the exchange of words that people have, fetching different ones is how two of them share the work.
+    # Teammates cannot talk, so fetching different ingredients is how two of them share the work.
     nth = jnp.cumsum(missing)
     wanted = jnp.where(jnp.sum(missing) > 1, nth == 2, nth == 1) if second else nth == 1
     known = jnp.where(jnp.any(missing), ids[jnp.argmax(wanted)], _NONE)
@@ -209,7 +209,7 @@ def _block(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
 
 
 def _access_cells(paths: Paths, kind: int) -> np.ndarray:
-    """bool (cells,): floor cells adjacent to cells of a kind."""
+    """Return the mask of floor cells adjacent to cells of a kind, bool (cells,)."""
     return (paths.manhattan[:, paths.static(kind)] == 1).any(axis=1) & paths.layout.walkable
 
 
@@ -257,7 +257,7 @@ def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
 
 
 def _clear_the_way(scene: Scene) -> Int[Array, ""]:
-    """The step off the shortest paths between the partner, who carries a dish, and the goals."""
+    """Return the step off the shortest paths between the partner, who carries a dish, and the goals."""
     paths = scene.paths
     manhattan = jnp.asarray(paths.manhattan)
     exits = np.flatnonzero(_access_cells(paths, GOAL))
@@ -287,12 +287,12 @@ RECIPE_AWARE_BUTTON = Heuristic(
         "refresh_interval": 100,
         "cost_sensitivity": 0.2,
         "strict_recipe": 0.9,
-        "exploration_bias": 0.1,  # without effect: read by no rule
+        "exploration_bias": 0.1,  # a published parameter that no rule reads
         "plate_timing": 0.5,
-        "dist_weight": 0.3,  # without effect: the nearest target wins, unweighted
-        "inertia": 0.4,  # without effect: no rule looks at the last intent
+        "dist_weight": 0.3,  # a published parameter without effect: the nearest target wins, unweighted
+        "inertia": 0.4,  # a published parameter without effect: no rule looks at the last intent
         "task_specialization": 0.0,
-        "stubbornness": 0.0,  # without effect: read, then unused
+        "stubbornness": 0.0,  # a published parameter without effect: it is read and not used
         "wrong_ingredient_prob": 0.0,
         "idle_prob": 0.0,
         "path_blocking": 0.0,

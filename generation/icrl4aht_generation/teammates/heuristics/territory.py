@@ -48,12 +48,12 @@ class Areas(NamedTuple):
 
 
 def begin_territory(key: Key[Array, ""]) -> TerritoryMemory:
-    """Memory at the start of an episode."""
+    """Return the memory at the start of an episode."""
     return TerritoryMemory(key, jnp.int32(_NOWHERE), jnp.int32(0))
 
 
 def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Array, ""], TerritoryMemory]:
-    """One step of an H2 teammate."""
+    """Take one step of an H2 teammate."""
     following, u = draw(memory.key)
     mode = params["behavior_mode"]
     action = _work(scene, params, u[0], memory.stuck >= _STUCK)
@@ -67,7 +67,7 @@ def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Ar
 
 
 def _to_the_middle(scene: Scene) -> Int[Array, ""]:
-    """The step towards the middle: across first, then along the middle column; stay in front of a wall."""
+    """Return the step towards the middle: across first, then along the middle column; stay in front of a wall."""
     layout = scene.paths.layout
     y, x = np.divmod(np.arange(layout.cells), layout.width)
     # On most layouts nobody gets past a blocker in the middle column.
@@ -79,7 +79,7 @@ def _to_the_middle(scene: Scene) -> Int[Array, ""]:
 
 
 def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> Int[Array, ""]:
-    """The action of the modes other than BLOCKER: rules in order of priority."""
+    """Return the action of the modes other than BLOCKER: rules in order of priority."""
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
     hoards, counters = params["behavior_mode"] == HOARDER, params["behavior_mode"] == COUNTER
     soup, cooking, room = (jnp.any(mask) for mask in (scene.cooked, scene.cooking, scene.nonfull))
@@ -118,7 +118,7 @@ def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> 
             Rule(empty, plates),
         ]
     )
-    # Sabotage is never interrupted; honest work is, by being stuck or, for hoarders, at random.
+    # Only cooperative modes are interrupted: when stuck or, for hoarders, at random.
     sabotages = chosen.found & (chosen.number < len(sabotage))
     wanders = ~chosen.found | (stuck & ~sabotages) | (plate & hoards & (u < 0.7))
     worked = scene.go_to(chosen.target, chosen.waits, _step(scene, params, chosen.target))
@@ -161,7 +161,7 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
 
 
 def areas(scene: Scene, params) -> Areas:
-    """The areas of the scene's agent, or of its partner for the mode INVADER."""
+    """Return the areas of the scene's agent, or of its partner for the mode INVADER."""
     # The split by stations can leave one agent without floor, in small rooms; such layouts are split vertically.
     beyond, stations = _borders(scene.paths)
     kind = jnp.where((params["split_mode"] == STATIONS) & (not stations), VERTICAL, params["split_mode"])

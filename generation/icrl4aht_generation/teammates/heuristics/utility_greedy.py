@@ -31,12 +31,12 @@ class GreedyMemory(NamedTuple):
 
 
 def begin_utility_greedy(key: Key[Array, ""]) -> GreedyMemory:
-    """Memory at the start of an episode."""
+    """Return the memory at the start of an episode."""
     return GreedyMemory(key, jnp.int32(-1), jnp.int32(0))
 
 
 def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[Array, ""], GreedyMemory]:
-    """One step of an H4 teammate."""
+    """Take one step of an H4 teammate."""
     intent, action = _decide(scene, params, memory.intent)
     action, wait = _yield(scene, memory, action)
     # A wait holds the intent but not the key, which moves on in every step as in the published code.
@@ -50,7 +50,7 @@ def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[
 
 
 def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """The best intent (-1 if none is feasible) and its action."""
+    """Return the best intent (-1 if none is feasible) and its action."""
     cooked, cooking, nonfull = scene.reach(scene.cooked), scene.reach(scene.cooking), scene.reach(scene.nonfull)
     # With a plate, a soup that still cooks is worth as much as a finished one, if no other is finished.
     waits = scene.holds_plate & ~jnp.any(cooked) & jnp.any(cooking)
@@ -65,14 +65,14 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
             nonfull,
             jnp.where(jnp.any(needed), needed, scene.recipe_piles),
             jnp.where(prefers_pots, stageable, scene.empty_counters),
-            jnp.zeros_like(scene.goals),  # START has no targets
+            jnp.zeros_like(scene.goals),  # the intent START has no targets
             scene.buttons,
         ]
     )
     values, allowed = _values(scene, params, waits, jnp.any(needed))
     distance = jax.vmap(scene.nearest_distance)(targets)
     feasible = allowed & (distance < UNREACHABLE)
-    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # keeps it from wavering between two intents
+    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # prevents wavering between two intents
     scores = jnp.where(feasible, values - params["dist_weight"] * distance + bonus, -jnp.inf)
     best = jnp.argmax(scores)
     target = scene.closest(targets[best])
@@ -83,7 +83,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
 
 
 def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array, " 8"], Array]:
-    """float32 (8,): weight x value of each intent; bool (8,): whether its conditions other than reach are met."""
+    """Return weight x value of each intent, float32 (8,), and whether its conditions except reach hold, bool (8,)."""
     cooking, cooked, nonfull = (jnp.sum(mask) for mask in (scene.cooking, scene.cooked, scene.nonfull))
     can_add = jnp.any(scene.reach(scene.nonfull))
     can_put_down = jnp.any(scene.reach(scene.empty_counters))
@@ -118,7 +118,7 @@ def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array,
 
 
 def _yield(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
-    """Sometimes waits when the next cell is adjacent to the partner: the action and the wait that follows."""
+    """Return the action, sometimes `stay` next to the partner, and the number of steps to wait."""
     distance = jnp.asarray(scene.paths.manhattan)[scene.destination(action), scene.partner]
     # As published, the roll is the key's first word itself, not a draw from the key.
     roll = jax.random.key_data(memory.key)[0] % 100
@@ -151,7 +151,7 @@ UTILITY_GREEDY = Heuristic(
         "w_add_ingredient": 6.0,
         "w_fetch_ingredient": 4.0,
         "w_stage_on_counter": 2.0,
-        "w_start_cooking": 7.0,  # without effect: pots start by themselves
+        "w_start_cooking": 7.0,  # a published parameter without effect, since pots start by themselves
         "w_press_L": 3.0,
         "dist_weight": 0.5,
         "inertia": 0.3,
