@@ -1,4 +1,4 @@
-"""The benchmark for GPUs in tiny sizes on a CPU, and what can be known of a GPU without one: that programs lower."""
+"""The GPU benchmark: tiny sizes run on a CPU, and full-size programs lower for CUDA."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_the_command():
     assert found["learner/mlp"]["mfu"] == pytest.approx(speed * work / 1e3, rel=0.02)
 
 
-def test_what_there_is_no_time_for_is_skipped_with_a_line():
+def test_cases_without_time_are_reported_as_skipped():
     result = CliRunner().invoke(main, ["--minutes", "0"], catch_exceptions=False)
     assert result.exit_code == 0
     found = lines_of(result.output)
@@ -82,7 +82,7 @@ def test_what_there_is_no_time_for_is_skipped_with_a_line():
     assert all(line["skipped"] for line in found.values())
 
 
-def test_an_error_has_a_line_and_ends_the_process(monkeypatch):
+def test_an_error_is_reported_and_ends_the_process(monkeypatch):
     monkeypatch.setitem(CASES, "product", lambda bench: 1 / 0)
     result = CliRunner().invoke(main, ["--here", "--part", "product", "--part", "loader"], catch_exceptions=False)
     assert result.exit_code == 1

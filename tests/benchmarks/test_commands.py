@@ -1,4 +1,4 @@
-"""The benchmarks on the smallest scale: they run, and their figures are consistent."""
+"""The benchmarks at the smallest scale: they run and print consistent numbers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from icrl4aht_data.writing.published import to_published
 
 
 def run(module: Any, options: str) -> list[dict[str, Any]]:
-    """The JSON lines of a benchmark."""
+    """Run a benchmark and return its JSON lines."""
     result = CliRunner().invoke(module.main, options.split(), catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return [json.loads(line) for line in result.stdout.splitlines() if line.startswith("{")]
@@ -68,8 +68,8 @@ def main(config):
 
 
 @pytest.mark.slow
-def test_jaxmarls_learner_gets_both_environments(tmp_path, monkeypatch):
-    """Both environments are passed to the script of `--peer`: here a small one, as JaxMARL's package has none."""
+def test_the_jaxmarl_script_gets_both_environments(tmp_path, monkeypatch):
+    """A small script replaces the one of `--peer`, which JaxMARL's package does not contain."""
     monkeypatch.setattr("jaxmarl.make", None)  # restored after the test
     script = tmp_path / "ippo.py"
     script.write_text(SCRIPT)

@@ -1,4 +1,4 @@
-"""The operations that are counted in a program's matrix products."""
+"""Counts of floating-point operations in matrix products."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cases in processes that crash, fail, talk or hang."""
+"""Benchmark cases in processes that crash, fail, print or hang."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ for case in sys.argv[1:]:
 
 
 def run(*cases: str, seconds: float = 30, case_seconds: float = 20) -> tuple[int, dict]:
-    """The number of failures, and the facts of each case in the order of their lines."""
+    """Run cases; return the number of failures and the facts of each case in order."""
     found = {}
 
     def note(case, facts):

@@ -67,7 +67,7 @@ ALWAYS = 10**9
 
 @pytest.fixture(autouse=True)
 def data(tmp_path, monkeypatch) -> Path:
-    """The data folder, empty at first. Waits before retries are short."""
+    """Return an empty data folder; shorten the waits before retries."""
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
     monkeypatch.delenv("ICRL4AHT_REMOTE", raising=False)
     monkeypatch.setattr(clients, "_WAITS", (0.01, 0.01, 0.01))
@@ -107,7 +107,7 @@ def shards_in(folder: Path) -> set[str]:
 
 
 @KINDS
-def test_a_remote_release_reads_as_its_local_twin(kind, lite, monkeypatch):
+def test_a_remote_release_equals_its_local_copy(kind, lite, monkeypatch):
     local = load_icrl4aht(lite[0])
     with served(kind, lite[0]) as (url, _):
         remote = load_icrl4aht(url)
@@ -276,7 +276,7 @@ WRONG: dict[str, tuple[Fault, str]] = {
 
 @pytest.mark.parametrize("fault", WRONG)
 @pytest.mark.parametrize("kind", ["http", "hub"])
-def test_a_server_that_is_wrong_for_good(kind, fault, lite, tmp_path):
+def test_permanent_server_errors(kind, fault, lite, tmp_path):
     wrong, message = WRONG[fault]
     with served(kind, lite[0]) as (url, server):
         assert server is not None
@@ -343,7 +343,7 @@ def silent_server() -> socket.socket:
 
 
 @pytest.mark.parametrize("what", ["http", "hub", pytest.param("s3", marks=pytest.mark.slow), "refused", "hub refused"])
-def test_no_answer_is_an_error_soon(what, tmp_path, monkeypatch):
+def test_a_silent_server_times_out(what, tmp_path, monkeypatch):
     monkeypatch.setattr(clients, "_TIMEOUT", 0.5)
     with silent_server() as server:
         endpoint = f"http://127.0.0.1:{9 if 'refused' in what else server.getsockname()[1]}"
@@ -465,7 +465,7 @@ def test_repair_needs_the_right_source(lite, full, tmp_path, monkeypatch):
     assert contents(root) == contents(lite[0])
 
 
-def test_a_note_is_about_one_folder_and_release(lite, tmp_path, data):
+def test_a_note_is_valid_for_one_folder_and_release(lite, tmp_path, data):
     target = tmp_path / "mine"
     with http_server(lite[0]) as server:
         fetch_planned(plan_download(server.url, to=target, layout="demo_wide"))
@@ -477,7 +477,7 @@ def test_a_note_is_about_one_folder_and_release(lite, tmp_path, data):
     assert download.read_note(target) is None and SHARD in verify_release(target).files_at_fault
 
 
-def test_verification_reports_every_file_that_a_remote_serves_damaged(lite, tmp_path):
+def test_verification_reports_every_damaged_remote_file(lite, tmp_path):
     root = tmp_path / "served"
     shutil.copytree(lite[0], root)
     for name in ("README.md", SHARD):
@@ -510,7 +510,7 @@ def test_bad_addresses(url, error, message, lite, tmp_path):
             plan_download(server.url, layout="demo_wid")
 
 
-def test_the_token_does_not_leave_the_hub(lite):
+def test_the_token_is_sent_to_the_hub_only(lite):
     with served("hub", lite[0]) as (url, hub):
         batch(url)
         assert isinstance(hub, Hub)
@@ -531,7 +531,7 @@ def test_texts_without_credentials(text, expected):
     assert without_credentials(text) == expected
 
 
-def test_credentials_that_are_not_encoded_are_refused_unseen():
+def test_unencoded_credentials_are_refused_and_hidden():
     for address in ("http://user:hunter2/RET@127.0.0.1:9/x", "http://user:1/hunter2@127.0.0.1:9/x"):
         with pytest.raises(OptionError, match="percent-encode the user name and password") as caught:
             load_icrl4aht(address)

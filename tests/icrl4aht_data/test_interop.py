@@ -1,4 +1,4 @@
-"""Loaders of other libraries over samplers, each with the library itself."""
+"""Loaders of PyTorch, Grain and Hugging Face over samplers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def sampler(lite):
 
 
 class TestPasses:
-    """A second pass had the batches of the first, so that a model trained on one set of windows for ever."""
+    """Regression: each pass over a loader repeated the batches of the first pass."""
 
     def test_each_pass_over_a_torch_loader_continues(self, sampler):
         loader, n = torch_loader(sampler), len(sampler)
@@ -40,7 +40,7 @@ class TestPasses:
             for i, batch in enumerate(batches, start=number * n):
                 np.testing.assert_array_equal(batch.obs, sampler[i].obs)
 
-    def test_a_resumed_loader_ends_its_passes_where_the_first_one_did(self, sampler):
+    def test_a_resumed_loader_keeps_the_ends_of_its_passes(self, sampler):
         resumed, n = torch_loader(sampler, start=len(sampler) + 3), len(sampler)
         assert len(resumed) == n - 3
         first, second = list(resumed), list(resumed)
@@ -191,9 +191,9 @@ def by_hugging_face(sampler):
 
 @pytest.mark.parametrize("take", [by_torch, by_hugging_face])
 class TestLosses:
-    """Targets were int32, which PyTorch's losses refuse; padding was the action "up"."""
+    """Regression: int32 targets are refused by PyTorch's losses, and padding was the action "up"."""
 
-    def test_cross_entropy_takes_the_targets_as_they_come(self, lite, take):
+    def test_cross_entropy_accepts_the_targets(self, lite, take):
         sampler = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=3, length=150, teammate_actions=True)
         batch = take(sampler)
         for name in ("prev_actions", "target_actions", "prev_teammate_actions"):

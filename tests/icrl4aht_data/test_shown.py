@@ -1,4 +1,4 @@
-"""What people see: `repr`, HTML in notebooks, `help()`, and the types that a checker finds in a user's script."""
+"""Displayed texts: `repr`, HTML in notebooks, `help()`, and types in a user's script."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def bundled() -> Dataset:
 
 
 def shown(dataset: Dataset) -> dict[str, object]:
-    """One object of every public class, and those that their attributes lead to."""
+    """Return an object of every public class, including attributes."""
     selection = dataset.filter(layout="demo_wide")
     sampler, contexts, history = (
         selection.ad(batch_size=2, length=30),
@@ -116,7 +116,7 @@ def test_html_escapes_names():
 
 @pytest.mark.parametrize("values", [[40.0, 40.0, 40.0], [38.0, 42.0] * 3])
 def test_the_axis_of_a_curve_does_not_magnify(values):
-    """Alternating returns once filled the axis, and a constant lay on its bottom line."""
+    """Regression: small changes filled the axis, and constants lay on its lower edge."""
     svg = ElementTree.fromstring(curve_svg({"ppo": np.array(values)}))
     low, high = return_limits(values)
     assert [text.text for text in svg.iter("text")][:2] == [f"{high:.1f}", f"{low:.1f}"]
@@ -152,7 +152,7 @@ def test_help_of_loading_and_verifying_shows_types():
 
 @pytest.mark.parametrize("shown", [Dataset, History, Episode, Batches], ids=lambda shown: shown.__name__)
 def test_help_of_methods_shows_types(shown):
-    """Types of libraries that are imported for type checks only stay texts."""
+    """Types of libraries imported only for type checks are shown as text."""
     for name, method in inspect.getmembers(shown, inspect.isfunction):
         if name.startswith("_") and name != "__init__":
             continue
@@ -175,7 +175,7 @@ SCRIPT = Path(__file__).with_name("user_script.py")
 
 
 def test_a_users_script_has_no_type_errors(tmp_path):
-    """Checks Grain, PyTorch and JAX device batches; a wrong line shows that the checker sees the types."""
+    """Check Grain, PyTorch and JAX batches; one wrong line proves that types are checked."""
     settings = {"typeCheckingMode": "standard", "pythonVersion": "3.11", "extraPaths": [str(ROOT)]}
     settings |= {"venvPath": str(Path(sys.prefix).parent), "venv": Path(sys.prefix).name}
     wrong = "\nfrom icrl4aht_data import load_icrl4aht as load\nload().ad(batch_size=2, length=3)[0].obs.at\n"

@@ -1,4 +1,4 @@
-"""A user's script with Grain, PyTorch and JAX, which is checked for types and run by `test_shown.py`."""
+"""A user's script with Grain, PyTorch and JAX; `test_shown.py` runs and type-checks it."""
 
 import grain
 import jax

@@ -1,4 +1,4 @@
-"""The trainer: one step, exact resume, several devices and processes, held-out parts, run folders."""
+"""The trainer: steps, exact resume, several devices and processes, held-out data, run folders."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ MODEL = dataclasses.replace(TINY, layers=1)
 
 
 class Rows:
-    """Batches of the flat world, each a function of its number."""
+    """Batches of flat observations; each is a function of its number."""
 
     def __init__(self, seed: int = 0, die_at: int | None = None) -> None:
         self.seed, self.die_at = seed, die_at
@@ -72,7 +72,7 @@ class Rows:
 
 @cache
 def compiled() -> Trainer:
-    """Return the trainer of all runs of this file, of the method with the most state (slow parameters)."""
+    """Return one compiled trainer for all tests, with the method that has the most state."""
     return Trainer(get_method("amago_offline")(MODEL, FLAT), OPTIONS)
 
 
@@ -94,7 +94,7 @@ def assert_same(one: Any, two: Any) -> None:
 
 
 def scalars(folder: Path) -> list[tuple[str, int, str, float]]:
-    """(part, step, name, value) of a run's event files, whose records are length, checksum, event, checksum."""
+    """Return (part, step, name, value) of each record in a run's event files."""
     found = []
     for path in folder.glob("tensorboard/*/*"):
         content, at = path.read_bytes(), 0
@@ -107,9 +107,9 @@ def scalars(folder: Path) -> list[tuple[str, int, str, float]]:
 
 
 class TestResume:
-    def test_a_killed_run_resumes_to_the_same_bits(self, through, tmp_path):
+    def test_a_killed_run_resumes_bit_for_bit(self, through, tmp_path):
         with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path, die_at=5, tensorboard=True)  # behind the checkpoint of step 3, and behind a logged line
+            trained(tmp_path, die_at=5, tensorboard=True)  # after the checkpoint of step 3 and after a logged line
         assert Checkpoints(tmp_path / CHECKPOINTS).latest == 3
         with (tmp_path / "metrics.jsonl").open("a") as log:
             log.write('{"step": 5, "cut o')
@@ -125,7 +125,7 @@ class TestResume:
             if name not in ("part", "step")
         )
 
-    def test_a_finished_run_is_left_as_it_is(self, through):
+    def test_a_finished_run_is_not_changed(self, through):
         log = (through[0] / "metrics.jsonl").read_bytes()
         assert_same(trained(through[0]), through[1])
         assert (through[0] / "metrics.jsonl").read_bytes() == log
@@ -166,7 +166,7 @@ class TestResume:
 
 
 def terminate_at_4(step: int, loss: float | None) -> None:
-    """Progress callback that stops the training at a step that is logged but not a checkpoint, by two SIGTERMs."""
+    """Send two SIGTERMs at a step that is logged but has no checkpoint."""
     if step == 4:
         os.kill(os.getpid(), signal.SIGTERM)
         assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL  # with it the next one would kill the tests
@@ -222,7 +222,7 @@ class TestStopping:
 
 class TestFolder:
     def test_a_refused_training_does_not_block_the_corrected_one(self, through, tmp_path):
-        """Without a checkpoint nothing is lost; with one, other settings are refused."""
+        """Other settings are refused only if the run has a checkpoint."""
         first, corrected = ({**format_versions(), "train": {"batch_size": size}} for size in (10**9, 4))
         open_run(tmp_path / "run", first)
         assert open_run(tmp_path / "run", corrected) == corrected == read_config(tmp_path / "run")
@@ -241,9 +241,9 @@ class TestFolder:
     @pytest.mark.parametrize(
         ("stored", "asked", "refused"),
         [
-            ({"layers": 1, "gone": False}, {"layers": 1}, None),  # an option that no longer exists, and was not used
+            ({"layers": 1, "gone": False}, {"layers": 1}, None),  # a removed option that was not used
             ({"layers": 1, "gone": True}, {"layers": 1}, r"model\.gone: the run has True, expected None"),
-            ({"layers": 1}, {"layers": 1, "width": 256}, None),  # one that came after the run, which has its default
+            ({"layers": 1}, {"layers": 1, "width": 256}, None),  # a newer option with its default value
             ({"layers": 1}, {"layers": 1, "width": 64}, r"model\.width: the run has 256, expected 64"),
         ],
     )
@@ -257,7 +257,7 @@ class TestFolder:
 class TestStep:
     @pytest.mark.slow
     def test_parts_of_a_batch_add_up(self):
-        """The gradient, and so the step, is that of the complete batch; padding differs between the parts."""
+        """Parts with unequal padding give the gradient of the complete batch."""
         method = get_method("ad")(dataclasses.replace(MODEL, dropout=0.0), FLAT)
         one, parts = (Trainer(method, dataclasses.replace(OPTIONS, accumulate=n)) for n in (1, 2))
         batch = Rows().batch(0)
@@ -301,8 +301,8 @@ def long_ppo(tmp_path_factory) -> Path:
 
 
 class TestHeldOut:
-    def test_no_history_and_no_teammate_is_in_two_parts(self, tmp_path, monkeypatch):
-        """Where a release does not describe teammates, each task counts as one."""
+    def test_parts_share_no_history_and_no_teammate(self, tmp_path, monkeypatch):
+        """Without teammate descriptions, each task counts as its own teammate."""
         random_release(tmp_path / "r", layouts=("demo_wide",), teammates=5, streams=4, episodes=2)
         dataset = load_icrl4aht(tmp_path / "r", obs="state")
         monkeypatch.setattr(dataset_module, "teammate_ids", lambda dataset, ids: None)
@@ -342,7 +342,7 @@ class TestHeldOut:
             hold_out(dataset[3:5])
 
     def test_a_teammate_of_both_sources_is_in_one_part(self, tmp_path, monkeypatch):
-        """Tasks of two sources with one teammate have different ids."""
+        """Tasks of two sources have different ids even with one teammate."""
         random_release(tmp_path / "r", layouts=("demo_wide",), teammates=4, streams=4, episodes=2)
         dataset = load_icrl4aht(tmp_path / "r", obs="state")
         mates = {name: f"mate {number % 2}" for number, name in enumerate(dataset.index.values("task_id"))}
@@ -358,7 +358,7 @@ class TestHeldOut:
             assert not train & others
 
     def test_every_task_keeps_a_history(self, two_sources):
-        """A large share takes all others; a small one takes a history of some tasks."""
+        """A large share holds out all but one history; a small one affects some tasks only."""
         dataset = load_icrl4aht(two_sources[0], source="noise", split="train", layout="demo_wide")
         for share, held in ((0.9, 4), (0.5, 3), (0.01, 1)):
             split = hold_out(dataset, share, validation=dataset[:1])
@@ -399,7 +399,7 @@ class TestHeldOut:
         assert [len(split.train), len(split.histories)] == [len(dataset) - 1, 1]
 
     def test_filters_choose_the_histories_and_are_recorded(self):
-        """The bundled release has teammates of several families and algorithms on asymm_both."""
+        """Filter the teammates of asymm_both, which have several families and algorithms."""
 
         def job(**filters: Any) -> dict[str, Any]:
             return prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), **filters)).about
@@ -484,7 +484,7 @@ def metrics(folder: Path) -> list[dict[str, Any]]:
 
 
 def test_processes_share_the_batches(lite, monkeypatch):
-    """Rows of two processes, one after the other, are those of a single one."""
+    """Concatenated rows of two processes equal those of one process."""
 
     def rows(index: int, count: int) -> Any:
         monkeypatch.setattr(jax, "process_index", lambda: index)
@@ -505,7 +505,7 @@ def on_one_device(lite, tmp_path_factory) -> list[dict[str, Any]]:
 def across(
     root: Path, folder: Path, environments: list[dict[str, str]], *arguments: str, code: int = 0
 ) -> list[dict[str, Any]]:
-    """Train in one process per environment, which all exit with `code`; the log."""
+    """Train in one process per environment, check the exit code `code`, and return the log."""
     processes = [
         start("-c", DEVICES, f"{root},{folder / 'run'}", *arguments, **environment) for environment in environments
     ]
@@ -526,7 +526,7 @@ def assert_close(one: list[dict[str, Any]], two: list[dict[str, Any]]) -> None:
 
 @pytest.mark.slow
 def test_two_devices_train_as_one(lite, tmp_path, on_one_device):
-    """Also with dropout, accumulation and validation."""
+    """Equal results on two devices, also with dropout, accumulation and validation."""
     two = across(lite[0], tmp_path, [{"XLA_FLAGS": add_xla_flag("--xla_force_host_platform_device_count=2")}])
     assert_close(two, on_one_device)
 

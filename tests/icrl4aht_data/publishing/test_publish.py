@@ -1,4 +1,4 @@
-"""Releases built for publication: their files, and that card and descriptions are true and valid."""
+"""Releases built for publication: files, card and machine-readable descriptions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DAY = datetime.date(2026, 1, 2)
 
 @pytest.fixture(scope="session")
 def release(tmp_path_factory) -> Path:
-    """A full release of random play on layouts of both tracks, of the training and the test split. Read only."""
+    """Return a full release of random play with both tracks and splits (read-only)."""
     root = tmp_path_factory.mktemp("source") / "release"
     random_release(root, "full", ("coord_simple", "cramped_up", "cramped_down"), streams=2)
     return root
@@ -43,13 +43,13 @@ def release(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def published(release, tmp_path_factory) -> Path:
-    """The release built from `release`. Read only."""
+    """Build the fixture `release` for publication (read-only)."""
     return build_release(release, tmp_path_factory.mktemp("published") / "release", published=DAY)
 
 
 @pytest.fixture(scope="session")
 def with_learned(tmp_path_factory) -> Path:
-    """A release of one task with a learned teammate and its checkpoint. Read only."""
+    """Return a release of one task with a learned teammate and its checkpoint (read-only)."""
     folder = tmp_path_factory.mktemp("learned")
     weights = folder / "policy.safetensors"
     weights.write_bytes(b"weights")
@@ -126,7 +126,7 @@ def test_a_combination_lists_its_sources(published, tmp_path):
     assert (out / "meta/source_card.md").read_text() == sources
 
 
-def test_linked_files_take_no_space_and_are_not_written_through(published, tmp_path):
+def test_linked_files_are_never_modified(published, tmp_path):
     source = shutil.copytree(published, tmp_path / "source")
     (source / "README.md").write_text("# mine\n")
     write_manifest(source)
@@ -173,11 +173,11 @@ def test_datasets_loads_every_configuration(published, tmp_path):
     }
 
 
-def test_croissant_is_valid_and_its_records_are_the_index(published):
+def test_croissant_is_valid_and_its_records_equal_the_index(published):
     import mlcroissant
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # raised by libraries that mlcroissant is built on
+        warnings.simplefilter("ignore")  # raised by dependencies of mlcroissant
         described = mlcroissant.Dataset(str(published / "croissant.json"))
         records = list(described.records("histories"))
         episodes = list(described.records("episodes"))

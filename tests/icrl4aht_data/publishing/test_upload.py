@@ -1,4 +1,4 @@
-"""Uploads are complete, resume after an interruption, and are tagged only if the repository equals the release."""
+"""Uploads: complete, resumable, and tagged only if the repository equals the release."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ REPO, ADDRESS = "us/histories", "hf://datasets/us/histories"
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory) -> Path:
-    """A release built for publication. Read only."""
+    """Return a release built for publication (read-only)."""
     root = tmp_path_factory.mktemp("upload")
     random_release(root / "source", streams=2)
     return build_release(root / "source", root / "release")
@@ -43,7 +43,7 @@ def hub(tmp_path):
 
 
 def next_version(release: Path, target: Path) -> Path:
-    """The release under another data version, without one of its files."""
+    """Return the release with another data version and one file less."""
     shutil.copytree(release, target)
     info = target / "meta/info.json"
     info.write_text(info.read_text().replace('"data_version": "0.0.1"', '"data_version": "0.1.0"'))
@@ -53,7 +53,7 @@ def next_version(release: Path, target: Path) -> Path:
 
 
 def sent(hub: Hub) -> list[str]:
-    """Return the large files that were sent completely."""
+    """Return the large files that were uploaded completely."""
     return [request.path for request in hub.log if request.method == "PUT" and request.status == 200]
 
 
@@ -118,7 +118,7 @@ def test_the_next_version_replaces_the_last(hub, published, tmp_path):
     assert "meta/source_card.md" in hub.files(REPO, "v0.0.1")
 
 
-def test_a_repository_with_other_peoples_files_is_left_alone(hub, published, tmp_path):
+def test_repositories_with_foreign_files_are_refused(hub, published, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("years")
     hub.add_repo(REPO, tmp_path / "mine")
@@ -128,7 +128,7 @@ def test_a_repository_with_other_peoples_files_is_left_alone(hub, published, tmp
     assert hub.files(REPO) == {"thesis.txt": b"years"}
 
 
-def test_a_public_repository_is_not_taken_for_a_private_one(hub, published, tmp_path):
+def test_a_public_repository_is_refused_for_a_private_upload(hub, published, tmp_path):
     upload_release(published, ADDRESS)
     with pytest.raises(UploadError, match="us/histories: is public; make it private"):
         upload_release(next_version(published, tmp_path / "new"), ADDRESS, private=True)
@@ -149,7 +149,7 @@ def test_other_addresses_are_refused(published, address):
 
 @pytest.mark.slow
 def test_a_killed_upload_resumes(hub, published):
-    """Files that were sent completely are not sent again."""
+    """Completely uploaded files are not uploaded again."""
     puts = 0
 
     def rule(request: Request) -> Slow | None:
@@ -207,8 +207,8 @@ def test_an_unreachable_hub(published, tmp_path):
             assert "kept" not in str(error.value)
 
 
-def test_what_differs_after_the_upload_gets_no_tag(hub, published, tmp_path):
-    """Another user commits in between."""
+def test_a_changed_repository_gets_no_tag(hub, published, tmp_path):
+    """Another user commits during the upload."""
     shutil.copytree(published, tmp_path / "theirs")
     (tmp_path / "theirs/LICENSE").write_text("all rights reserved")
     next(tmp_path.glob("theirs/data/*/*/*.h5")).write_bytes(b"no data")

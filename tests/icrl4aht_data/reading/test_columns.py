@@ -1,4 +1,4 @@
-"""Columns of the index, data frames, and filters by what the labels' policies earn."""
+"""Columns of the index, data frames, and filters by expert return."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def expert(greedy: float | None, sampled: float | None = None) -> ExpertLabels:
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """Four tasks: labels that earn 9.5, 0.0 greedily and 16.9 sampled, -30.0, and of which nothing is known."""
+    """Return four tasks with expert returns 9.5, 0.0 (16.9 sampled), -30.0 and unknown."""
     root = tmp_path_factory.mktemp("measured") / "release"
     experts = [expert(9.5, 10.0), expert(0.0, 16.9), expert(-30.0, 1.0), None]
     random_release(root, streams=2, experts=experts, sources=["ppo", "ppo", "search", "search"])
@@ -38,7 +38,7 @@ def measured(tmp_path_factory):
 
 
 def test_columns_of_names_are_names(lite):
-    """Were integer codes: comparison with a name found nothing."""
+    """Regression: names were integer codes, so comparisons with a name found nothing."""
     dataset = load_icrl4aht(lite[0])
     layouts = dataset.column("layout")
     assert layouts.dtype.kind == "U"
@@ -103,7 +103,7 @@ def test_filters_of_sources_and_algorithms(measured):
         load_icrl4aht(measured, layout="coord_simple", source="search")
 
 
-def test_filter_by_what_the_labels_earn(measured):
+def test_filter_by_expert_return(measured):
     dataset = load_icrl4aht(measured, source="ppo", min_expert_return=9.5)
     assert dataset.ids.tolist() == [0, 1]
     assert load_icrl4aht(measured).select([2, 1]).filter(min_expert_return=-1).ids.tolist() == [2, 1]
@@ -121,7 +121,7 @@ def test_filter_by_what_the_labels_earn(measured):
             load_icrl4aht(measured, min_expert_return=wrong)  # type: ignore[arg-type]
 
 
-def test_a_history_names_what_its_labels_earn(measured):
+def test_a_history_has_its_expert_return(measured):
     dataset = load_icrl4aht(measured)
     assert "labels 9.5, source ppo)" in repr(dataset[0])
     assert "labels -30.0, source search)" in repr(dataset[4])
@@ -134,7 +134,7 @@ def test_a_release_without_returns_refuses_the_filter(lite):
 
 
 class TestWeakLabels:
-    """Random play loses a little in all these tasks."""
+    """Random play earns slightly less than 0 in all tasks."""
 
     def test_warning_names_tasks_and_numbers(self, measured):
         dataset = load_icrl4aht(measured, layout="demo_wide")
@@ -159,7 +159,7 @@ class TestWeakLabels:
             dataset.dpt(batch_size=2, context=5)
         assert [one.category for one in caught] == [WeakLabelsWarning] * weak  # labels earn 9.5
 
-    def test_nothing_is_said_of_what_was_not_measured(self, lite):
+    def test_no_warning_without_measured_returns(self, lite):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             load_icrl4aht(lite[0], layout="demo_wide").dpt(batch_size=2, context=5)

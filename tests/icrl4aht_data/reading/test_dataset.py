@@ -1,4 +1,4 @@
-"""Loading, selecting, other options, fields of histories."""
+"""Loading, selecting, changing options, and fields of histories."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_other_options_share_index_and_shards(lite, converted_release):
     ],
     ids=str,
 )
-def test_fields_index_as_arrays_do(lite, key):
+def test_fields_are_indexed_like_arrays(lite, key):
     root, written = lite
     lazy = load_icrl4aht(root)[4].state
     expected = written[4]["state"]
@@ -135,7 +135,7 @@ def test_fields_index_as_arrays_do(lite, key):
         lambda ds: ds[0]["nothing"],
     ],
 )
-def test_impossible_positions_are_errors_of_this_package(lite, use):
+def test_invalid_positions(lite, use):
     with pytest.raises(Icrl4ahtError):
         use(load_icrl4aht(lite[0]))
 
@@ -156,7 +156,7 @@ def test_a_step_out_of_range(lite):
 
 
 @pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
-def test_observations_as_the_option_says(lite_or_full, obs):
+def test_observations_follow_the_obs_option(lite_or_full, obs):
     root, written = lite_or_full
     history = load_icrl4aht(root, layout="demo_wide", obs=obs)[0]
     state = written[history.entry.history_id]["state"]
@@ -184,7 +184,7 @@ def test_returns_are_the_learning_curve(lite):
     np.testing.assert_allclose(load_icrl4aht(root)[3].returns(), expected, rtol=0, atol=1e-9)
 
 
-def test_a_dataset_travels_by_pickle(lite):
+def test_a_dataset_can_be_pickled(lite):
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     dataset[0].state[:]
     copy = pickle.loads(pickle.dumps(dataset))

@@ -101,7 +101,7 @@ class TestPictures:
         ):
             dataset[6].animate(episode)
 
-    def test_nothing_is_drawn_from_observations(self, full, tmp_path):
+    def test_pictures_need_state_records(self, full, tmp_path):
         to_release(load_icrl4aht(full[0]), tmp_path / "o", "observations")
         with pytest.raises(NotStoredError, match="this release has observations only"):
             load_icrl4aht(tmp_path / "o")[0].animate()
@@ -126,15 +126,15 @@ class TestSplit:
         others = {tuple(two_sourced.split(0.25, seed=seed, by=by)[1].ids) for seed in range(5)}
         assert len(others) > 1
 
-    def test_by_teammate_no_teammate_is_in_both(self, two_sourced):
+    def test_split_by_teammate_has_no_shared_teammates(self, two_sourced):
         train, validation = (set(part.column("task_id")) for part in two_sourced.split(0.3))
         assert train and validation and not train & validation
 
-    def test_by_history_every_task_is_trained_on(self, two_sourced):
+    def test_split_by_history_keeps_every_task_in_training(self, two_sourced):
         train, validation = two_sourced.split(0.9, by="history")
         assert set(validation.column("task_id")) <= set(train.column("task_id")) == set(two_sourced.column("task_id"))
 
-    def test_what_cannot_be_divided(self, two_sourced):
+    def test_invalid_splits(self, two_sourced):
         one = two_sourced.filter(task_id=str(two_sourced.column("task_id")[0]))
         with pytest.raises(OptionError, match=r'has one teammate, so none can be held out; take by="history"'):
             one.split()
@@ -168,7 +168,7 @@ class TestSampling:
     @pytest.mark.parametrize(
         ("n", "message"), [(73, "the selection has 72 episodes"), (0, "at least 1"), (1.5, "integer")]
     )
-    def test_impossible_numbers(self, dataset, n, message):
+    def test_invalid_sample_sizes(self, dataset, n, message):
         with pytest.raises(OptionError, match=f"n = {n}: .*{message}"):
             dataset.sample_episodes(n)
 

@@ -1,4 +1,4 @@
-"""Releases of observations: made of published files without state records, and usable without them."""
+"""Releases of observations: converted from published files without state records."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class TestConversion:
             assert (group["rewards"].dtype, group["actions"].dtype) == ("float32", "int32")
             np.testing.assert_array_equal(group["obs"][()], published_folder[1][0]["obs"])
 
-    def test_files_made_of_a_release_give_the_same_release(self, converted_release, tmp_path):
+    def test_exporting_and_importing_round_trips(self, converted_release, tmp_path):
         to_published(load_icrl4aht(converted_release), tmp_path / "files")
         assert not (tmp_path / "files" / "tasks.jsonl").exists()
         from_published(tmp_path / "files", tmp_path / "back", kept_steps=KEPT)
@@ -75,7 +75,7 @@ class TestConversion:
             np.testing.assert_array_equal(old.obs[:], new.obs[:])
 
     @pytest.mark.parametrize("kind", KINDS)
-    def test_states_cannot_be_made(self, published_folder, converted_release, tmp_path, kind):
+    def test_states_cannot_be_recovered_from_observations(self, published_folder, converted_release, tmp_path, kind):
         with pytest.raises(OptionError, match=rf"has observations only, and a {kind} release is made of state records"):
             to_release(load_icrl4aht(converted_release), tmp_path / "out", kind)
         with pytest.raises(
@@ -84,7 +84,7 @@ class TestConversion:
             from_published(published_folder[0], tmp_path / "out", kind, kept_steps=KEPT)
 
     def test_states_may_be_left_out(self, lite, reconverted_release, tmp_path):
-        """A lite release can be converted directly, and published files with states can, too."""
+        """Lite releases and published files with states can be converted without their states."""
         to_published(load_icrl4aht(lite[0]), tmp_path / "files")
         to_release(load_icrl4aht(lite[0]), tmp_path / "one", "observations")
         assert from_published(tmp_path / "files", tmp_path / "two", "observations", kept_steps=KEPT) == "observations"
@@ -165,7 +165,7 @@ class TestFaults:
             (lambda file, index: file["/0"].pop("obs") and file.create_group("/0/obs"), r"/0/obs: not a dataset"),
             (edit(1, T=100), r"group /1: dones: 100 steps on demo_wide: expected numbers of shape \(100,\), found"),
             (edit(0, layout="test_wide"), r"history 1 is of .*demo_wide.*, its task 'task_a' of .*test_wide"),
-            (edit(2, layout="demo_simple"), None),  # as many channels: nothing in the files says otherwise
+            (edit(2, layout="demo_simple"), None),  # equal channel counts, so the files do not reveal the fault
             (edit(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
             (edit(1, teammate_kind="other"), r"index\.jsonl: history 1 is of .*'other'.*, its task 'task_a' of"),
             (edit(1, T="many"), r"index\.jsonl, line 2: field 'T': Expected `int`, got `str`, found 'many'"),
@@ -208,7 +208,7 @@ class TestFaults:
 
 
 class TestTasks:
-    def test_without_tasks_teammates_are_known_by_name(self, converted_release):
+    def test_without_tasks_teammates_have_names_only(self, converted_release):
         dataset = load_icrl4aht(converted_release)
         assert (converted_release / "meta" / "tasks.jsonl").read_text() == ""
         assert {entry.seed for entry in dataset.entries} == {-1}
@@ -219,7 +219,7 @@ class TestTasks:
         assert dataset.environment_parameters(0)["layout"] == "demo_wide"
         assert len(load_icrl4aht(converted_release, teammate_family="H2", task_id="task_c")) == 1
 
-    def test_with_tasks_they_are_known(self, lite, reconverted_release):
+    def test_with_tasks_teammates_are_complete(self, lite, reconverted_release):
         one, two = load_icrl4aht(lite[0]), load_icrl4aht(reconverted_release)
         assert (reconverted_release / "meta" / "tasks.jsonl").read_text() == (
             lite[0] / "meta" / "tasks.jsonl"
@@ -227,7 +227,7 @@ class TestTasks:
         assert two.recover_teammate(8) == one.recover_teammate(8)
         assert [entry.seed for entry in two.entries] == [entry.seed for entry in one.entries]
 
-    def test_all_are_given_or_none(self, published_folder, tmp_path):
+    def test_partial_tasks_are_refused(self, published_folder, tmp_path):
         write_tasks(tmp_path / "tasks.jsonl", make_tasks(["demo_wide"]))
         with pytest.raises(PublishedFormatError, match=r"tasks\.jsonl: missing 3 tasks of the index, such as 'task_a'"):
             from_published(published_folder[0], tmp_path / "out", tasks=tmp_path / "tasks.jsonl", kept_steps=KEPT)
@@ -236,7 +236,7 @@ class TestTasks:
 
 
 class TestWithoutStates:
-    def test_what_needs_states_says_so(self, converted_release):
+    def test_missing_states_are_an_error(self, converted_release):
         with pytest.raises(
             OptionError, match=r'obs = "state": .* has observations only, no state records; take float32'
         ):
@@ -260,7 +260,7 @@ class TestWithoutStates:
             mixed = load_icrl4aht(converted_release, layout="demo_wide", cache=cache)
             assert mixed.ad(batch_size=9, length=5)[0].prev_teammate_actions is None
 
-    def test_a_large_index_says_who_has_them(self, tmp_path, monkeypatch):
+    def test_a_large_index_counts_teammate_actions(self, tmp_path, monkeypatch):
         monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
         long_index(tmp_path / "r")
         info, index = tmp_path / "r" / "meta" / "info.json", tmp_path / "r" / "meta" / "histories.jsonl"
@@ -282,12 +282,12 @@ class TestWithoutStates:
 class TestBatches:
     @pytest.mark.parametrize("obs", ["float32", "uint8"])
     @pytest.mark.parametrize("cache", CACHES)
-    def test_ad_batches_are_those_of_the_original(self, lite, full, reconverted_release, obs, cache):
+    def test_ad_batches_equal_those_of_the_original(self, lite, full, reconverted_release, obs, cache):
         options = {"batch_size": 6, "seed": 5, "teammate_actions": True}
         for root in (lite[0], full[0]):
             original = load_icrl4aht(root, layout="demo_wide", obs=obs)
             dataset = load_icrl4aht(reconverted_release, layout="demo_wide", obs=obs, cache=cache, threads=2)
-            for length in (1, 40, 130):  # the last longer than the histories
+            for length in (1, 40, 130):  # the last length exceeds the histories
                 for i in (0, 3, 1000):
                     one, two = (d.ad(length=length, **options)[i] for d in (original, dataset))
                     assert two.obs.dtype == obs
@@ -303,7 +303,7 @@ class TestBatches:
     @pytest.mark.parametrize("order", ["contiguous", "random"])
     @pytest.mark.parametrize("options", [{}, {"episodes": (1, 3)}, {"episodes": (-1, None)}])
     def test_no_context_has_an_episodes_last_step(self, converted_release, published_folder, cache, order, options):
-        """Nor the last step of an unfinished episode; every other step turns up, with what followed it."""
+        """Contexts exclude last steps, also of unfinished episodes, and contain all other steps."""
         arrays = published_folder[1][1]  # 130 steps: six episodes and a half
         dataset = load_icrl4aht(converted_release, obs="uint8", cache=cache).select([1])
         sampler = dataset.dpt(batch_size=40, context=15, order=order, seed=2, teammate_actions=True, **options)
@@ -327,7 +327,7 @@ class TestBatches:
         sampler = load_icrl4aht(converted_release).select([0]).dpt(batch_size=2000, context=1)
         assert set(sampler._draw(0)[1].ravel().tolist()) == set(range(120))
 
-    def test_impossible_contexts(self, converted_release, tmp_path):
+    def test_invalid_contexts(self, converted_release, tmp_path):
         dataset = load_icrl4aht(
             converted_release, task_id="task_a", obs="uint8"
         )  # 120 and 130 steps: 114 and 123 transitions
@@ -352,7 +352,9 @@ class TestBatches:
 
 
 class TestCombine:
-    def test_like_ones(self, converted_release, published_folder, reconverted_release, lite, tmp_path):
+    def test_combining_releases_of_observations(
+        self, converted_release, published_folder, reconverted_release, lite, tmp_path
+    ):
         other = shutil.copytree(published_folder[0], tmp_path / "files")
         index = other / "histories_index.jsonl"
         index.write_text(index.read_text().replace('": "task_', '": "more_'))
@@ -376,7 +378,7 @@ class TestCombine:
         with pytest.raises(OptionError, match=r"kind 'lite'.*combine releases of one kind"):
             combine_releases(tmp_path / "mixed", [converted_release, lite[0]])
 
-    def test_one_with_tasks_to_the_same_bytes(self, reconverted_release, tmp_path):
+    def test_combining_one_release_gives_equal_bytes(self, reconverted_release, tmp_path):
         combine_releases(tmp_path / "out", [reconverted_release])
         for name in (SHARD, "meta/tasks.jsonl", "meta/histories.jsonl", "meta/info.json"):
             assert (tmp_path / "out" / name).read_bytes() == (reconverted_release / name).read_bytes()

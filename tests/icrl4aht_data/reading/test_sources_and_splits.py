@@ -1,4 +1,4 @@
-"""Histories by source, split and learner: filters, counts, representations."""
+"""Histories by source, split and learner: filters, counts and `repr`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Impossible options of loading, sampling and loaders: an error of the package that names the value, nothing else."""
+"""Invalid options of loading and sampling raise an error of the package that names the value."""
 
 from __future__ import annotations
 

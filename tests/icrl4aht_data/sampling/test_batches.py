@@ -1,4 +1,4 @@
-"""Batches made ahead: order, buffers, devices, errors, resuming."""
+"""Prefetched batches: order, buffers, devices, errors and resume."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_batches_in_order(sampler, prefetch, reuse):
 
 
 def _aligned(array):
-    """An array of the same shape at an address that JAX would take over instead of copying from it."""
+    """Return an array aligned such that JAX would alias it instead of copying."""
     if array is None:
         return None
     memory = np.empty(array.nbytes + 64, np.uint8)
@@ -58,7 +58,7 @@ def test_on_a_device(sampler, monkeypatch):
         assert_equal(jax.tree.map(np.asarray, batch), sampler[i])
 
 
-def test_no_more_are_made_ahead(sampler, monkeypatch):
+def test_prefetching_is_limited(sampler, monkeypatch):
     made, plain = [], sampler.batch
     monkeypatch.setattr(sampler, "batch", lambda i, out=None: made.append(i) or plain(i, out))
     with sampler.batches(prefetch=2) as batches:
@@ -89,7 +89,7 @@ def test_closing_ends_the_thread(sampler):
     del abandoned
     gc.collect()
     deadline = time.monotonic() + 20
-    while workers() and time.monotonic() < deadline:  # submitted batches are still made
+    while workers() and time.monotonic() < deadline:  # submitted batches are completed
         time.sleep(0.01)
     assert workers() == 0
 
@@ -97,7 +97,7 @@ def test_closing_ends_the_thread(sampler):
 def test_resuming_continues_exactly(lite, sampler):
     batches = sampler.batches()
     for _ in range(4):
-        next(batches)  # more are made ahead: what was not consumed is made again
+        next(batches)  # prefetched but unconsumed batches are made again
     state = json.loads(json.dumps(batches.state_dict()))
     batches.close()
     with sampler.batches() as resumed:

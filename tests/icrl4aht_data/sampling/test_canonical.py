@@ -1,4 +1,4 @@
-"""Batches and histories of several layouts with canonical channels: of every kind of release, cache and loader."""
+"""Canonical channels in batches and histories: all kinds of releases, caches and loaders."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RELEASES = ["lite", "full", "reconverted_release"]
 
 @pytest.fixture(params=RELEASES)
 def root(request):
-    """Releases of equal histories: with states, with states and observations, with observations only."""
+    """Return releases of equal histories with states, both, and observations only."""
     made = request.getfixturevalue(request.param)
     return made if request.param == "reconverted_release" else made[0]
 
@@ -60,7 +60,7 @@ def kinds(dataset):
 
 
 def rendered(records, layouts):
-    """uint8 (B, ..., S) and layout numbers (B,) to canonical observations, row by row."""
+    """Return canonical observations of records, uint8 (B, ..., S), on layouts numbered by int (B,)."""
     views = []
     for row, number in zip(records, layouts, strict=True):
         layout = get_layout(LAYOUTS[number])
@@ -69,7 +69,7 @@ def rendered(records, layouts):
 
 
 @pytest.mark.parametrize("cache", CACHES)
-def test_batches_of_observations_are_those_of_state_records_rendered(lite, cache):
+def test_batches_equal_rendered_state_records(lite, cache):
     rows = set()
     states = canonical(lite[0], obs="state", cache="ram")
     assert [layout.name for layout in states.layouts] == LAYOUTS
@@ -98,7 +98,7 @@ def test_batches_of_observations_are_those_of_state_records_rendered(lite, cache
 
 @pytest.mark.parametrize("cache", CACHES)
 @pytest.mark.parametrize("obs", ["uint8", "float32"])
-def test_stored_observations_are_put_into_their_places(lite, reconverted_release, cache, obs):
+def test_stored_observations_are_mapped_to_canonical_channels(lite, reconverted_release, cache, obs):
     original, stored = canonical(lite[0], obs=obs), canonical(reconverted_release, obs=obs, cache=cache)
     assert not stored.has_states
     for length in (1, 40, 130):
@@ -148,14 +148,14 @@ def test_positions_of_other_channels_are_not_resumed(lite):
         with pytest.raises(OptionError, match="channels = 'canonical', not 'own'"):
             other.load_state_dict(batches.state_dict())
         earlier = other.state_dict()
-        del earlier["channels"]  # as before there were canonical channels
+        del earlier["channels"]  # positions saved before canonical channels existed
         other.load_state_dict(earlier)
         with pytest.raises(OptionError, match="channels = 'own', not 'canonical'"):
             batches.load_state_dict(earlier)
 
 
-def test_memory_that_a_batch_takes(lite, reconverted_release):
-    """Arrays, and what they are rendered from: state records, or observations with own channels."""
+def test_memory_of_a_batch(lite, reconverted_release):
+    """Memory includes the arrays and the state records or observations they are rendered from."""
     longest = max(record_size(get_layout(name)) for name in LAYOUTS)
     for root, record in ((lite[0], longest), (reconverted_release, 25 * 45)):
         dataset = canonical(root)

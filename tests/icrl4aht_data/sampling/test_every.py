@@ -1,4 +1,4 @@
-"""Windows of every n-th episode."""
+"""Windows of every n-th episode (option `every`)."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ OPTIONS: dict[str, Any] = {"batch_size": 32, "length": 2 * LENGTH + 7, "seed": 2
 
 
 def following(step: int, every: int) -> int:
-    """The step after a step."""
+    """Return the next step of the window."""
     after = step + 1
     return after if after % LENGTH else after + (every - 1) * LENGTH
 
 
 def before(step: int, every: int) -> int:
-    """The step before a step of the first episodes of a history, or of later ones; -1 before the first step of all."""
+    """Return the previous step of the window; -1 before the first step."""
     skipped = (every - 1) * LENGTH
     return step - 1 if step % LENGTH or step <= skipped else step - 1 - skipped
 
@@ -60,14 +60,14 @@ def test_windows_skip_episodes(two_sources, cache, every):
 
 
 def test_all_windows_are_drawn(two_sources):
-    """With every second of six episodes there are two sequences of three episodes each, and 14 starts in each."""
+    """Every second of six episodes gives two sequences of three episodes, with 14 starts each."""
     sampler = load_icrl4aht(two_sources[0], layout="demo_wide", split="train").ad(every=2, **OPTIONS)
     starts = np.concatenate([sampler.windows(i)[1] for i in range(40)])
     assert set(starts.tolist()) == {*range(14), *range(LENGTH, LENGTH + 14)}
 
 
 def test_parts_of_histories(two_sources):
-    """The last four of six episodes, and of these the first half at batch 0: episodes 2 and 3."""
+    """The range has the last four of six episodes; batch 0 uses its first half, episodes 2 and 3."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
     parts = dataset.ad(every=2, episodes=(-4, None), curriculum=Curriculum(9, (0, 0.5), (0.5, 1)), **OPTIONS)
     for i, first in ((0, 2), (9, 4), (50, 4)):

@@ -1,4 +1,4 @@
-"""Forks while a thread of the parent makes a batch."""
+"""Forks while a thread of the parent prepares a batch."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ for cache in sys.argv[2:]:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
 def test_a_child_makes_batches(lite, tmp_path):
-    """Hung for good: the child waited for locks of a thread that it did not have."""
+    """Regression: the child hung on locks of a thread that existed only in the parent."""
     script = tmp_path / "fork.py"
     script.write_text(FORK)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "ICRL4AHT_CACHE_DIR": str(tmp_path / "cache")}

@@ -1,4 +1,4 @@
-"""Labels, the expert's or the oracle's actions: in every storage, loader and device, and where there are none."""
+"""Labels (expert or oracle actions) in every storage, loader and device; missing labels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def sampler(two_sources):
 
 
 def expected_targets(written, sampler, i: int) -> np.ndarray:
-    """The labels at the query steps of batch i."""
+    """Return the labels at the query steps of batch i."""
     query, steps, *_ = sampler._draw(i)
     ids = sampler.dataset.ids[query].tolist()
     return np.array([written[k][f"{sampler.labels}_actions"][t] for k, (t,) in zip(ids, steps, strict=True)])
@@ -35,8 +35,8 @@ def expected_targets(written, sampler, i: int) -> np.ndarray:
 @pytest.mark.parametrize("order", ["contiguous", "random"])
 @pytest.mark.parametrize("labels", LABELS)
 @pytest.mark.parametrize("cache", CACHES)
-def test_targets_are_the_labels_of_the_query_step(two_sources, cache, labels, order):
-    """On two layouts, whose histories the caches hold in separate arrays."""
+def test_targets_equal_the_labels_of_the_query_steps(two_sources, cache, labels, order):
+    """Use two layouts, because caches store each layout in separate arrays."""
     root, written = two_sources
     dataset = load_icrl4aht(root, cache=cache, channels="canonical", obs="uint8")
     sampler = dataset.dpt(labels=labels, order=order, **OPTIONS)
@@ -46,7 +46,7 @@ def test_targets_are_the_labels_of_the_query_step(two_sources, cache, labels, or
 
 @pytest.mark.parametrize("labels", LABELS)
 @pytest.mark.parametrize("cache", CACHES)
-def test_windows_with_labels_differ_in_their_targets_only(two_sources, cache, labels):
+def test_label_kinds_change_the_targets_only(two_sources, cache, labels):
     root, written = two_sources
     dataset = load_icrl4aht(root, cache=cache, channels="canonical", obs="uint8")
     options: dict[str, Any] = {"batch_size": 16, "length": 50, "seed": 4, "episodes": (-2, None)}
@@ -83,13 +83,15 @@ def test_resuming_needs_the_same_labels(sampler):
     expert = sampler.dataset.dpt(**OPTIONS).batches(prefetch=0)
     with pytest.raises(OptionError, match="labels = 'oracle', not 'expert'"):
         expert.load_state_dict(state)
-    expert.load_state_dict({name: value for name, value in state.items() if name != "labels"})  # as once written
+    expert.load_state_dict(
+        {name: value for name, value in state.items() if name != "labels"}
+    )  # positions saved by older versions
     assert expert.next == 1
 
 
 @pytest.fixture(scope="module")
 def smaller(tmp_path_factory):
-    """A release with the histories of `two_sources`, those of noise stored without oracle actions. Read only."""
+    """Return `two_sources` with noise histories stored without oracle actions (read-only)."""
     root = tmp_path_factory.mktemp("releases") / "smaller"
     two_source_release(root, oracle=("ppo",))
     return root
@@ -100,7 +102,7 @@ class TestNoiseWithoutOracleActions:
 
     @pytest.mark.parametrize("cache", CACHES)
     @pytest.mark.parametrize("filters", [{}, {"source": "noise"}])
-    def test_batches_are_those_of_a_release_with_them(self, two_sources, smaller, cache, filters):
+    def test_batches_equal_those_with_stored_oracle_actions(self, two_sources, smaller, cache, filters):
         options: dict[str, Any] = {"layout": "demo_wide", "cache": cache} | filters
         one, other = (load_icrl4aht(root, **options) for root in (two_sources[0], smaller))
         assert_equal(one.dpt(labels="oracle", **OPTIONS)[0], other.dpt(labels="oracle", **OPTIONS)[0])
@@ -116,7 +118,7 @@ class TestNoiseWithoutOracleActions:
         rows: Any = hf_episodes(dataset[:1])
         np.testing.assert_array_equal(np.concatenate([row["oracle_actions"] for row in rows]), actions)
 
-    def test_verification_and_conversion_leave_them_out(self, smaller, tmp_path):
+    def test_verification_and_conversion_omit_oracle_actions(self, smaller, tmp_path):
         to_release(load_icrl4aht(smaller), tmp_path / "full", "full")
         assert verify_release(tmp_path / "full", level="deep").ok
         to_release(load_icrl4aht(tmp_path / "full"), tmp_path / "lite", "lite")
@@ -155,7 +157,7 @@ class TestMissingLabels:
             load_icrl4aht(tmp_path / "r").dpt(**OPTIONS)
 
 
-def test_an_oracle_that_earns_little_is_warned_of(two_sources, monkeypatch):
+def test_weak_oracles_cause_a_warning(two_sources, monkeypatch):
     """The oracle earns 5 in all tasks."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide", source="ppo")
     column = type(dataset).column

@@ -1,4 +1,4 @@
-"""Caches, sampler options and buffers: the same batches however they are made."""
+"""Caches, sampler options and buffers: all give equal batches."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LAYOUTS = ("coord_simple", "demo_simple", "coord_ring")
 
 @pytest.fixture(scope="module")
 def three(tmp_path_factory):
-    """A release of three layouts, what went in, and the same without states. Read only."""
+    """Return a release of three layouts, its source arrays, and a copy without states (read-only)."""
     root = tmp_path_factory.mktemp("three")
     written = random_release(root / "states", layouts=LAYOUTS, teammates=1)
     to_release(load_icrl4aht(root / "states"), root / "observations", "observations")
@@ -32,7 +32,7 @@ def three(tmp_path_factory):
 
 class TestCaches:
     @pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
-    def test_the_same_batches_from_each(self, lite, full, reconverted_release, obs):
+    def test_all_caches_give_equal_batches(self, lite, full, reconverted_release, obs):
         for kinds in ((lite[0], full[0]), (reconverted_release,)[obs == "state" :]):
             all_samplers = (
                 samplers(load_icrl4aht(root, layout="demo_wide", obs=obs, cache=cache, threads=threads), seed=4)
@@ -58,7 +58,7 @@ class TestCaches:
                         rendered[~one[0].attention_mask] = 0
                     np.testing.assert_array_equal(getattr(two[0], name), rendered)
 
-    def test_histories_in_any_order_and_twice(self, lite):
+    def test_histories_may_be_reordered_and_repeated(self, lite):
         mixed = load_icrl4aht(lite[0], layout="demo_wide", obs="state").select([9, 6, 9, 11])
         sampler = mixed.ad(batch_size=9, length=20)
         for cache in CACHES:
@@ -67,7 +67,7 @@ class TestCaches:
         for row, (history_id, start) in enumerate(zip(ids, starts, strict=True)):
             np.testing.assert_array_equal(batch.obs[row], lite[1][history_id]["state"][start : start + 20])
 
-    def test_automatic_choice_by_size_and_room(self, lite, monkeypatch):
+    def test_automatic_choice_of_the_cache(self, lite, monkeypatch):
         dataset = load_icrl4aht(lite[0])
         assert dataset.cache.cache == "ram"
         assert "GB decoded" in dataset.cache.reason
@@ -79,8 +79,10 @@ class TestCaches:
             load_icrl4aht(lite[0], cache="disk")  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("cache", CACHES)
-    def test_damage_is_named_not_sampled(self, damaged, cache, tmp_path, monkeypatch):
-        monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))  # without arrays of the undamaged release
+    def test_damaged_files_are_an_error(self, damaged, cache, tmp_path, monkeypatch):
+        monkeypatch.setenv(
+            "ICRL4AHT_CACHE_DIR", str(tmp_path / "cache")
+        )  # drops cached arrays of the undamaged release
         data = bytearray((damaged / SHARD).read_bytes())
         data[int(np.load(chunk_table_path(damaged, SHARD))["offset"][0])] ^= 1
         (damaged / SHARD).write_bytes(data)
@@ -152,7 +154,7 @@ class TestOptions:
         ("episodes", "low", "high"),
         [((0, 2), 0, 40), ((-3, None), 60, 120), ((2, 4), 40, 80), ((None, -5), 0, 20)],
     )
-    def test_draws_stay_inside_an_episode_range(self, lite, episodes, low, high):
+    def test_draws_stay_in_the_episode_range(self, lite, episodes, low, high):
         dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="state")  # 6 episodes of 20 steps
         _, starts = dataset.ad(batch_size=200, length=15, episodes=episodes).windows(0)
         assert (starts.min(), starts.max()) == (low, high - 15)
@@ -192,10 +194,10 @@ class TestOptions:
         query, _, context, _ = dataset.dpt(batch_size=400, context=9, weights=[0, 0, 0, 2.5])._draw(0)
         assert set(query) == set(context) == {3}
         uniform = dataset.ad(batch_size=400, length=9, weights="length").windows(0)[0]
-        assert np.bincount(uniform).min() > 60  # equal lengths: as likely each
+        assert np.bincount(uniform).min() > 60  # equal lengths have equal probability
 
     def test_large_weights_are_drawn_in_proportion(self, lite):
-        """Sums of such weights were infinite, so that all windows were of one history."""
+        """Regression: sums of large weights overflowed, so all windows came from one history."""
         dataset = load_icrl4aht(lite[0], layout="demo_wide")
         weights = np.array([1.0, 2.0, 0.0, 1.0, 1.0, 0.5])
         expected = dataset.ad(batch_size=200, length=9, weights=weights).windows(3)[0]

@@ -1,4 +1,4 @@
-"""Batches: contents against the histories, purity, fixed draws."""
+"""Batches: contents equal the histories, and draws are fixed."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_several_queries_of_a_context_are_steps_of_one_history(lite_or_full, ord
 
 
 def _rows(arrays, *names):
-    """Each step's values as one hashable tuple."""
+    """Return each step's values as a hashable tuple."""
     columns = [np.asarray(arrays[name]) for name in names or arrays]
     return [tuple(x.tobytes() if x.ndim else float(x) for x in row) for row in zip(*columns, strict=True)]
 
@@ -133,7 +133,7 @@ def _transitions(arrays):
 
 
 def _following(arrays):
-    """The state after each step in the same episode."""
+    """Return the state after each step within its episode."""
     following = np.concatenate([arrays["state"][1:], arrays["state"][:1]])
     following[arrays["dones"]] = arrays["episode_end_state"]
     return following
@@ -144,7 +144,7 @@ def _is_slice(window, states):
 
 
 @pytest.mark.parametrize("order", ["contiguous", "random"])
-def test_what_follows_an_episodes_last_step_is_its_own_end(lite, order):
+def test_the_last_steps_next_state_is_the_episodes_end(lite, order):
     root, written = lite
     batch = load_icrl4aht(root, obs="state").select([2]).dpt(batch_size=3, context=120, order=order)[0]
     states, following = written[2]["state"], _following(written[2])
@@ -179,8 +179,8 @@ def test_fields_dtypes_and_shapes(lite, obs):
         assert batch.describe().splitlines()[0].split()[:2] == [next(iter(found)), dtypes["obs"]]
 
 
-def test_the_draws_are_fixed_for_good(lite):
-    """A stored batch number must mean the same batch in years: the windows of one seed, written down."""
+def test_draws_equal_the_stored_ones(lite):
+    """Saved batch numbers must stay valid, so the windows of one seed are fixed here."""
     ids, starts = load_icrl4aht(lite[0], layout="demo_wide").ad(batch_size=6, length=20, seed=0).windows(0)
     assert ids.tolist() == [6, 7, 6, 9, 9, 7]
     assert starts.tolist() == [95, 99, 25, 19, 71, 13]
@@ -203,7 +203,7 @@ def test_a_one_step_episode_release_samples(tmp_path):
 
 
 class TestMemory:
-    """Was MemoryError of NumPy, or a killed process."""
+    """Regression: too large batches raised NumPy's MemoryError or killed the process."""
 
     @pytest.mark.parametrize("kind", ["ad", "dpt"])
     def test_a_batch_larger_than_memory_is_refused_before_it_is_made(self, lite, kind):
@@ -239,8 +239,8 @@ def _sampler(dataset, kind, *, batch_size, steps, order="contiguous"):
     return dataset.dpt(batch_size=batch_size, context=steps, order=order)
 
 
-def test_mixed_splits_are_warned_of(two_sources):
-    """Without a filter, a selection has the validation histories, too."""
+def test_mixed_splits_cause_a_warning(two_sources):
+    """Unfiltered selections contain validation histories."""
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
     with pytest.warns(
         MixedSplitsWarning, match=r"several splits, train \(14\), validation \(6\): .*split=\"train\""

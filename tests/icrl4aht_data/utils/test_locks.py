@@ -1,4 +1,4 @@
-"""Locks whose files are removed after use: they exclude one another all the same, and leave nothing behind."""
+"""File locks exclude other holders although the lock file is removed after use."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ count(Path(sys.argv[1]), 50)
 
 
 def count(folder: Path, times: int) -> None:
-    """Add one to the number in a file, so slowly that a lock that does not exclude others loses some."""
+    """Increment the number in a file slowly, so a broken lock would lose increments."""
     path = folder / "number.txt"
     for _ in range(times):
         with process_lock(folder / "locks" / "below" / ".number.lock"):

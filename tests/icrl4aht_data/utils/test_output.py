@@ -1,4 +1,4 @@
-"""What commands write: refused where something exists, replaced on demand; links and folders are never replaced."""
+"""Output of commands: existing files are replaced only on demand, links and folders never."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objects that other packages register by entry points: known by name, imported on demand, with clear errors."""
+"""Plugins registered by entry points: found by name, imported on demand, clear errors."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ POINTS = {
 
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory) -> Path:
-    """A package with layouts, a teammate and methods, some of which cannot be used."""
+    """Return a package with layouts, a teammate and methods, some of them broken."""
     return write_package(tmp_path_factory.mktemp("site"), "rooms", {"maps": MAPS, "methods": METHODS}, POINTS)
 
 
@@ -94,8 +94,8 @@ def test_a_registered_layout_is_known(rooms, tmp_path):
         get_layout("plain_room")
 
 
-def test_processes_know_it(rooms, tmp_path):
-    """Also the command line's choices."""
+def test_subprocesses_find_plugins(rooms, tmp_path):
+    """Subprocesses find plugins, also as choices of commands."""
     with installed(rooms):
         random_release(tmp_path / "release", layouts=("plain_room", "demo_wide"))
     code = "from icrl4aht_data.commands.cli import main; main()"
@@ -112,7 +112,7 @@ def test_processes_know_it(rooms, tmp_path):
     assert "plain_room" in json.dumps(json.loads(done.stdout))
 
 
-def test_the_published_benchmark_stays_as_it_is(rooms):
+def test_plugins_do_not_change_the_benchmark(rooms):
     before = CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES]
     with installed(rooms):
         assert before == (CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES])

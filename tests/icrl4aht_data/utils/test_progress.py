@@ -1,4 +1,4 @@
-"""Progress where the output is not a terminal: plain lines, measured by a clock that the test moves."""
+"""Progress without a terminal: plain lines, timed by a fake clock."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icrl4aht_data.utils.progress import PlainLines, counted, progress_bars
 
 
 class Clock:
-    """A clock that only `wait` moves."""
+    """A fake clock that only `wait` advances."""
 
     now = 0.0
 
@@ -42,7 +42,7 @@ def test_a_line_has_count_speed_and_time_left(seconds, expected):
     assert output.getvalue() == f"x: {expected}\n"
 
 
-def test_the_speed_falls_while_nothing_moves():
+def test_the_speed_falls_without_progress():
     clock, output = Clock(), io.StringIO()
     lines = PlainLines(Console(file=output), clock=clock)
     for number in (0, 200, 500, 800):
@@ -57,7 +57,7 @@ def test_the_speed_falls_while_nothing_moves():
     ]
 
 
-def test_what_a_resumed_run_had_finished_is_no_speed():
+def test_resumed_work_does_not_count_as_speed():
     clock, output = Clock(), io.StringIO()
     lines = PlainLines(Console(file=output), clock=clock)
     lines.show("x", 900, 1000)

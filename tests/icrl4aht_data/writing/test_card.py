@@ -1,4 +1,4 @@
-"""The card: facts about a release, README.md made of them, and card.json with the long tables."""
+"""The card of a release: facts, README.md and the long tables in card.json."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def made(
 
 
 def four_tasks() -> Tasks:
-    """Two learners with a teammate on demo_wide, noise with it, a validation teammate, and coord_simple."""
+    """Return two learners and noise with one teammate, a validation teammate, and coord_simple."""
     return [
         (drawn("demo_wide", "H3", 12), made("ppo"), [(0, 0.0, 20.0), (1, 0.0, 4.0)]),
         (drawn("demo_wide", "H3", 12, seed=1), made("noise"), [(0, 1.0, 41.0), (0, 0.0, 45.0)]),
@@ -70,7 +70,7 @@ def four_tasks() -> Tasks:
 
 @pytest.fixture
 def write(lite, tmp_path) -> Callable[..., dict[str, Any]]:
-    """Write the files of meta/ that a card is made of, and return its facts; `change` changes every provenance."""
+    """Write the files of meta/ for a card and return its facts; `change` edits each provenance."""
     like = read_index(lite[0]).entries[0]
 
     def write(tasks: Tasks | None = None, change: Change = lambda of: of, **fields: Any) -> dict[str, Any]:
@@ -111,7 +111,7 @@ def test_learning_by_layout_source_and_split(write):
     assert "| **all** | ppo | 3 | 3.3 | 11.3 | 33% |" in render_card(write(change=lambda of: Provenance()))
 
 
-def test_tables_that_are_too_long_for_people(write, tmp_path):
+def test_long_tables_move_to_card_json(write, tmp_path):
     write()
     write_card(tmp_path)
     tables = json.loads((tmp_path / "card.json").read_text())
@@ -131,7 +131,7 @@ def test_tables_that_are_too_long_for_people(write, tmp_path):
     assert len(tables["learning"]) == 4
 
 
-def test_what_the_card_says(write):
+def test_text_of_the_card(write):
     card = render_card(write())
     for text in (
         "6 histories of 4 tasks, 720 transitions; each history has 120 steps.",
@@ -165,7 +165,7 @@ def test_teammates_that_act_like_the_test_are_named(write):
     assert "Its training teammates H1 are heuristics, in place of the learned teammates" in card
 
 
-def test_tasks_that_hardly_rise_and_weak_oracles_are_named(write):
+def test_the_card_names_flat_tasks_and_weak_oracles(write):
     tasks = four_tasks()
     tasks[0] = (*tasks[0][:2], [(0, 0.0, 9.5), (1, 2.0, 11.5)])
     card = render_card(write(tasks))

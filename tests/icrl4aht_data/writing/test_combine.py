@@ -1,4 +1,4 @@
-"""Combination of releases."""
+"""Combining releases: histories, equal bytes and refused inputs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FIELDS = ("state", "actions", "rewards", "dones", "teammate_actions", "expert_a
 
 @pytest.fixture(scope="module", params=["lite", "full"])
 def parts(request, tmp_path_factory) -> list[Path]:
-    """Two releases, without a task in common, of the same layout and of another."""
+    """Return two releases on overlapping layouts with distinct tasks."""
     folder = tmp_path_factory.mktemp(request.param)
     random_release(folder / "a", request.param, ("coord_simple",), teammates=1, streams=2, episodes=5)
     random_release(folder / "b", request.param, ("demo_wide", "coord_simple"), teammates=1, streams=3, episodes=6)

@@ -1,4 +1,4 @@
-"""Other forms of a release, and the way back."""
+"""Conversion of releases to other forms and back."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.helpers.batches import digest
 
 @pytest.fixture(scope="module")
 def published(lite, tmp_path_factory):
-    """`lite` as the published code's files. Read only."""
+    """Return `lite` converted to the published code's files (read-only)."""
     return to_published(load_icrl4aht(lite[0]), tmp_path_factory.mktemp("published") / "files")
 
 
@@ -67,7 +67,7 @@ def test_published_files_are_as_the_paper_says(lite, published):
             np.testing.assert_array_equal(group["obs"][()], load_icrl4aht(root).history(entry["history_id"]).obs[:])
 
 
-def test_there_and_back(lite, published, tmp_path):
+def test_conversion_round_trips(lite, published, tmp_path):
     from_published(published, tmp_path / "back", "lite", data_version="0.0.1", kept_steps=20)
     assert verify_release(tmp_path / "back", level="deep").ok
     assert digest(tmp_path / "back") == digest(lite[0])
@@ -101,7 +101,7 @@ def test_published_files_with_faults(published, tmp_path):
     fails(r"tasks\.jsonl: missing")
 
 
-def test_targets_that_are_taken(lite, tmp_path):
+def test_existing_targets_are_refused(lite, tmp_path):
     dataset = load_icrl4aht(lite[0])
     (tmp_path / "file").touch()
     for write in (to_published, partial(to_release, kind="full")):

@@ -27,7 +27,7 @@ STEPS, WIDTH = 20, 24
 
 @pytest.fixture(scope="module")
 def built(two_sources, tmp_path_factory) -> Path:
-    """`two_sources`, built for publication. Read only."""
+    """Build `two_sources` for publication (read-only)."""
     return build_release(two_sources[0], tmp_path_factory.mktemp("built") / "release")
 
 
@@ -41,7 +41,7 @@ def stream(built: Path, split: str) -> Any:
 
 
 def in_file_order(dataset: Dataset, split: str) -> list[tuple[History, Episode]]:
-    """The episodes of a split with their histories; files are in the order of their layouts' names."""
+    """Return the episodes of a split with their histories, ordered by layout name like the files."""
     layouts = sorted(layout.name for layout in dataset.filter(split=split).layouts)
     parts = [dataset.filter(split=split, layout=name) for name in layouts]
     return [(history, episode) for part in parts for history in part for episode in history.episodes]
@@ -66,8 +66,8 @@ def test_streamed_rows_are_the_episodes(built, dataset, split):
 class TestObservations:
     @pytest.mark.parametrize("obs", ["float32", "uint8"])
     @pytest.mark.parametrize("channels", ["own", "canonical"])
-    def test_they_are_those_of_the_histories(self, built, dataset, channels, obs):
-        """One row at a time, as lists, and in batches of arrays."""
+    def test_observations_equal_those_of_the_histories(self, built, dataset, channels, obs):
+        """Render single rows of lists, and batches of arrays."""
         opened = dataset.filter(split="train").with_options(obs=obs, channels=channels)
         for layout in opened.layouts:
             expected = [episode.obs for history in opened.filter(layout=layout.name) for episode in history.episodes]
@@ -87,7 +87,7 @@ class TestObservations:
         with pytest.raises(OptionError, match=r'expected one shape, found .*: give .* take channels="canonical"'):
             render_observations(rows)
 
-    def test_rows_that_are_none(self, built):
+    def test_invalid_rows(self, built):
         row = next(iter(stream(built, "train")))
         wrong: list[tuple[type[Exception], str, Any, dict[str, Any]]] = [
             (UnknownNameError, "unknown channels", row, {"channels": "all"}),
@@ -118,7 +118,7 @@ def test_hugging_face_datasets_in_memory_have_the_same_rows(built, dataset, tmp_
 
 
 def test_histories_are_divided_among_files_and_row_groups(dataset, tmp_path, monkeypatch):
-    """Neither needs more than a row group in memory; both are whole histories, in order."""
+    """Files and row groups contain complete histories in order."""
     monkeypatch.setattr(parquet, "ROW_GROUP", 12)
     part, done = dataset.filter(split="train", layout="demo_wide"), []
     write_episodes(part, tmp_path, file_episodes=30, advance=lambda *numbers: done.append(numbers))

@@ -1,4 +1,4 @@
-"""Writing to a full disk: an error that names the disk, and nothing left behind."""
+"""Writing to a full disk: the error names the disk, and no partial files remain."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ needs_disks = pytest.mark.skipif(not can_mount(), reason="this user may not moun
 
 
 def test_a_limit_on_the_size_of_files(lite, tmp_path):
-    """libhdf5, which would write the files otherwise, raises RuntimeError or crashes when a file cannot be closed."""
+    """Shards are not written by libhdf5, because it may crash when a file cannot be closed."""
     dataset = load_icrl4aht(lite[0])
     for limit in (PAGE, 10 * PAGE):
         with file_size_limit(limit), pytest.raises(OSError, match=r"File too large.*histories\.h5") as error:
@@ -45,8 +45,8 @@ def test_a_full_disk_is_named(lite, tmp_path):
                 assert not any(disk.iterdir())
 
 
-def test_the_bytes_of_a_shard_are_those_that_libhdf5_writes(lite, tmp_path, monkeypatch):
-    """Shards are made in memory; other releases of this package made them on the disk."""
+def test_shards_equal_files_written_by_libhdf5(lite, tmp_path, monkeypatch):
+    """Shards made in memory must equal those written to disk by older versions."""
     real = h5py.File
     to_release(load_icrl4aht(lite[0]), tmp_path / "memory", "full")
     assert verify_release(tmp_path / "memory").ok

@@ -1,4 +1,4 @@
-"""Conversion to Minari datasets, which Minari itself opens."""
+"""Conversion to Minari datasets, read back with Minari."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EPISODES, STEPS = 6, 20
 
 @pytest.fixture(scope="module")
 def converted(lite, tmp_path_factory):
-    """All histories of `lite`, whose two layouts have observations of unequal shape."""
+    """Return all histories of `lite` as Minari data; its two layouts have unequal observation shapes."""
     folder = tmp_path_factory.mktemp("minari")
     return to_minari(load_icrl4aht(lite[0]), folder / "lite-v0")
 
@@ -56,7 +56,7 @@ def test_minari_opens_every_episode(lite, converted, monkeypatch):
 
 
 def test_a_dataset_of_one_task_has_its_environment(tmp_path):
-    """Minari recovers the environment that the release recovers."""
+    """Minari and the release recover equal environments."""
     release = load_icrl4aht(MINI, layout="demo_wide", source="noise", teammate_family="H3")
     part = release.filter(task_id=release.entries[0].task_id)[:1]
     to_minari(part, tmp_path / "one-v0")
@@ -68,7 +68,7 @@ def test_a_dataset_of_one_task_has_its_environment(tmp_path):
     assert env.observation_space.shape == (5, 5, 45)
 
 
-def test_what_minari_has_no_fields_for_is_in_the_metadata(lite, converted):
+def test_other_facts_are_in_minaris_metadata(lite, converted):
     about = json.loads((converted / "data" / "metadata.json").read_text())["icrl4aht"]
     release = load_icrl4aht(lite[0])
     assert (about["data_version"], about["kept_steps"]) == ("0.0.1", STEPS)

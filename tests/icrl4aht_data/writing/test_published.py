@@ -1,4 +1,4 @@
-"""The published code's own files: names of families, 4 x 5 views, duplicates, and interrupted conversions to them."""
+"""Files of the published code: family names, 4 x 5 views, duplicates, interrupted conversions."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_other_names_are_mapped_by_hand(published_folder, tmp_path):
 
 @pytest.fixture(scope="module")
 def short_views(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]], np.ndarray]:
-    """Files with 4 x 5 views of cramped_up, what was played, and the complete views. Read only."""
+    """Return files with 4 x 5 views of cramped_up, the history, and the complete views (read-only)."""
     folder = tmp_path_factory.mktemp("short")
     written = random_release(folder / "release", layouts=("cramped_up",), teammates=1, streams=2)
     dataset = load_icrl4aht(folder / "release", obs="uint8")
@@ -116,7 +116,7 @@ def test_short_views_are_completed(short_views, tmp_path):
 
 @pytest.mark.parametrize("kind", ["lite", "full"])
 def test_short_views_with_states(short_views, tmp_path, kind):
-    """The states show the rows that were not recorded; a changed recorded row is found."""
+    """States determine the missing rows; changes of recorded rows are found."""
     files, _, complete = short_views
     shutil.copytree(files, tmp_path / "files")
     dataset = load_icrl4aht(files.parent / "release")

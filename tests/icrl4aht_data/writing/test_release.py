@@ -1,4 +1,4 @@
-"""Writing: releases read back as written, by our reader and by plain h5py; no unfinished one is ever read."""
+"""Writing releases: round trips with our reader and h5py; unfinished releases are never read."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def fail() -> list[NewHistory]:
         (lambda a: a | {"dones": np.roll(a["dones"], 1)}, "10 steps"),
     ],
 )
-def test_unfit_arrays_are_refused_and_nothing_remains(tmp_path, spoil, message):
+def test_invalid_arrays_are_refused_without_leftovers(tmp_path, spoil, message):
     with pytest.raises(OptionError, match=message):
         write_cramped(tmp_path / "out", lambda: [NewHistory(0, spoil(played()))])
     assert visible(tmp_path) == []
@@ -235,7 +235,7 @@ def list_note(root: Path) -> None:
     ],
     ids=["file", "folder", "listed", "empty manifest", "release"],
 )
-def test_what_is_not_a_release_is_not_replaced(tmp_path, make, message):
+def test_other_folders_are_not_replaced(tmp_path, make, message):
     root = tmp_path / "release"
     make(root)
     before = contents(tmp_path)
@@ -246,7 +246,7 @@ def test_what_is_not_a_release_is_not_replaced(tmp_path, make, message):
     assert contents(tmp_path) == before
 
 
-def test_what_appears_meanwhile_is_not_replaced(tmp_path):
+def test_folders_created_during_writing_are_not_replaced(tmp_path):
     root = tmp_path / "release"
 
     def meanwhile() -> list[NewHistory]:
@@ -265,11 +265,11 @@ def test_what_appears_meanwhile_is_not_replaced(tmp_path):
     ("pause", "delay", "streams"),
     [
         (60, 0.0, 2),  # killed after the first shard
-        pytest.param(0, 0.05, 40, marks=pytest.mark.slow),  # killed at any point after it
+        pytest.param(0, 0.05, 40, marks=pytest.mark.slow),  # killed at any later point
         pytest.param(0, 0.2, 40, marks=pytest.mark.slow),
     ],
 )
-def test_a_killed_writer_leaves_nothing_that_reads_as_a_release(tmp_path, pause, delay, streams):
+def test_a_killed_writer_leaves_no_readable_release(tmp_path, pause, delay, streams):
     root = tmp_path / "release"
     code = f"""
 import sys, time
@@ -297,6 +297,6 @@ random_release(Path(sys.argv[1]), streams={streams}, episodes=60, length=100)
         load_icrl4aht(root)
     assert (tmp_path / ".release.partial").exists(), "the writer was killed too late for this test"
     assert not verify_release(tmp_path / ".release.partial").ok
-    random_release(root, streams=1)  # the next writer removes the rest
+    random_release(root, streams=1)  # the next writer removes the leftovers
     assert verify_release(root).ok
     assert visible(tmp_path) == ["release"]
