@@ -91,7 +91,7 @@ class Report:
         if len(self.findings) < _FINDINGS:
             self.findings.append(Finding(_printable(file), _printable(problem)))
         elif len(self.findings) == _FINDINGS:
-            self.findings.append(Finding(".", "and more: correct these first, then verify again"))
+            self.findings.append(Finding(".", "more problems omitted: correct these first, then verify again"))
 
 
 def _printable(text: str) -> str:

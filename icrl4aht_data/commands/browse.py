@@ -47,19 +47,24 @@ _FILE = "browse.html"
 @click.argument("root", required=False, type=Root())
 @filter_options
 @click.option(
-    "--history", "wanted", type=COUNT_OR_NONE, multiple=True, metavar="ID", help="Only this history; repeat for more."
+    "--history",
+    "wanted",
+    type=COUNT_OR_NONE,
+    multiple=True,
+    metavar="ID",
+    help="Only this history; repeat for more.",
 )
-@click.option("--histories", type=COUNT, default=PAGE_HISTORIES, help="At most so many, of all layouts and teammates.")
-@click.option("--megabytes", type=COUNT, default=PAGE_MEGABYTES, help="Keep the page below this size.")
+@click.option("--histories", type=COUNT, default=PAGE_HISTORIES, help="Maximum number of histories on the page.")
+@click.option("--megabytes", type=COUNT, default=PAGE_MEGABYTES, help="Maximum size of the page in MB.")
 @click.option(
     "--out",
     type=NewFile(".html", ".htm"),
     metavar="FILE",
-    help="Write the page here.",
+    help="File to write.",
     show_default=f"{_FILE}, with --serve nowhere",
 )
 @overwrite_option
-@click.option("--serve", is_flag=True, help="Show the page at an address of this machine only, until Ctrl-C.")
+@click.option("--serve", is_flag=True, help="Serve the page on this machine only, until Ctrl-C.")
 @click.option(
     "--port", type=click.IntRange(0, 65535), metavar="PORT", help="Port of --serve.", show_default="a free one"
 )

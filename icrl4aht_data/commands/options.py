@@ -122,13 +122,13 @@ COUNT_OR_NONE = click.IntRange(min=0)
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace what exists: files, or a release folder, which has a manifest."
+    "--overwrite", is_flag=True, help="Replace existing files, or an existing release folder."
 )
 family_map_option = click.option(
     "--family-map",
     multiple=True,
     metavar="OLD=NEW",
-    help="Teammate family in published files, and here: rl, H1 to H4, or a kind such as fcp; repeat for more.",
+    help="Translate a teammate family of published files to rl, H1 to H4, or a kind such as fcp; repeat for more.",
     show_default="the names of the published code",
 )
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems only.")

@@ -94,13 +94,13 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
 @_root
 @filter_options
 @click.option(
-    "--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show only this history; list prints the ids."
+    "--history", "history_id", type=COUNT_OR_NONE, metavar="ID", help="Show only this history; `list` prints the ids."
 )
 @click.option(
     "--plot",
     type=NewFile(*PICTURES),
     metavar="FILE",
-    help="Also draw learning curves, by task or, of more than 12, by layout: .png, .svg or .pdf.",
+    help="Also draw learning curves by task, or by layout for more than 12 tasks: .png, .svg or .pdf.",
 )
 @overwrite_option
 @json_option
@@ -162,7 +162,7 @@ def show(
 @click.argument("root", required=False, type=Root(remote=True), envvar="ICRL4AHT_REMOTE", metavar="[ADDRESS]")
 @filter_options
 @click.option("--to", type=Folder(), metavar="FOLDER", help="Write the release here.")
-@click.option("--dry-run", is_flag=True, help="Fetch only the index; print the files to download, and their bytes.")
+@click.option("--dry-run", is_flag=True, help="Fetch only the index; print the files to download and their sizes.")
 @quiet_option
 @json_option
 def download(
@@ -204,7 +204,13 @@ def download(
 @click.option("--quick", is_flag=True, help="Check only names, sizes and the index.")
 @click.option("--deep", is_flag=True, help="Also replay every step and render every observation.")
 @click.option("--repair", is_flag=True, help="Fetch damaged and missing files again, then verify once more.")
-@click.option("--from", "origin", metavar="ADDRESS", help="Repair from here.", show_default="the origin of ROOT")
+@click.option(
+    "--from",
+    "origin",
+    metavar="ADDRESS",
+    help="Repair from this release.",
+    show_default="the origin of ROOT",
+)
 @quiet_option
 @json_option
 def verify(
@@ -269,13 +275,13 @@ def verify(
 )
 @overwrite_option
 @click.option(
-    "--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet", "minari"]), help="The form to convert to."
+    "--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet", "minari"]), help="Format to convert to."
 )
 @click.option(
     "--tasks",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
-    help="Tasks of published files.",
+    help="JSONL file with the tasks of published files.",
     show_default="tasks.jsonl in SOURCE",
 )
 @family_map_option
@@ -369,7 +375,7 @@ def combine(
 @click.argument("source", required=False, type=Folder())
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
 @overwrite_option
-@click.option("--link", is_flag=True, help="Use hard links, not copies: saves space, but editing one changes both.")
+@click.option("--link", is_flag=True, help="Hard-link files instead of copying: saves space, but edits affect both.")
 @quiet_option
 @json_option
 def build(source: Path | None, out: Path, overwrite: bool, link: bool, quiet: bool, as_json: bool) -> None:

@@ -268,7 +268,7 @@ class _ShardWriter:
             )
         needed = {field.name for field in held_fields(self.kind) if self.kind not in field.optional}
         if not needed <= arrays.keys():
-            raise OptionError(f"task {task.task_id}: a history has no arrays {sorted(needed - arrays.keys())}")
+            raise OptionError(f"task {task.task_id}: a history is missing the arrays {sorted(needed - arrays.keys())}")
         dones = arrays["dones"]
         unfinished = len(dones) % self.kept_steps if self.kind in KINDS else len(dones) < self.kept_steps
         if unfinished or not np.array_equal(dones, episode_ends(len(dones), self.kept_steps)):

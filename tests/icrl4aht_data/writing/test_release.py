@@ -137,7 +137,7 @@ def fail() -> list[NewHistory]:
     [
         (lambda a: a | {"rewards": a["rewards"] + 0.5}, "values that int8 cannot hold"),
         (lambda a: a | {"actions": a["actions"][:-1], "state": a["state"][:-1]}, "rows, expected"),
-        (lambda a: {name: array for name, array in a.items() if name != "episode_end_state"}, "has no arrays"),
+        (lambda a: {name: array for name, array in a.items() if name != "episode_end_state"}, "is missing the arrays"),
         (lambda a: a | {"dones": np.roll(a["dones"], 1)}, "10 steps"),
     ],
 )
