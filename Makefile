@@ -14,7 +14,7 @@ STAMP := $(VENV)/installed
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify control test test-slow check docs format bench-env bench-collect bench-gpu bench-learn bench-loader bench-faults clean
+.PHONY: help install demo generate teammates verify control test test-slow check docs format bench-env bench-collect bench-gpu bench-learn bench-loader clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -43,7 +43,7 @@ verify: install ## verify every byte and the physics of a release: ROOT=folder (
 control: install ## show that the models adapt in context in worlds built for it (about 10 minutes)
 	$(BIN)/icrl4aht-data control
 
-test: check ## lint, types and the default tests (8 minutes on 2 cores): WORKERS=2 (2 GB each)
+test: check ## lint, types and the default tests (5.5 minutes on 2 cores): WORKERS=2 (2 GB each)
 	$(PYTEST) -m "not slow"
 
 test-slow: install ## the slow tests: wheels, killed processes, Ray, several devices, long series of faults
@@ -66,9 +66,6 @@ bench-env: install ## steps/s of environments compared with JaxMARL's, JSON line
 
 bench-loader: install ## windows/s of each cache compared with readers of the published format, JSON lines
 	$(BIN)/python -m benchmarks.bench_loader
-
-bench-faults: install ## faults of servers, disks, processes and files: tried, survived, lost, JSON lines
-	$(BIN)/python -m tests.robustness.faults.series
 
 bench-learn: install ## speed of learning egos and of training and playing sequence models, JSON lines; PEER= as for bench-env
 	$(BIN)/python -m benchmarks.bench_learn $(if $(PEER),--peer $(PEER)) $(OPTIONS)

@@ -1,64 +1,325 @@
-"""A sample of each family of `make bench-faults`, in which nothing may be lost, and faults that once lost something."""
+"""Disks, processes and files fail: reading gives the right data or one of our errors, and a second call succeeds."""
 
 from __future__ import annotations
 
 import errno
+import hashlib
+import itertools
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.errors import IndexFormatError, OptionError
-from icrl4aht_data.format.manifest import parse_manifest, write_manifest
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.download import fetch_planned, plan_download
+from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError
+from icrl4aht_data.format import columns
+from icrl4aht_data.format.manifest import parse_manifest, read_manifest, write_manifest
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, held_fields
+from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.utils.files import atomic_write
+from tests.helpers.damages import contents
 from tests.helpers.paths import ROOT
-from tests.robustness.faults.series import FAMILIES, run
-from tests.robustness.faults.workspace import Workspace
-from tests.robustness.limits import file_size_limit
+from tests.helpers.random_releases import random_release
+from tests.robustness.limits import PAGE, can_mount, file_size_limit, memory_limit, small_disk, time_limit
+from tests.servers.common import Slow, http_server
 
-SLOW = {"cache build killed", "two readers at once", "two cache builds at once"}
-"""Families of which one attempt takes more than a second."""
-QUICK = {"bit flips": 9, "mutated index or manifest": 5, "disk full": 2, "damaged caches": 3}
-"""Attempts in the default tests; one of every other family."""
-LONG = {"bit flips": 1000, "damaged caches": 20, "mapped arrays' disk full": 1, "mutated index or manifest": 25}
-"""Attempts in the slow tests; two of the families in `SLOW`, four of every other."""
+SLOW = pytest.mark.slow
+
+
+def digest(arrays: Iterable[np.ndarray]) -> bytes:
+    found = hashlib.blake2b()
+    for array in arrays:
+        found.update(f"{array.dtype} {array.shape}".encode() + array.tobytes())
+    return found.digest()
+
+
+def hash_batches(dataset: Dataset) -> bytes:
+    """Return a hash of batches of both kinds, from all episodes and from some."""
+    samplers = []
+    for part in (dataset.filter(layout=layout.name) for layout in dataset.layouts):
+        samplers.append(part.ad(batch_size=8, length=20, teammate_actions=True))
+        samplers.append(part.ad(batch_size=4, length=7, seed=1, episodes=(1, 4)))
+        samplers.append(part.dpt(batch_size=4, context=20))
+    return digest(array for sampler in samplers for array in sampler.batch(3)._asdict().values() if array is not None)
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory) -> Workspace:
-    return Workspace(tmp_path_factory.mktemp("faults"), seed=1)
+def release(tmp_path_factory) -> Path:
+    """A release of some hundred kilobytes, its shards of many pieces."""
+    root = tmp_path_factory.mktemp("faults") / "release"
+    random_release(root, "full", teammates=1, streams=3, episodes=80, length=25)
+    return root
 
 
-def _attempts(name: str) -> int:
-    return LONG.get(name, 2 if name in SLOW else 4)
+@pytest.fixture(scope="module")
+def batches(release) -> bytes:
+    return hash_batches(load_icrl4aht(release, obs="uint8", cache="ram"))
 
 
-@pytest.mark.parametrize(
-    ("name", "count"),
-    [(name, QUICK.get(name, 1)) for name in FAMILIES if name not in SLOW]
-    + [pytest.param(name, _attempts(name), marks=pytest.mark.slow) for name in FAMILIES],
+@pytest.fixture
+def caches(tmp_path, monkeypatch) -> Path:
+    """An empty cache folder, in which columns of every size are cached."""
+    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
+    monkeypatch.setattr(columns, "_UNCACHED", 0)
+    return tmp_path / "cache"
+
+
+class DamagedCopy:
+    """A copy of a small release, and what reading it gave before it was damaged."""
+
+    def __init__(self, root: Path) -> None:
+        random_release(root, teammates=2, streams=1, episodes=6, length=15)
+        self.root = root
+        self.before = self.read(root)
+
+    def read(self, root: Path, cache: CacheMode = "ram") -> tuple[bytes, str]:
+        """Return a hash of all arrays and of batches, and the metadata as text."""
+        dataset = load_icrl4aht(root, obs="uint8", cache=cache, threads=1)
+        names = {h: [one.name for one in held_fields(dataset.info.kind) if h.entry.has(one)] for h in dataset}
+        arrays = digest(itertools.chain.from_iterable([h.obs[:], *map(h.read, names[h])] for h in names))
+        histories = [(repr(h.entry), dataset.recover_teammate(h.entry.history_id)) for h in dataset]
+        return arrays + hash_batches(dataset), f"{histories} {dataset.info}"
+
+    @contextmanager
+    def damaged(self, path: Path, data: bytes) -> Iterator[None]:
+        """Replace the content of a file for a while, not its times."""
+        right, status = path.read_bytes(), path.stat()
+        path.write_bytes(data)
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+        try:
+            yield
+        finally:
+            path.write_bytes(right)
+
+    def check(self, cache: CacheMode = "ram") -> None:
+        """Assert that `verify` finds the damage, and that reading raises one of our errors or gives the right data."""
+        assert not verify_release(self.root).ok, "verify finds nothing"
+        with suppress(Icrl4ahtError):
+            assert self.read(self.root, cache) == self.before, "other data without an error"
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> DamagedCopy:
+    return DamagedCopy(tmp_path_factory.mktemp("small") / "release")
+
+
+@pytest.mark.parametrize("count", [9, pytest.param(90, marks=SLOW)])
+def test_no_reading_believes_a_flipped_bit(small, caches, count):
+    """Every file of the release has its turn, and every cache mode. test_verify.py flips 1,000 bits."""
+    rng, paths = np.random.default_rng(1), sorted(path for path in small.root.rglob("*") if path.is_file())
+    modes: list[CacheMode] = ["ram", "stream", "mmap"]
+    for number in range(count):
+        path = paths[number % len(paths)]
+        data = bytearray(path.read_bytes())
+        data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+        with small.damaged(path, bytes(data)):
+            small.check(modes[number % 3])
+
+
+VALUES = [0, -1, 2**31, 2**63, 10**400, 1e300, -0.5, None, True, "", "x", "\0", "../x", "/etc", "ü" * 9, [], [[]], {}]
+RAW = [b"NaN", b"1e999", b"[" * 100_000, b'{"a":' * 50_000, b'"' + b"x" * 10_000_000 + b'"', b"\xff\xfe", b"\\ud800"]
+
+
+def mutated(data: bytes, rng: np.random.Generator, name: str) -> bytes:
+    """Return `data` with one random change."""
+    lines = data.splitlines(keepends=True)
+    one, low, high = rng.integers(len(lines)), *sorted(rng.integers(len(data) + 1, size=2).tolist())
+    changes: list[Callable[[], bytes]] = [
+        lambda: data[:low],
+        lambda: data[:low] + data[high:],
+        lambda: data[:low] + RAW[rng.integers(len(RAW))] + data[low + 1 :],
+        lambda: b"".join([*lines[:one], *lines[one + 1 :]]),
+        lambda: b"".join([*lines[: one + 1], *lines[one:]]),
+        lambda: data.replace(b"\n", rng.choice([b"\r\n", b"\r", b"\n\n", b"\x0b", b""]).item()),
+        lambda: b"\xef\xbb\xbf" + data,
+        lambda: data.replace(b"meta/", rng.choice([b"/meta/", b"../meta/", b"meta//", b"C:/meta/"]).item(), 1),
+        lambda: data.upper(),
+    ]
+    values = 0 if name == MANIFEST else 3 * len(changes)  # of JSON, most changes are of values
+    choice = int(rng.integers(len(changes) + values))
+    return changes[choice]() if choice < len(changes) else other_value(data, rng, by_line=name.endswith(".jsonl"))
+
+
+def other_value(data: bytes, rng: np.random.Generator, by_line: bool) -> bytes:
+    """Return JSON with one value changed or removed."""
+    lines = data.splitlines() if by_line else [data]
+    row = int(rng.integers(len(lines)))
+    content: Any = json.loads(lines[row])
+    inner = content
+    while True:
+        keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
+        key = keys[rng.integers(len(keys))]
+        if not isinstance(inner[key], dict | list) or not inner[key] or rng.random() < 0.3:
+            break
+        inner = inner[key]
+    if rng.random() < 0.8:
+        inner[key] = VALUES[rng.integers(len(VALUES))]
+    else:
+        del inner[key]
+    lines[row] = json.dumps(content).encode()
+    return b"".join(line + b"\n" for line in lines)
+
+
+def manifest_of(root: Path) -> dict[str, str] | None:
+    with suppress(Icrl4ahtError):
+        return read_manifest(root)
+    return None
+
+
+@pytest.mark.parametrize("name", [HISTORIES, INFO, MANIFEST, TASKS, PROVENANCE])
+@pytest.mark.parametrize("count", [1, pytest.param(10, marks=SLOW)])
+def test_mutated_text_files(small, caches, tmp_path, name, count):
+    """The errors are ours, also where the manifest fits the mutated file; time and memory are bounded."""
+    path, rng, lines = small.root / name, np.random.default_rng(count), manifest_of(small.root)
+    for number in range(count):
+        data = mutant = path.read_bytes()
+        while mutant == data:
+            mutant = mutated(data, rng, name)
+        with small.damaged(path, mutant), time_limit(20), memory_limit(2 * 2**30):
+            if name == MANIFEST:
+                with http_server(small.root) as server, suppress(Icrl4ahtError):
+                    fetch_planned(plan_download(server.url, to=tmp_path / f"{number}"))
+                    assert small.read(tmp_path / f"{number}") == small.before, "other data, downloaded"
+                if manifest_of(small.root) != lines:
+                    small.check()
+                continue
+            small.check()
+            with small.damaged(small.root / MANIFEST, (small.root / MANIFEST).read_bytes()):
+                write_manifest(small.root)
+                verify_release(small.root)
+                with suppress(Icrl4ahtError):
+                    small.read(small.root)
+
+
+def limited(folder: Path, size: int, mounted: bool):
+    """Limit the bytes of a folder if `mounted`, else of each file."""
+    return small_disk(folder, size) if mounted else file_size_limit(size)
+
+
+DISKS = pytest.mark.parametrize(
+    "mounted", [False, pytest.param(True, marks=pytest.mark.skipif(not can_mount(), reason="cannot mount disks"))]
 )
-def test_nothing_is_lost(workspace, name, count, capsys):
-    line = run(name, FAMILIES[name][0], workspace, count)
-    assert (line["tried"], line["lost"]) == (count, 0), capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_no_full_disk_ends_a_process():
-    """In a process of its own: writing to a map of a file on a full disk would end it by a signal."""
-    command = [sys.executable, "-m", "tests.robustness.faults.series", "mapped arrays' disk full", "disk full"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert [json.loads(line)["tried"] for line in done.stdout.splitlines()] == [20, 20, 40]
+@DISKS
+@pytest.mark.parametrize("share", [0.3, 0.8])
+def test_a_download_that_fills_the_disk_is_resumed(release, tmp_path, share, mounted):
+    right, to = contents(release), tmp_path / "disk" / "release"
+    sizes = [len(data) for data in right.values()]
+    size = int(share * (sum(sizes) if mounted else max(sizes))) // PAGE * PAGE
+    with http_server(release) as server, limited(to.parent, size, mounted) as enlarge:
+        with pytest.raises((Icrl4ahtError, OSError)) as caught:
+            fetch_planned(plan_download(server.url, to=to))
+        error = caught.value
+        assert isinstance(error, Icrl4ahtError) or error.errno in (errno.ENOSPC, errno.EFBIG), repr(error)
+        assert (contents(to) if to.exists() else {}).items() <= right.items()
+        enlarge()
+        fetch_planned(plan_download(server.url, to=to))
+        assert contents(to) == right
 
 
-def test_episodes_one_step_shorter_by_a_flipped_bit(workspace, tmp_path):
+@DISKS
+@pytest.mark.parametrize("size", [PAGE, 8 * PAGE])
+def test_mapped_arrays_that_fill_the_disk(release, batches, caches, size, mounted):
+    with limited(caches, size, mounted) as enlarge:
+        dataset = load_icrl4aht(release, obs="uint8", cache="mmap")
+        with pytest.raises(CacheError, match=f"{caches}: the cache folder has no room for arrays of "):
+            hash_batches(dataset)
+        left = [path.name for path in caches.iterdir()]
+        assert all(name.startswith(("histories-", "index-")) for name in left), left
+        enlarge()
+        assert hash_batches(dataset) == batches
+
+
+CODE = {
+    "download": "fetch_planned(plan_download(sys.argv[1], to=Path(sys.argv[2])))",
+    "open": "for _ in range(20): open_root(sys.argv[1])",
+    "build": "load_icrl4aht(sys.argv[1], cache='mmap').storage",
+}
+"""What processes do with a release or its address."""
+
+
+def start(code: str, *arguments: object) -> subprocess.Popen[str]:
+    """Start a Python process that runs `code` when a line comes in; return when it is ready."""
+    imports = """
+import sys
+from pathlib import Path
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.download import fetch_planned, plan_download
+from icrl4aht_data.fetch import open_root
+from icrl4aht_data.format import columns
+columns._UNCACHED = 0
+print(flush=True)
+sys.stdin.readline()
+"""
+    command, pipe = [sys.executable, "-c", imports + code, *map(str, arguments)], subprocess.PIPE
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=ROOT)
+    assert process.stdout is not None
+    process.stdout.readline()
+    return process
+
+
+@pytest.mark.parametrize("what", ["download", pytest.param("open", marks=SLOW), pytest.param("build", marks=SLOW)])
+def test_two_processes_at_once(release, batches, caches, tmp_path, what):
+    to = tmp_path / "copy"
+    with http_server(release) as server:
+        server.faults.next(Slow(0.01), times=10**9)
+        root = release if what == "build" else server.url
+        processes = [start(CODE[what], root, to) for _ in range(2)]
+        for process in processes:
+            assert process.stdin is not None
+            process.stdin.write("\n")
+            process.stdin.flush()
+        errors = [process.communicate()[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], errors
+    if what == "download":
+        assert contents(to) == contents(release)
+    if what == "build":
+        assert {path.name.split("-")[0] for path in caches.iterdir()} <= {"index", "histories"}
+        made = contents(caches)
+        assert hash_batches(load_icrl4aht(release, obs="uint8", cache="mmap")) == batches
+        assert contents(caches) == made, "built again"
+
+
+@SLOW
+@pytest.mark.parametrize("moment", [0.02, 0.1, 0.2, 0.4])
+@pytest.mark.parametrize("what", ["download", "build"])
+def test_what_a_killed_process_left_is_used_or_replaced(release, batches, caches, tmp_path, what, moment):
+    to = tmp_path / "copy"
+    with http_server(release) as server:
+        server.faults.next(Slow(0.02), times=10**9)
+        process = start(CODE[what] + "\nsys.stdin.readline()", release if what == "build" else server.url, to)
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+        time.sleep(moment)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        process.communicate()
+        if what == "download":
+            fetch_planned(plan_download(server.url, to=to))
+            assert contents(to) == contents(release)
+    for _ in range(2):  # the first builds what is missing, the second finds it
+        assert hash_batches(load_icrl4aht(release, obs="uint8", cache="mmap")) == batches
+
+
+def test_episodes_one_step_shorter_by_a_flipped_bit(small, tmp_path):
     """15 steps become 14 by one bit, and 90 steps are six complete episodes of either length."""
     root = tmp_path / "release"
-    shutil.copytree(workspace.small, root)
+    shutil.copytree(small.root, root)
     info = root / "meta" / "info.json"
     info.write_text(info.read_text().replace('"kept_steps": 15', '"kept_steps": 14'))
     with pytest.raises(IndexFormatError, match=r"info\.json: expected sha256"):
@@ -69,8 +330,8 @@ def test_episodes_one_step_shorter_by_a_flipped_bit(workspace, tmp_path):
         dataset.ad(batch_size=4, length=5, episodes=(1, 4))
 
 
-def test_a_manifest_without_its_last_byte_is_cut_off(workspace):
-    text = (workspace.small / "MANIFEST.sha256").read_text()
+def test_a_manifest_without_its_last_byte_is_cut_off(small):
+    text = (small.root / "MANIFEST.sha256").read_text()
     with pytest.raises(IndexFormatError, match=r"MANIFEST: cut off: its last line has no end"):
         parse_manifest(text[:-1], "MANIFEST")
 

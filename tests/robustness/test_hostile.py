@@ -6,10 +6,11 @@ They run in one process of their own, whose memory is bounded: see `hostile.run`
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import re
-import subprocess
-import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -25,40 +26,33 @@ from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, U
 from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.utils.files import atomic_write, parse_json
-from tests.helpers.paths import ROOT
 from tests.robustness.hostile.cases import CASES
+from tests.robustness.hostile.run import bound_process, make_bases, run_case
 from tests.robustness.hostile.spoil import TERABYTE
 
-SECONDS = 480
-"""Time for all cases together."""
+SECONDS = 400
+"""Time for one case."""
 DISK_BYTES = 64 * 2**20
 """Most that the steps of a case may write."""
 
 
 @pytest.fixture(scope="module")
-def outcomes(request, tmp_path_factory) -> dict[str, dict[str, Any]]:
-    """The outcomes of the selected cases; a missing case ended the process or exceeded the time."""
-    names = [item.callspec.params["name"] for item in request.session.items if item.originalname == test_case.__name__]
+def outcome_of(tmp_path_factory) -> Iterator[Callable[[str], dict[str, Any]]]:
+    """A function that runs the case of a name in the bounded process; one that ends the process is an error."""
     folder = tmp_path_factory.mktemp("hostile")
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "tests.robustness.hostile.run", str(folder)]
-    with (folder / "out.jsonl").open("wb") as out, (folder / "errors.txt").open("wb") as errors:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=out, stderr=errors, env=environment)
-        try:
-            process.communicate(json.dumps(names).encode(), SECONDS)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-    lines = [json.loads(line) for line in (folder / "out.jsonl").read_text().splitlines()]
-    return {line["case"]: line for line in lines} | {"": {"errors": (folder / "errors.txt").read_text()[-2000:]}}
+    make_bases(folder)
+    context = multiprocessing.get_context("spawn")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OPENBLAS_NUM_THREADS", "1")
+        with ProcessPoolExecutor(1, context, initializer=bound_process) as pool:
+            yield lambda name: pool.submit(run_case, folder, name).result(SECONDS)
 
 
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if n % 8 == 0 else pytest.mark.slow) for n, name in enumerate(CASES)]
 )
-def test_case(outcomes, name):
-    assert name in outcomes, f"the process ended before: {outcomes['']['errors']}"
-    found = outcomes[name]
+def test_case(outcome_of, name):
+    found = outcome_of(name)
     foreign = {step: outcome["said"] for step, outcome in found["steps"].items() if not outcome["ours"]}
     assert not foreign, foreign
     assert not found["touched"], "a file of the release or outside of it was changed"

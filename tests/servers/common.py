@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from tests.servers.faults import (
     Cut,
-    Etag,
     Fault,
     Faults,
     Flip,
-    IgnoreRange,
     Long,
     Redirect,
     Request,
@@ -25,12 +23,10 @@ from tests.servers.s3 import Bucket, s3_server
 __all__ = [
     "Bucket",
     "Cut",
-    "Etag",
     "Fault",
     "Faults",
     "Flip",
     "Hub",
-    "IgnoreRange",
     "Long",
     "Redirect",
     "Request",

@@ -84,18 +84,6 @@ class Flip:
 
 
 @dataclass(frozen=True)
-class Etag:
-    """Another ETag of this path from now on."""
-
-    value: str
-
-
-@dataclass(frozen=True)
-class IgnoreRange:
-    """Status 200 and the complete body, whatever range was requested."""
-
-
-@dataclass(frozen=True)
 class Redirect:
     """A redirect to another path of this server, or to a URL."""
 
@@ -103,7 +91,7 @@ class Redirect:
     code: int = 302
 
 
-Fault = Cut | Status | Slow | Short | Long | Flip | Etag | IgnoreRange | Redirect
+Fault = Cut | Status | Slow | Short | Long | Flip | Redirect
 Rule = Callable[[Request], Fault | None]
 
 
@@ -153,7 +141,7 @@ class Faults:
         self.add(rule)
 
     def clear(self) -> None:
-        """Remove all rules; ETags that were changed stay changed."""
+        """Remove all rules."""
         with self._lock:
             self._rules.clear()
 

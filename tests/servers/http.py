@@ -20,11 +20,9 @@ from urllib.parse import unquote, urlsplit
 
 from tests.servers.faults import (
     Cut,
-    Etag,
     Fault,
     Faults,
     Flip,
-    IgnoreRange,
     Long,
     Redirect,
     Request,
@@ -68,7 +66,6 @@ class Server(ThreadingHTTPServer):
         self.faults = Faults() if faults is None else faults
         self.log: list[Request] = [] if log is None else log
         self.url = f"http://127.0.0.1:{self.server_address[1]}"
-        self.etags: dict[str, str] = {}
         self.closing = threading.Event()
         self._errors: list[BaseException] = []
         self._open: dict[Any, threading.Thread] = {}
@@ -164,16 +161,12 @@ class Handler(BaseHTTPRequestHandler):
 
     def _send(self, request: Request, answer: Answer, fault: Fault | None) -> None:
         headers, etag = dict(answer.headers), answer.etag
-        if isinstance(fault, Etag):
-            self.owner.etags[request.path] = f'"{fault.value}"'
-        if request.path in self.owner.etags:
-            etag = etag and self.owner.etags[request.path]
         with _opened(answer.body) as file:
             size = os.fstat(file.fileno()).st_size if isinstance(answer.body, Path) else len(answer.body)
             status, start, stop = answer.status, 0, size
             if etag is not None:
                 headers |= {"ETag": etag, "Accept-Ranges": "bytes"}
-                status, start, stop = self._selected(size, isinstance(fault, IgnoreRange))
+                status, start, stop = self._selected(size)
             if status == 206:
                 request.start, request.stop = start, stop
             if status == 416:
@@ -192,10 +185,10 @@ class Handler(BaseHTTPRequestHandler):
                 file.seek(start)
                 self._send_body(request, file, stop - start, fault)
 
-    def _selected(self, size: int, ignore_range: bool) -> tuple[int, int, int]:
+    def _selected(self, size: int) -> tuple[int, int, int]:
         """Status, first byte and end of what this request's range selects."""
         found = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
-        if ignore_range or found is None:
+        if found is None:
             return 200, 0, size
         start, stop = int(found[1]), min(int(found[2] or size) + 1, size)
         return (206, start, stop) if start < stop else (416, 0, 0)
