@@ -321,15 +321,6 @@ def group_link_out(file: Any, out: Path) -> None:
     file["0"] = h5py.ExternalLink(str(out / "secret.h5"), "/")
 
 
-def endless_heap(root: Path) -> None:
-    """Set the size of the free space in the heap of texts to zero."""
-    data = bytearray((root / SHARD).read_bytes())
-    left = data.index(b"GCOL") + 16 + 16 + 16  # after the heap's header and "coord_simple" with its own
-    assert data[left : left + 2] == b"\0\0"
-    data[left + 8 : left + 16] = bytes(8)
-    (root / SHARD).write_bytes(data)
-
-
 _SHARED: dict[str, dict[str, ChangeFile]] = {
     "lead out of the file": {
         "soft link": link(lambda out: h5py.SoftLink("/0/state")),
@@ -359,7 +350,6 @@ _OF_SHARDS: dict[str, dict[str, ChangeFile]] = {
 }
 for _message, _changes in (_SHARED | _OF_SHARDS).items():
     add_hashed(_message, {f"shard: {name}": hdf5(change) for name, change in _changes.items()})
-add_hashed("not stored as libhdf5", {"shard: endless heap of texts": endless_heap})
 
 # Published files
 
