@@ -23,7 +23,6 @@ import pytest
 from click.testing import CliRunner
 from fsspec.implementations.memory import MemoryFileSystem
 from icrl4aht_baselines.methods.registry import METHODS
-from icrl4aht_generation.planning import plan
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.commands.cli import all_verbs, cli
@@ -35,6 +34,7 @@ from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_posi
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.writing.convert import to_release
+from tests.helpers.damages import flip_bit
 from tests.helpers.paths import ROOT
 from tests.helpers.plugins import installed, write_package
 from tests.helpers.random_releases import random_history, random_release
@@ -176,52 +176,27 @@ def _numbers(ranges: str) -> list[int]:
 
 
 class TestFormat:
-    def assert_reads(self, reader, root: Path, histories=None) -> None:
-        dataset = load_icrl4aht(root, obs="uint8")
-        for number in range(len(dataset)) if histories is None else histories:
-            history = dataset[number]
-            for field in history.entry.stored_fields(dataset.info.kind):
-                array = reader["read"](root, number, field.name)
-                assert array.dtype == field.element(LAYOUTS[history.entry.layout], dataset.info.kind).base
-                np.testing.assert_array_equal(array, history.read(field.name))
-
-    def test_the_bundled_release(self, reader):
-        self.assert_reads(reader, MINI, (0, 31, 79, 80))
-
-    def test_every_kind(self, reader, lite, full, tmp_path):
+    def test_reading_gives_the_arrays_of_the_package(self, reader, lite, full, tmp_path):
         to_release(load_icrl4aht(full[0]), tmp_path / "observations", "observations")
-        for root in (lite[0], full[0], tmp_path / "observations"):
-            self.assert_reads(reader, root)
-
-    def test_several_shards_without_labels(self, reader, tmp_path):
-        random_release(tmp_path / "r", labels=False, shard_histories=4)
-        self.assert_reads(reader, tmp_path / "r")
+        random_release(tmp_path / "shards", labels=False, shard_histories=4)
+        random_release(tmp_path / "oracle", layouts=("coord_simple",), oracle=True)
+        for root in (MINI, lite[0], full[0], *sorted(tmp_path.iterdir())):
+            dataset = load_icrl4aht(root, obs="uint8")
+            for number in (0, 31, 79, 80) if root is MINI else range(len(dataset)):
+                history = dataset[number]
+                for field in history.entry.stored_fields(dataset.info.kind):
+                    array = reader["read"](root, number, field.name)
+                    assert array.dtype == field.element(LAYOUTS[history.entry.layout], dataset.info.kind).base
+                    np.testing.assert_array_equal(array, history.read(field.name))
         with pytest.raises(KeyError):
-            reader["read"](tmp_path / "r", 0, "expert_actions")
-
-    def test_oracle_actions(self, reader, tmp_path):
-        random_release(tmp_path / "r", layouts=("coord_simple",), oracle=True)
-        self.assert_reads(reader, tmp_path / "r")
+            reader["read"](tmp_path / "shards", 0, "expert_actions")
 
     def test_a_damaged_byte_is_an_error(self, reader, damaged):
         shard = damaged / load_icrl4aht(damaged).entries[0].shard
         table = np.load(damaged / "meta/chunks" / shard.relative_to(damaged / "data").with_suffix(".npy"))
-        content = bytearray(shard.read_bytes())
-        content[int(table["offset"][0]) + 5] ^= 1
-        shard.write_bytes(content)
+        flip_bit(shard, int(table["offset"][0]) + 5)
         with pytest.raises(ValueError, match="are damaged"):
             reader["read"](damaged, 0, "state")
-
-    def test_chunk_tables_cover_every_byte_once(self, lite):
-        for path in (lite[0] / "data").rglob("*.h5"):
-            stored = lite[0] / "meta/chunks" / path.relative_to(lite[0] / "data").with_suffix(".npy")
-            table, header = np.load(stored), 10 + int.from_bytes(stored.read_bytes()[8:10], "little")
-            assert header + 36 * len(table) == stored.stat().st_size
-            assert table["size"][table["rows"] == 0].max() <= 2048
-            table.sort(order="offset")
-            ends = np.cumsum(table["size"], dtype=np.int64)
-            assert table["offset"].tolist() == [0, *ends[:-1].tolist()]
-            assert ends[-1] == path.stat().st_size
 
     @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=str)
     def test_records_and_observations(self, reader, layout):
@@ -306,56 +281,29 @@ def write_own_package(folder: Path) -> Path:
     return write_package(folder, project["name"], modules, project["entry-points"])
 
 
-class TestExtending:
-    @pytest.mark.slow
-    def test_page(self, tmp_path, monkeypatch):
-        """Run the snippets, then the commands, which are processes of their own."""
-        package = write_own_package(tmp_path / "site")
-        (tmp_path / "page").mkdir()
-        with installed(package), mock.patch.dict(METHODS):
-            names = run_snippets("extending", tmp_path / "page")
-        assert names["task"].teammate_family == "waiter"
-        shutil.copy(tmp_path / "page/mine.jsonl", tmp_path)
-        (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
-        for line in blocks("sh", PAGES["extending"])[0].splitlines():
-            line = line.replace("--profile smoke", "--profile tiny.toml").replace("--steps 2000", SMALL)
-            self.run(line, tmp_path, package)
-        results, config = (
-            (tmp_path / "runs" / name).read_text(encoding="utf-8")
-            for name in ("oracle/report/report.md", "mean_open/config.json")
-        )
-        assert "| waiter (training) |" in results
-        assert "open_kitchen" in results
-        assert json.loads(config)["method"] == "mean_ad"
-
-    def run(self, line: str, folder: Path, package: Path) -> None:
-        path = os.pathsep.join(map(str, (package, ROOT)))
-        done = subprocess.run(
-            [sys.executable, *line.split()[1:]],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": path},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+@pytest.mark.slow
+def test_extending(tmp_path, monkeypatch):
+    """Run the snippets, then the commands, which are processes of their own."""
+    package = write_own_package(tmp_path / "site")
+    (tmp_path / "page").mkdir()
+    with installed(package), mock.patch.dict(METHODS):
+        names = run_snippets("extending", tmp_path / "page")
+    assert names["task"].teammate_family == "waiter"
+    shutil.copy(tmp_path / "page/mine.jsonl", tmp_path)
+    (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (package, ROOT)))}
+    for line in blocks("sh", PAGES["extending"])[0].splitlines():
+        line = line.replace("--profile smoke", "--profile tiny.toml").replace("--steps 2000", SMALL)
+        command = [sys.executable, "-m", "icrl4aht_data", *line.split()[1:]]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{line}: {done.stderr}"
+    assert "| waiter (training) |" in (tmp_path / "runs/oracle/report/report.md").read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "runs/mean_open/config.json").read_text(encoding="utf-8"))["method"] == "mean_ad"
 
 
-class TestScale:
-    def test_the_plan_of_the_paper_is_the_printed_one(self, monkeypatch):
-        """All lines are equal, except for numbers that depend on measurements."""
-        monkeypatch.setattr(plan, "step_seconds", lambda config: 0.001)
-        (arguments,) = (a for a in commands(PAGES["scale"]) if a[0] == "plan")
-        result = CliRunner().invoke(cli, arguments)
-        assert result.exit_code == 0, result.output
-        (written,) = (block for block in blocks("text", PAGES["scale"]) if block.startswith("profile"))
-        for ours, line in zip(result.output.splitlines(), written.splitlines(), strict=True):
-            measured = re.match("device|steps per second|teammate hours|hours", ours)
-            assert ours[:29] == line[:29] if measured else ours == line
-
-    def test_listed_variables_are_those_that_the_code_reads(self):
-        sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "icrl4aht_data").rglob("*.py"))
-        used = set(re.findall(r'"((?:ICRL4AHT|HF)_[A-Z_]+)"', sources))
-        listed = {name for cells in rows("scale", "variable") for name in cells[0].split(", ")}
-        assert used <= listed
-        assert {name for name in listed if name.startswith("ICRL4AHT")} <= used
+def test_listed_variables_are_those_that_the_code_reads():
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "icrl4aht_data").rglob("*.py"))
+    used = set(re.findall(r'"((?:ICRL4AHT|HF)_[A-Z_]+)"', sources))
+    listed = {name for cells in rows("scale", "variable") for name in cells[0].split(", ")}
+    assert used <= listed
+    assert {name for name in listed if name.startswith("ICRL4AHT")} <= used
