@@ -396,12 +396,12 @@ add("published", "an object of objects", {"provenance: a list": replaced("proven
 # Servers
 
 add("served", "expected at most", {f"a terabyte: {name}": replaced(name, sparse) for name in (MANIFEST, TABLE)})
-add("served", "sha256|cover|crc32", {"a terabyte: shard": replaced(SHARD, sparse)})
+add("served", "expected at most|sha256", {"a terabyte: shard": replaced(SHARD, sparse)})
 add("served", "leads out of the release", {"names above": listed("../../new")})
 for _name, _message, _rules in (
     ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": Long(TERABYTE)}),
     ("endless index", "expected at most|more came|says", {f"*/{HISTORIES}": Long(TERABYTE)}),
-    ("endless shard", "more came", {"*.h5": Long(TERABYTE)}),
+    ("endless shard", "expected at most", {"*.h5": Long(TERABYTE)}),
     ("to a local file", "info.json", {f"*/{INFO}": Redirect("file:///etc/passwd")}),
     ("to another protocol", "h5", {"*.h5": Redirect("ftp://127.0.0.1/x")}),
     ("in a circle", "info.json", {f"*/{INFO}": Redirect(f"/{INFO}")}),
