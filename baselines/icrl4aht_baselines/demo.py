@@ -17,7 +17,7 @@ from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
 from icrl4aht_baselines.plotting import plot_family_curves
 from icrl4aht_baselines.report.page import check_can_render, write_page_with_episodes
-from icrl4aht_baselines.report.results import note_results, read_run, shipped_validation_tasks
+from icrl4aht_baselines.report.results import bundled_by_id, note_results, read_run
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
@@ -150,7 +150,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
 
     tasks = settings.tasks
     if tasks is None:
-        tasks = tuple(task for task in shipped_validation_tasks().values() if task.layout.name == DEMO_LAYOUT)
+        tasks = tuple(task for task in bundled_by_id("validation").values() if task.layout.name == DEMO_LAYOUT)
     others = [*AGENTS, *([settings.reference] if settings.reference else [])]
     say(5, f"evaluating it and {', '.join(others)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
     returns = {name: _evaluate(name, out, tasks, settings) for name in (*others, str(out / "ad"))}

@@ -13,6 +13,7 @@ Everything resumes: finished parts are kept, stopped ones continue, and folders 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -31,7 +32,7 @@ from icrl4aht_baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, Histo
 from icrl4aht_baselines.training.trainer import train
 from icrl4aht_data.benchmark.facts import TESTED_ON, track_of
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.dataset import Dataset, load_icrl4aht
+from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
 from icrl4aht_data.format.schema import TASKS
 from icrl4aht_data.overcooked.channels import Channels
@@ -225,7 +226,7 @@ def run_experiment(
     results = []
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout
-        _train_entry(method, entry, layout, plan, folder / "run", progress)
+        _train_entry(_prepare_entry(method, entry, layout, plan), f"{entry.name} on {layout}", plan, folder, progress)
         _evaluate_entry(experiment, entry, tasks[layout], plan, folder, progress)
         results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
@@ -260,14 +261,16 @@ def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[lis
     """Return the layouts to train on, or `ALL_LAYOUTS` for one model of all, and a note on those left out."""
     dataset = load_icrl4aht(plan.root, split="train")
     filters = HistoryOptions((), **plan.filters).filters
-    if filters:
-        filter_histories(dataset, filters)  # a value that no history has is an error that names it
-    by_layout = {layout.name: dataset.filter(layout=layout.name) for layout in dataset.layouts}
-    available = {name for name, histories in by_layout.items() if _pass_all(histories, filters)}
-    release = plan.root or "the bundled mini release"
-    kind = "training histories" + "".join(f" of {name} {' and '.join(values)}" for name, values in filters.items())
+    filter_histories(dataset, filters)  # a value that no history has is an error that names it
     if ALL_LAYOUTS in plan.layouts:
         return list(HistoryOptions(plan.layouts).layouts), []
+    available = []
+    for layout in dataset.layouts:
+        with suppress(EmptySelectionError):
+            filter_histories(dataset.filter(layout=layout.name), filters)
+            available.append(layout.name)
+    release = plan.root or "the bundled mini release"
+    kind = "training histories" + "".join(f" of {name} {' and '.join(values)}" for name, values in filters.items())
     wanted = tuple(get_layout(name).name for name in plan.layouts)
     for name in wanted:
         if name not in TESTED_ON:
@@ -282,32 +285,21 @@ def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[lis
     return names, [f"left out, the release has no {kind} of them: {', '.join(missing)}"] if missing else []
 
 
-def _pass_all(histories: Dataset, filters: dict[str, tuple[str, ...]]) -> bool:
-    """Return whether every value of the filters has histories."""
-    try:
-        return bool(filter_histories(histories, filters))
-    except EmptySelectionError:
-        return False
-
-
-def _all_layouts(plan: ExperimentPlan) -> list[str]:
-    """Return the layouts of a model of all layouts, in the order of `TESTED_ON`."""
-    filters = HistoryOptions((), **plan.filters).filters
-    dataset = filter_histories(load_icrl4aht(plan.root, split="train"), filters)
-    names = [name for name in TESTED_ON if name in {layout.name for layout in dataset.layouts}]
-    if not names:
-        raise EmptySelectionError(f"{dataset!r}: none of its layouts is a training layout of the benchmark")
-    return names
-
-
 def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
     """Return the tasks that a model trained on a layout, or on `ALL_LAYOUTS`, is evaluated on."""
     if layout == ALL_LAYOUTS:
-        return [task for name in _all_layouts(plan) for task in _test_tasks(experiment, plan, name)]
+        filters = HistoryOptions((), **plan.filters).filters
+        dataset = filter_histories(load_icrl4aht(plan.root, split="train"), filters)
+        names = [name for name in TESTED_ON if name in {layout.name for layout in dataset.layouts}]
+        if not names:
+            raise EmptySelectionError(f"{dataset!r}: none of its layouts is a training layout of the benchmark")
+        return [task for name in names for task in _test_tasks(experiment, plan, name)]
     if experiment.held_out:
         if plan.split:
-            raise OptionError(f"split = {plan.split}: this experiment has tasks of its own, those of the suite's "
-                              f"held-out teammates; leave --split out")  # fmt: skip
+            raise OptionError(
+                f"split = {plan.split}: this experiment has tasks of its own, those of the suite's held-out teammates; "
+                f"leave --split out"
+            )
         tasks = held_out_tasks(plan.suite, layout, plan.root)
     else:
         split = plan.split or "test"
@@ -383,28 +375,17 @@ def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: Exper
 
 
 def _train_entry(
-    method: str,
-    entry: ExperimentEntry,
-    layout: str,
-    plan: ExperimentPlan,
-    folder: Path,
-    progress: ExperimentProgress,
+    job: TrainingTask, name: str, plan: ExperimentPlan, folder: Path, progress: ExperimentProgress
 ) -> None:
-    job = _prepare_entry(method, entry, layout, plan)
-    steps = job.options.steps
-    what = f"{job.method.label} {entry.name} on {layout}: training steps"
-    progress(what, 0, steps)
-    train(
-        job.method,
-        job.data,
-        job.options,
-        folder,
-        job.about,
-        tensorboard=plan.tensorboard,
-        save_minutes=plan.save_minutes,
-        done=lambda step, loss: progress(what, step, steps),
-    )
-    progress(what, steps, steps)
+    what, steps = f"{job.method.label} {name}: training steps", job.options.steps
+
+    def done(step: int, loss: float | None) -> None:
+        progress(what, step, steps)
+
+    done(0, None)
+    watched: Any = {"tensorboard": plan.tensorboard, "save_minutes": plan.save_minutes, "done": done}
+    train(job.method, job.data, job.options, folder / "run", job.about, **watched)
+    done(steps, None)
 
 
 def _evaluate_entry(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from rich.console import Console
 from icrl4aht_baselines.commands.options import (
     EGO_NAME,
     PROTOCOL_NAME,
+    add_options,
     default_batch_size,
     experiment_options,
     find_ego,
@@ -30,83 +32,72 @@ from icrl4aht_data.utils.templates import card_file
 _console = Console(soft_wrap=True)
 
 
-@click.command(
+def _experiment_command(name: str, text: str, *own: Callable[[Any], Any], usage: Sequence[str] = ()) -> click.Command:
+    """Return the command of an experiment, or of several that an argument `what` distinguishes.
+
+    Args:
+        name: of the command.
+        text: its help.
+        own: decorators that add the command's own arguments and options.
+        usage: examples.
+    """
+
+    def run(
+        root: Any, out: Path | None, train: Any, histories: Any, size: str | None, what: str = "", **plan: Any
+    ) -> None:
+        from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
+
+        experiment, size = f"{name} {what}".strip(), size or "small"
+        sizes: Any = {"size": size, "batch_size": default_batch_size(size), "train": train}
+        chosen = ExperimentPlan(root=root and str(root), **sizes, **histories, **plan)
+        with progress_bars() as show:
+            found = run_experiment(experiment, chosen, out or Path("runs") / experiment.replace(" ", "-"), show)
+        for line in [*found.notes, *(f"wrote {path}" for path in found.report)]:
+            click.echo(line)
+
+    command = add_options(run, [*own, experiment_options(f"runs/{name}" + "-WHAT" * bool(usage))])
+    return click.command(name, help=text, epilog=examples(*usage) if usage else None)(command)
+
+
+sweep_command = _experiment_command(
     "sweep",
-    epilog=examples(
+    """Train and evaluate over sizes, or context lengths.
+
+    WHAT is context (K of 250 to 10,000) or size (small, medium, large). Writes runs, results and OUT/report.
+    """,
+    click.argument("what", type=variant_names("sweep")),
+    usage=(
         "icrl4aht-data research sweep size --layout demo_wide",
         "icrl4aht-data research sweep context --only K250 --steps 20 --layout demo_wide --tasks 1 --episodes 5",
     ),
 )
-@click.argument("what", type=variant_names("sweep"))
-@experiment_options("runs/sweep-WHAT")
-def sweep_command(what: str, **options: Any) -> None:
-    """Train and evaluate over sizes, or context lengths.
-
-    WHAT is context (K of 250 to 10,000) or size (small, medium, large). Writes runs, results and OUT/report.
-    """
-    _run_experiment(f"sweep {what}", **options)
-
-
-@click.command("ablate", epilog=examples("icrl4aht-data research ablate ta --layout demo_wide"))
-@click.argument("what", type=variant_names("ablate"))
-@experiment_options("runs/ablate-WHAT")
-def ablate_command(what: str, **options: Any) -> None:
+ablate_command = _experiment_command(
+    "ablate",
     """Train and evaluate with and without parts.
 
     WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both. Writes runs, results and OUT/report.
-    """
-    _run_experiment(f"ablate {what}", **options)
-
-
-@click.command("tracks")
-@experiment_options("runs/tracks")
-def tracks_command(**options: Any) -> None:
+    """,
+    click.argument("what", type=variant_names("ablate")),
+    usage=("icrl4aht-data research ablate ta --layout demo_wide",),
+)
+tracks_command = _experiment_command(
+    "tracks",
     """Train and evaluate on both tracks.
 
-    The paper's Tables 1 and 2; with other methods 4 and 5. Its numbers are shown with --protocol published. Writes
-    runs, results and OUT/report.
-    """
-    _run_experiment("tracks", **options)
-
-
-@click.command("heldout-rl")
-@click.option(
-    "--suite",
-    type=Folder(),
-    metavar="FOLDER",
-    default="build/suite",
-    help="Folder of learned teammates.",
+    The paper's Tables 1 and 2; with other methods 4 and 5. The paper's numbers are shown with --protocol published.
+    Writes runs, results and OUT/report.
+    """,
 )
-@experiment_options("runs/heldout-rl")
-def heldout_rl_command(suite: Path, **options: Any) -> None:
+heldout_rl_command = _experiment_command(
+    "heldout-rl",
     """Train, and evaluate with held-out teammates.
 
     These are a suite's learned teammates that are not in training. Writes runs, results and OUT/report.
-    """
-    _run_experiment("heldout-rl", suite=suite, **options)
-
-
-def _run_experiment(
-    name: str,
-    out: Path | None,
-    root: Any,
-    train: dict[str, Any],
-    histories: dict[str, Any],
-    suite: Path | None = None,
-    size: str | None = None,
-    **options: Any,
-) -> None:
-    from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
-
-    size = size or "small"
-    sizes: Any = {"size": size, "batch_size": default_batch_size(size), "train": train}
-    plan = ExperimentPlan(root=root and str(root), suite=suite, **sizes, **histories, **options)
-    with progress_bars() as show:
-        found = run_experiment(name, plan, out or Path("runs") / name.replace(" ", "-"), show)
-    for note in found.notes:
-        click.echo(note)
-    for path in found.report:
-        click.echo(f"wrote {path}")
+    """,
+    click.option(
+        "--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Folder of learned teammates."
+    ),
+)
 
 
 @click.command("control")

@@ -23,15 +23,7 @@ from icrl4aht_baselines.commands.options import (
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue
-from icrl4aht_data.commands.options import (
-    COUNT,
-    COUNT_OR_NONE,
-    LAYOUT,
-    TRACK,
-    Folder,
-    examples,
-    overwrite_option,
-)
+from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, LAYOUT, TRACK, Folder, examples, overwrite_option
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -153,12 +145,7 @@ def collect_command(
 )
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
 def reference_command(
-    names: tuple[str, ...],
-    track: tuple[str, ...],
-    teacher: str | None,
-    evaluates: bool,
-    bundle: str | None,
-    out: Path,
+    names: tuple[str, ...], track: tuple[str, ...], teacher: str | None, evaluates: bool, bundle: str | None, out: Path
 ) -> None:
     """Make reference models, with everything that they need.
 

@@ -29,7 +29,7 @@ from icrl4aht_data.utils.options import Positive
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
-    """Returns a function that imports a module and returns one of its attributes, since importing JAX takes seconds."""
+    """Return a function that imports a module and returns one of its attributes, since importing JAX takes seconds."""
     return lambda: getattr(import_module(module), name)
 
 
@@ -41,7 +41,7 @@ class EgoName(Names):
 
 
 def find_ego(option: str, value: str, **mode: Any) -> Any:
-    """Returns the ego that an option names, a `icrl4aht_baselines.agents.egos.NamedEgo`.
+    """Return the ego that an option names, a `icrl4aht_baselines.agents.egos.NamedEgo`.
 
     Args:
         option: name of the option, for messages.
@@ -73,7 +73,6 @@ class HostPort(click.ParamType):
 
 EGO_NAME = EgoName("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names())
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], lambda: [ALL_LAYOUTS, *LAYOUT.offered()])
-_EVALUATION_SPLIT = Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS"))
 METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())
 _HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
 _playing = lazy_attribute("icrl4aht_baselines.methods.registry", "PLAYING")
@@ -99,15 +98,10 @@ greedy_option = click.option(
     help="Take the most probable actions of a trained model, or draw its actions.",
     show_default="greedy; a bundled model's own, see `models`",
 )
-experiment_acting_option = click.option(
-    "--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"
-)
-_SPLIT_HELP = "Which tasks: test, or validation and diverse, by which models are chosen."
-evaluation_split_option = click.option("--split", type=_EVALUATION_SPLIT, help=_SPLIT_HELP, show_default="test")
-_experiment_split_option = click.option(
+evaluation_split_option = click.option(
     "--split",
-    type=_EVALUATION_SPLIT,
-    help=_SPLIT_HELP,
+    type=Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS")),
+    help="Which tasks: test, or validation and diverse, by which models are chosen.",
     show_default="test",
 )
 tasks_option = click.option(
@@ -138,6 +132,11 @@ root_option = click.option(
 )
 
 
+def add_options(command: Any, options: Iterable[Callable[[Any], Any]]) -> Any:
+    """Return a command with options, which its help lists in this order."""
+    return functools.reduce(lambda decorated, option: option(decorated), reversed([*options]), command)
+
+
 def history_filters(command: Any) -> Any:
     """Add the options that filter the histories to train on; the command receives them as the dict `filters`."""
     options = [
@@ -166,10 +165,7 @@ def history_filters(command: Any) -> Any:
         filters = {name: chosen for name in FILTERS if (chosen := values.pop(name))}
         return command(*args, filters=filters, **values)
 
-    decorated: Any = collect
-    for option in reversed(options):
-        decorated = option(decorated)
-    return decorated
+    return add_options(collect, options)
 
 
 manifests_option = click.option(
@@ -193,12 +189,6 @@ size_option = click.option(
     help="tiny, for a CPU, or the paper's small, medium or large: sets what has `the size's` as its default.",
     show_default="tiny on a CPU, small elsewhere",
 )
-_experiment_size_option = click.option(
-    "--size",
-    type=_SIZE_NAME,
-    help="tiny, for a CPU, or the paper's small, medium or large; not with `sweep size`, which varies it.",
-    show_default="small, as in the paper",
-)
 _PAPER_OR_CPU = "1024 as in the paper; on a CPU 16 of tiny, 8 of others"
 _BY_SIZE = dict.fromkeys(SIZES["tiny"].model | SIZES["tiny"].train, "the size's")
 training_options = dataclass_options(TrainOptions, "train", default_text={**_BY_SIZE, "batch_size": _PAPER_OR_CPU})
@@ -207,7 +197,7 @@ model_options = dataclass_options(ModelOptions, "model", default_text=_BY_SIZE)
 
 
 def training_summary(histories: dict[str, Any]) -> str:
-    """Returns layouts, channels, labels and numbers of histories of a training run, from its histories' settings."""
+    """Return layouts, channels, labels and numbers of histories of a training run, from its histories' settings."""
     shape, sizes, split = " x ".join(map(str, histories["obs_shape"])), histories["sizes"], histories["teammates_split"]
     parts = [
         f"training on {', '.join(histories['layouts'])}",
@@ -221,7 +211,7 @@ def training_summary(histories: dict[str, Any]) -> str:
 
 
 def default_batch_size(size: str = "small") -> int:
-    """Returns the paper's batch size, or on a CPU one that makes a step take a second or less."""
+    """Return the paper's batch size, or on a CPU one that makes a step take a second or less."""
     import jax
 
     return SIZES[size].cpu_batch if jax.default_backend() == "cpu" else TrainOptions.batch_size
@@ -286,14 +276,13 @@ def prepare_training(
 
 
 def check_alone(option: str, *others: str) -> None:
-    """Check that parameters which an option replaces were not given beside it.
+    """Check that options whose values another option sets were not given as well.
 
     Raises:
-        click.UsageError: if one was; names all of these.
+        click.UsageError: if one was; the message names all of these.
     """
-    context = click.get_current_context()
-    given = [name for name in others if context.get_parameter_source(name) is ParameterSource.COMMANDLINE]
-    if given:
+    source = click.get_current_context().get_parameter_source
+    if given := [name for name in others if source(name) is ParameterSource.COMMANDLINE]:
         raise click.UsageError(f"{option}: not with {_flags(given)}, which it sets; leave one of them out")
 
 
@@ -329,7 +318,7 @@ def join_processes(coordinator: str | None, processes: int, process: int) -> Non
 
 
 def variant_names(command: str) -> Names:
-    """Returns the type of an experiment's second word, such as `size` in `sweep size`."""
+    """Return the type of an experiment's second word, such as `size` in `sweep size`."""
     experiments = lazy_attribute("icrl4aht_baselines.experiments", "EXPERIMENTS")
     prefix = f"{command} "
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
@@ -339,7 +328,7 @@ _NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "obs", "labels", "every",
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:
-    """Returns a decorator with the options of all experiments; `out` is shown as the default folder."""
+    """Return a decorator with the options of all experiments; `out` is shown as the default folder."""
     options = [
         click.option(
             "--method",
@@ -372,15 +361,20 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
             multiple=True,
             help="Evaluate only with teammates of this family, such as H4; repeat for several.",
         ),
-        _experiment_size_option,
+        click.option(
+            "--size",
+            type=_SIZE_NAME,
+            help="tiny, for a CPU, or the paper's small, medium or large; not with `sweep size`, which varies it.",
+            show_default="small, as in the paper",
+        ),
         history_filters,
         dataclass_options(HistoryOptions, "histories", exclude=_NOT_IN_EXPERIMENTS),
-        _experiment_split_option,
+        evaluation_split_option,
         tasks_option,
         episodes_option,
         seeds_option,
         protocol_option,
-        experiment_acting_option,
+        click.option("--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"),
         gifs_option,
         save_minutes_option,
         tensorboard_option,
@@ -401,9 +395,4 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         ),
     ]
 
-    def decorate(command: Any) -> Any:
-        for option in reversed(options):
-            command = option(command)
-        return command
-
-    return decorate
+    return lambda command: add_options(command, options)

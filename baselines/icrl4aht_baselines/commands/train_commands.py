@@ -44,15 +44,7 @@ from icrl4aht_baselines.training.options import HistoryOptions
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
-from icrl4aht_data.commands.options import (
-    LAYOUT,
-    SEED,
-    TRACK,
-    Folder,
-    NewFile,
-    examples,
-    overwrite_option,
-)
+from icrl4aht_data.commands.options import LAYOUT, SEED, TRACK, Folder, NewFile, examples, overwrite_option
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
@@ -137,10 +129,8 @@ def evaluate_command(
     names = {get_layout(name).name for name in layout}
     chosen = limit_tasks([task for task in given if not names or task.layout.name in names], tasks)
     if not chosen:
-        raise EmptySelectionError(
-            f"no task on {', '.join(sorted(names))} in {manifest or f'the {split} tasks'}: choose another --layout, or "
-            f"none"
-        )
+        found = manifest or f"the {split} tasks"
+        raise EmptySelectionError(f"no task on {', '.join(sorted(names))} in {found}: choose another --layout, or none")
     for name in {task.layout.name for task in chosen}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
     if chosen_seeds:
@@ -286,9 +276,7 @@ def train_command(
     manifests: tuple[Path, ...],
     save_minutes: float,
     tensorboard: bool,
-    coordinator: str | None,
-    processes: int,
-    process: int,
+    **machines: Any,
 ) -> None:
     """Train a model on learning histories.
 
@@ -296,7 +284,7 @@ def train_command(
     Writes settings, checkpoints, metrics.jsonl and, with the extra plot, curves.png into OUT; the same command resumes
     from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second Ctrl-C does not wait for it.
     """
-    join_processes(coordinator, processes, process)
+    join_processes(**machines)
     from icrl4aht_baselines.methods.registry import PLAYING
     from icrl4aht_baselines.training.histories import start_from
     from icrl4aht_baselines.training.run_folder import RUN_CURVES
@@ -306,8 +294,8 @@ def train_command(
     choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
     choice = replace_options(choice, histories)
     folder, plays = out or Path("runs") / method, method in PLAYING
-    if plays and processes > 1:
-        raise click.UsageError(f"--processes {processes}: {method} is trained by one process on one device")
+    if plays and machines["processes"] > 1:
+        raise click.UsageError(f"--processes {machines['processes']}: {method} is trained by one process on one device")
     job, options, description = prepare_training(method, size, model, train, play, choice, manifests)
     _console.print(description, highlight=False)
     with progress_bars(unit="steps") as show:

@@ -29,12 +29,7 @@ from icrl4aht_baselines.report.results import (
 )
 from icrl4aht_baselines.report.scores import PAPER_METHODS, cell_scores
 from icrl4aht_baselines.training.options import FILTERS, HistoryOptions
-from icrl4aht_baselines.training.seen import (
-    TASKS_SOURCE,
-    TRAINED_ON,
-    describe_training,
-    overlap_legend,
-)
+from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,7 @@ from icrl4aht_baselines.report.results import (
 )
 from icrl4aht_baselines.report.scores import AVERAGE, PAPER_METHODS, cell_headroom, normalise, open_cells
 from icrl4aht_baselines.report.statistics import mean_interval
-from icrl4aht_baselines.training.seen import (
-    OVERLAPS,
-    overlap_marks,
-)
+from icrl4aht_baselines.training.seen import OVERLAPS, overlap_marks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES
 from icrl4aht_data.errors import IndexFormatError, OptionError
@@ -80,10 +77,10 @@ class StoredResults:
 def agent_cells(table: pd.DataFrame) -> AgentCells:
     """Return one agent's results under one protocol, cells in order."""
     found: AgentCells = defaultdict(dict)
-    for (*cell, block), rows in table.groupby([*CELL_COLUMNS, "block"], sort=False):
-        tasks = rows["task"].nunique()
-        found[ResultCell(*map(str, cell))][str(block)] = rows["return"].to_numpy().reshape(tasks, -1)
-        found[ResultCell(*map(str, cell))]["overlaps"] = tuple(rows["overlap"].iloc[0].split())
+    for (*key, block), rows in table.groupby([*CELL_COLUMNS, "block"], sort=False):
+        blocks = found[ResultCell(*map(str, key))]
+        blocks[str(block)] = rows["return"].to_numpy().reshape(rows["task"].nunique(), -1)
+        blocks["overlaps"] = tuple(rows["overlap"].iloc[0].split())
     for blocks in found.values():
         blocks["gain"] = blocks["last"] - blocks["first"]
     return {cell: found[cell] for cell in sorted(found, key=lambda cell: cell.order)}
@@ -278,12 +275,10 @@ def cells_table(results: Mapping[str, AgentCells], protocol: str, track: str, ag
     chosen = [cell for cell in open_cells(protocol) if cell.layout in TRACKS[track]["test"]]
     agents = [agent for agent in agents if any(cell in results.get(agent, {}) for cell in chosen)]
     body = []
-    for cell in chosen:
-        egos = cell_headroom(protocol)[cell]
+    for cell, (layout, family, *own) in zip(chosen, _cell_rows(chosen, results, agents), strict=True):
+        stay, random, oracle = (f"{cell_headroom(protocol)[cell][name]:z.1f}" for name in ("stay", "random", "oracle"))
         published = [f"{published_cells(name)[cell.layout][cell.family][0]:z.1f}" for name in PAPER_METHODS]
-        own = [_cell_text(results[agent], cell) for agent in agents]
-        body.append([*cell[:2], *(f"{egos[name]:z.1f}" for name in ("stay", "random")), *published, *own])
-        body[-1].append(f"{egos['oracle']:z.1f}")
+        body.append([layout, family, stay, random, *published, *own, oracle])
     paper = [f"{name} (paper)" for name in PAPER_METHODS]
     header = ["layout", "family", "stay", "random", *paper, *(f"`{agent}`" for agent in agents), "oracle"]
     return markdown_table(header, body, right=len(header) - 2)
@@ -298,27 +293,20 @@ def validation_table(results: Mapping[str, AgentCells], agents: Sequence[str], k
         kind: "validation" for teammates of the published training ranges, or "diverse".
     """
     found = {cell for agent in agents for cell in results.get(agent, {}) if cell.kind == kind}
-    body = [
-        [*cell[:2], *(_cell_text(results.get(agent, {}), cell) for agent in agents)]
-        for cell in sorted(found, key=lambda cell: cell.order)
-    ]
+    body = _cell_rows(sorted(found, key=lambda cell: cell.order), results, agents)
     return markdown_table(["layout", "family", *(f"`{agent}`" for agent in agents)], body, right=len(agents))
 
 
 def gains_table(results: Mapping[str, AgentCells], protocol: str, agents: Sequence[str]) -> str:
     """Return a table of the first and the last episodes of each cell with headroom, and the interval of the gain."""
-    body = []
-    for cell in open_cells(protocol):
-        texts = []
-        for found in (results.get(agent, {}).get(cell) for agent in agents):
-            if found is None:
-                texts.append("")
-                continue
-            gain, low, high = mean_interval(found["gain"])
-            ends = f"{found['first'].mean():z.1f} to {found['last'].mean():z.1f}"
-            text = f"{ends}, {gain:+.1f} ({low:+.1f}, {high:+.1f}){_marks(found)}"
-            texts.append(f"**{text}**" if low > 0 else text)
-        body.append([*cell[:2], *texts])
+
+    def text(found: Mapping[str, Any]) -> str:
+        gain, low, high = mean_interval(found["gain"])
+        ends = f"{found['first'].mean():z.1f} to {found['last'].mean():z.1f}"
+        shown = f"{ends}, {gain:+.1f} ({low:+.1f}, {high:+.1f}){_marks(found)}"
+        return f"**{shown}**" if low > 0 else shown
+
+    body = _cell_rows(open_cells(protocol), results, agents, text)
     return markdown_table(["layout", "family", *(f"`{agent}`" for agent in agents)], body)
 
 
@@ -394,8 +382,19 @@ def _with_interval(*cells: np.ndarray, digits: int = 1, sign: str = "") -> str:
     return f"{mean} ({low} to {high})"
 
 
-def _cell_text(cells: AgentCells, cell: ResultCell) -> str:
-    return f"{cells[cell]['mean'].mean():z.1f}{_marks(cells[cell])}" if cell in cells else ""
+def _mean_text(found: Mapping[str, Any]) -> str:
+    return f"{found['mean'].mean():z.1f}{_marks(found)}"
+
+
+def _cell_rows(
+    cells: Iterable[ResultCell],
+    results: Mapping[str, AgentCells],
+    agents: Sequence[str],
+    text: Callable[[Mapping[str, Any]], str] = _mean_text,
+) -> list[list[str]]:
+    """Return rows with layout, family, and the text on each agent's results, empty if it has not played the cell."""
+    played = [results.get(agent, {}) for agent in agents]
+    return [[*cell[:2], *(text(own[cell]) if cell in own else "" for own in played)] for cell in cells]
 
 
 def _marks(*cells: Mapping[str, Any]) -> str:

@@ -13,12 +13,7 @@ import numpy as np
 
 from icrl4aht_baselines.plotting import smooth_returns
 from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, family_title
-from icrl4aht_baselines.report.scores import (
-    CellScore,
-    cell_headroom,
-    cell_scores,
-    paper_scores,
-)
+from icrl4aht_baselines.report.scores import CellScore, cell_headroom, cell_scores, paper_scores
 from icrl4aht_baselines.report.statistics import mean_interval
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom
 from icrl4aht_data.plotting import return_limits

@@ -38,12 +38,7 @@ from icrl4aht_baselines.report.results import (
     read_published,
     split_cells,
 )
-from icrl4aht_baselines.report.scores import (
-    describe_conditions,
-    find_headlines,
-    returns_tables,
-    rows,
-)
+from icrl4aht_baselines.report.scores import describe_conditions, find_headlines, returns_tables, rows
 from icrl4aht_baselines.training.seen import describe_training, overlap_legend, overlap_marks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import MOST_PANELS, check_can_draw
@@ -145,15 +140,6 @@ class _Chart(NamedTuple):
     caption: str
 
 
-class _TextTable(NamedTuple):
-    """A table of texts, whose rows begin with a header."""
-
-    title: str
-    caption: str
-    columns: list[str]
-    rows: list[list[str]]
-
-
 def write_page(
     runs: Sequence[EvaluationRun], path: Path, episodes: Sequence[EpisodePair] = (), notes: Sequence[str] = ()
 ) -> Path:
@@ -223,9 +209,8 @@ def _environment() -> Environment:
     except ImportError as error:
         raise OptionError(f"a page of results needs jinja2: {install_command('baselines')}") from error
     loader = PackageLoader("icrl4aht_baselines.report")
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    blocks: Any = {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, **blocks)
     environment.filters |= {
         "number": lambda value, digits=1: f"{value:z.{digits}f}",
         "signed": lambda value, digits=1: f"{value:+z.{digits}f}",
@@ -281,13 +266,11 @@ def _page_values(
 
 def _episodes_by_family(episodes: Sequence[EpisodePair]) -> dict[str, list[EpisodePair]]:
     """Return heading -> episodes: of each family, or of all without a heading if there is one pair of each family."""
-    by_family: dict[str, list[EpisodePair]] = {}
-    for pair in sorted(episodes, key=lambda pair: pair.cell.order[1:]):
-        name = "Learned teammates" if pair.cell.group == "rl" else pair.cell.group
-        by_family.setdefault(name, []).append(pair)
-    if all(len(pairs) == 1 for pairs in by_family.values()):
-        return {"": [pair for (pair,) in by_family.values()]} if by_family else {}
-    return by_family
+    ordered = sorted(episodes, key=lambda pair: pair.cell.order[1:])
+    names = ["Learned teammates" if pair.cell.group == "rl" else pair.cell.group for pair in ordered]
+    if len(set(names)) == len(names):
+        return {"": ordered} if ordered else {}
+    return {name: [pair for pair, own in zip(ordered, names, strict=True) if own == name] for name in names}
 
 
 def _bar_charts(protocol: str, runs: NumberedRuns) -> list[_Chart]:
@@ -347,13 +330,16 @@ def _caption(runs: Iterable[EvaluationRun], cells: Container[ResultCell] | None,
     return " ".join(filter(None, [describe_conditions(runs, cells), *sentences, overlap]))
 
 
-def _settings_table(runs: Sequence[EvaluationRun]) -> _TextTable:
-    """Return a table with a column for each source of results."""
+def _settings_table(runs: Sequence[EvaluationRun]) -> dict[str, Any]:
+    """Return a table of text with a column for each source of results."""
     sources = [(run, source) for run in runs for source in run.sources]
     found = [_source_settings(source) for _, source in sources]
     names = [name for name in found[0] if any(of_source[name] for of_source in found)]
-    body = [[name, *(of_source[name] for of_source in found)] for name in names]
-    return _TextTable("Evaluation and training", "", ["setting", *(run.label for run, _ in sources)], body)
+    return {
+        "title": "Evaluation and training",
+        "columns": ["setting", *(run.label for run, _ in sources)],
+        "rows": [[name, *(of_source[name] for of_source in found)] for name in names],
+    }
 
 
 def _source_settings(source: ResultSource) -> dict[str, str]:

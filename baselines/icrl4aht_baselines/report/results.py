@@ -7,17 +7,17 @@ A table of results is a data frame with a row for each task, seed and block of e
     block                                   mean: all episodes; first, last: up to 20 at each end; opening: episode 1
     return                                  mean return of the team in an episode of the block
     overlap                                 overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
-    stay, oracle                            mean returns of these egos in the cell; NaN where they were not measured
 
 Tasks of different kinds never share a cell, since the paper's numbers and the headroom are of published test tasks.
 """
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, bundled_tasks
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 from icrl4aht_baselines.evaluate.results import Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import OVERLAPS, TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, TRACKS, family_order, layout_order, track_of
-from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_headroom
+from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
@@ -204,15 +204,9 @@ class EvaluationRun:
 
 
 def results_table(rows: Sequence[tuple[Any, ...]]) -> pd.DataFrame:
-    """Return rows of `cell_rows` as a table, with the returns of `stay` and `oracle`."""
+    """Return rows of `cell_rows` as a table."""
     names = [*AGENT_COLUMNS, *CELL_COLUMNS, "task", "seed", "block", "return", "overlap"]
-    egos = [
-        (protocol, layout, family, "test", returns["stay"], returns["oracle"])
-        for protocol in PROTOCOLS
-        for (layout, family), returns in read_headroom(protocol).items()
-    ]
-    references = pd.DataFrame(egos, columns=["protocol", *CELL_COLUMNS, "stay", "oracle"])
-    return pd.DataFrame(rows, columns=names).merge(references, how="left", on=["protocol", *CELL_COLUMNS])
+    return pd.DataFrame(rows, columns=names)
 
 
 def cell_rows(
@@ -317,9 +311,9 @@ def as_run(
     settings = results[0].settings
     if any(result.settings != settings for result in results):
         raise OptionError(f"{where}: results of different settings in one run")
-    known = published_test_tasks() | {task.task_id: task for task in tasks}
+    known = bundled_by_id("test") | {task.task_id: task for task in tasks}
     if any(result.task_id not in known for result in results):
-        known = shipped_validation_tasks() | _bundled_by_id("diverse") | known
+        known = bundled_by_id("validation") | bundled_by_id("diverse") | known
     played: dict[ResultCell, list[tuple[Task, list[list[float]]]]] = defaultdict(list)
     for result in results:
         if result.task_id not in known:
@@ -333,11 +327,8 @@ def as_run(
     agent, protocol = settings["agent"], settings["protocol"]["name"]
     sources = []
     for track, of_track in seen.items():
-        own = {
-            cell: tuple(task for task, _ in found)
-            for cell, found in played.items()
-            if track in ("", track_of(cell.layout))
-        }
+        own = {cell: tuple(task for task, _ in found) for cell, found in played.items()}
+        own = {cell: played_tasks for cell, played_tasks in own.items() if track in ("", track_of(cell.layout))}
         sources += [ResultSource(where, settings, trained, own, of_track)] if own else []
     variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
     run = EvaluationRun(agent, protocol, pd.DataFrame(), {}, variant, sources=tuple(sources))
@@ -376,17 +367,17 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
     """
     merged: list[EvaluationRun] = []
     for run in runs:
-        same = [number for number, other in enumerate(merged) if other.name == run.name]
+        same = [other for other in merged if other.name == run.name]
         fitting = [
-            k for k in same if _rules(merged[k]) == _rules(run) and not merged[k].cells.keys() & run.cells.keys()
+            other for other in same if _rules(other) == _rules(run) and not other.cells.keys() & run.cells.keys()
         ]
         if not fitting:
             merged.append(replace(run, note=run.sources[0].folder) if same else run)
             continue
-        other = merged[fitting[0]]
+        other = fitting[0]
         cells = dict(sorted((other.cells | run.cells).items(), key=lambda found: found[0].order))
         table, sources = pd.concat([other.table, run.table], ignore_index=True), other.sources + run.sources
-        merged[fitting[0]] = replace(other, table=table, cells=cells, sources=sources)
+        merged[merged.index(other)] = replace(other, table=table, cells=cells, sources=sources)
     return merged
 
 
@@ -397,37 +388,23 @@ def _rules(run: EvaluationRun) -> tuple[Any, ...]:
     return source.settings["protocol"], source.settings["seeds"], playing
 
 
-def published_test_tasks() -> dict[str, Task]:
-    """Return the 160 published test tasks by id."""
-    return _bundled_by_id("test")
-
-
-def shipped_validation_tasks() -> dict[str, Task]:
-    """Return the package's validation tasks with teammates of the published training ranges, by id."""
-    return _bundled_by_id("validation")
-
-
 @cache
-def _bundled_by_id(split: str) -> dict[str, Task]:
+def bundled_by_id(split: str) -> dict[str, Task]:
+    """Return the package's tasks of a split of both tracks by id; "test" has the 160 published ones."""
     return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
-
-
-@cache
-def _instances() -> Counter[tuple[str, str]]:
-    return Counter((task.layout.name, task.teammate_family) for task in published_test_tasks().values())
 
 
 def published_instances(cell: ResultCell) -> int:
     """Return the number of published test tasks of a cell; 0 for cells of other kinds."""
-    return _instances()[cell.layout, cell.family] if cell.kind == "test" else 0
+    return sum(cell_of(task) == cell for task in bundled_by_id("test").values())
 
 
 def cell_of(task: Task) -> ResultCell:
     """Return the cell of a task."""
     kind = _KIND_OF_SPLIT[task.split]
-    if task.task_id in published_test_tasks():
+    if task.task_id in bundled_by_id("test"):
         kind = "test"
-    elif task.task_id in _bundled_by_id("diverse"):
+    elif task.task_id in bundled_by_id("diverse"):
         kind = "diverse"
     return ResultCell(task.layout.name, task.teammate_family, kind)
 
@@ -448,17 +425,14 @@ def split_cells(cells: Iterable[ResultCell], most: int) -> list[list[ResultCell]
 
     A list has one kind of tasks, and all cells of a layout unless these are more than `most`.
     """
-    by_layout: dict[tuple[int, str], list[ResultCell]] = {}
-    for cell in sorted(cells, key=lambda cell: cell.order):
-        by_layout.setdefault((list(TASK_KINDS).index(cell.kind), cell.layout), []).append(cell)
     split: list[list[ResultCell]] = []
-    for _, of_layout in sorted(by_layout.items(), key=lambda found: found[0][0]):
-        for start in range(0, len(of_layout), most):
-            part = of_layout[start : start + most]
-            if split and split[-1][0].kind == part[0].kind and len(split[-1]) + len(part) <= most:
-                split[-1] += part
-            else:
-                split.append(part)
+    ordered = sorted(cells, key=lambda cell: (cell.order[-1], cell.order))
+    for (kind, _), group in groupby(ordered, key=lambda cell: (cell.kind, cell.layout)):
+        of_layout = list(group)
+        if split and split[-1][0].kind == kind and len(split[-1]) + len(of_layout) <= most:
+            split[-1] += of_layout
+        else:
+            split += [of_layout[start : start + most] for start in range(0, len(of_layout), most)]
     return split
 
 

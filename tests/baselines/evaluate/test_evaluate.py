@@ -306,8 +306,8 @@ def test_validation_tasks_are_reported_separately(tmp_path, monkeypatch):
     write_tasks(path("layout", "validation"), [])
     write_tasks(path("layout", "test"), [])
     monkeypatch.setattr("icrl4aht_baselines.evaluate.protocols.manifest_path", path)
-    for name in ("_bundled_by_id", "_instances"):  # entries cached from other manifests would leak into later tests
-        monkeypatch.setattr(results_of_runs, name, getattr(results_of_runs, name).__wrapped__)
+    # Entries cached from other manifests would leak into later tests.
+    monkeypatch.setattr(results_of_runs, "bundled_by_id", results_of_runs.bundled_by_id.__wrapped__)
     monkeypatch.setattr(
         "icrl4aht_baselines.commands.train_commands.find_ego",
         lambda option, name, **mode: NamedEgo(name, AGENTS[name]),
