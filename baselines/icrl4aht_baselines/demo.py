@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
 from icrl4aht_baselines.plotting import plot_family_curves
 from icrl4aht_baselines.report.page import check_can_render, write_page_with_episodes
-from icrl4aht_baselines.report.results import bundled_by_id, note_results, read_run
+from icrl4aht_baselines.report.results import EvaluationRun, bundled_by_id, note_results, read_run
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
@@ -47,7 +48,6 @@ _MODEL = ModelOptions(**SIZES["tiny"].model)
 # 4,000 steps at a rate of 3e-3 without dropout fit as many histories better, and held-out ones much worse.
 _TRAINING = TrainOptions(3000, batch_size=16, context=SIZES["tiny"].context, validate_every=500, validation_batches=4)
 _PROTOCOL = get_protocol("seeded", 20)
-_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     curves, episode, picture, page = paths
 
     def say(number: int, text: str) -> None:
-        console.print(f"[bold]{number}/{_STEPS}[/bold] ({time.perf_counter() - started:.0f} s) {text}")
+        console.print(f"[bold]{number}/6[/bold] ({time.perf_counter() - started:.0f} s) {text}")
 
     def write(text: str) -> None:
         console.print(text, highlight=False, markup=False)
@@ -139,7 +139,12 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     write(dataset.dpt(batch_size=8, context=500)[0].describe())
 
     say(3, "verifying every byte and every step")
-    write(_verify(settings.root))
+    verified = verify_release(settings.root, level="deep")
+    if not verified.ok:
+        raise ReleaseError(f"{settings.root}: {verified.findings[0].file}: {verified.findings[0].problem}")
+    write(
+        f"no problem in {verified.files} files, {verified.chunks} chunks, {verified.transitions:,} transitions replayed"
+    )
 
     targets = f"{settings.labels} labels" if settings.labels else "the actions taken"
     model, training = settings.model, settings.training
@@ -153,10 +158,10 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
         tasks = tuple(task for task in bundled_by_id("validation").values() if task.layout.name == DEMO_LAYOUT)
     others = [*AGENTS, *([settings.reference] if settings.reference else [])]
     say(5, f"evaluating it and {', '.join(others)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
-    returns = {name: _evaluate(name, out, tasks, settings) for name in (*others, str(out / "ad"))}
-    runs = [read_run(folder) for folder, _ in returns.values()]
-    agent, by_agent = runs[-1].agent, {run.agent: of for run, (_, of) in zip(runs, returns.values(), strict=True)}
-    families = _by_family(tasks, by_agent)
+    played = [_evaluate(name, out, tasks, settings) for name in (*others, str(out / "ad"))]
+    runs, agent = [run for run, _ in played], played[-1][0].agent
+    names = sorted(played[0][1], key=family_order)
+    families = {family: {run.agent: returns[family] for run, returns in played} for family in names}
     leads = {family: find_lead(found, agent) for family, found in families.items()}
     write(_lead_table(families, leads, agent))
 
@@ -171,14 +176,6 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     return page
 
 
-def _verify(root: Path) -> str:
-    """Return text on what was verified."""
-    report = verify_release(root, level="deep")
-    if not report.ok:
-        raise ReleaseError(f"{root}: {report.findings[0].file}: {report.findings[0].problem}")
-    return f"no problem in {report.files} files, {report.chunks} chunks, {report.transitions:,} transitions replayed"
-
-
 def _train_demo(folder: Path, settings: DemoSettings) -> None:
     histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=settings.sources, labels=settings.labels)
     job = prepare("ad", settings.model, settings.training, histories)
@@ -190,22 +187,19 @@ def _train_demo(folder: Path, settings: DemoSettings) -> None:
         train(job.method, job.data, job.options, folder, job.about, done=done)
 
 
-def _evaluate(name: str, out: Path, tasks: Sequence[Task], settings: DemoSettings) -> tuple[Path, list[np.ndarray]]:
-    """Evaluate an agent. Return the folder of its results, and its returns in each task, (seeds, episodes)."""
+def _evaluate(
+    name: str, out: Path, tasks: Sequence[Task], settings: DemoSettings
+) -> tuple[EvaluationRun, dict[str, np.ndarray]]:
+    """Evaluate an agent. Return its results, and its returns (U, E) with each family, see `FamilyReturns`."""
     agent = find_agent(name)
     folder = out / "results" / agent.name
     rules: Any = {"seeds": settings.seeds, "out": folder, "details": agent.details}
     results = evaluate(agent.name, agent.make, tasks, settings.protocol, **rules)
     note_results(folder, agent.run, tasks)
-    return folder, [np.array(result.returns) for result in results]
-
-
-def _by_family(tasks: Sequence[Task], returns: Mapping[str, Sequence[np.ndarray]]) -> FamilyReturns:
-    found: FamilyReturns = {}
-    for family in sorted({task.teammate_family for task in tasks}, key=family_order):
-        chosen = [number for number, task in enumerate(tasks) if task.teammate_family == family]
-        found[family] = {agent: np.concatenate([of[number] for number in chosen]) for agent, of in returns.items()}
-    return found
+    returns: dict[str, list[Any]] = defaultdict(list)
+    for task, result in zip(tasks, results, strict=True):
+        returns[task.teammate_family] += result.returns
+    return read_run(folder), {family: np.array(found) for family, found in returns.items()}
 
 
 def _signed(found: MeanInterval) -> str:

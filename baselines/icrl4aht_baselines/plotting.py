@@ -33,24 +33,37 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     labels = list(dict.fromkeys(label for curves in panels.values() for label in curves))
     of_returns = [curve for name, curves in panels.items() if name.startswith(_RETURN) for curve in curves.values()]
     limits = return_limits(float(np.mean(values)) for curve in of_returns for values in curve.values())
-    columns = min(4 if len(panels) > 9 else 3, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = new_figure(4.2 * columns, 2.6 * rows + 0.4)
-    grid: list[Any] = [*figure.subplots(rows, columns, squeeze=False).flat]
+    figure, grid = _panel_grid(
+        [name if name.startswith(_RETURN) else name.replace("_", " ") for name in panels],
+        min(4 if len(panels) > 9 else 3, len(panels)),
+        (4.2, 2.6),
+        "training step",
+    )
     for axes, (name, curves) in zip(grid, panels.items(), strict=False):
         for label, points in curves.items():
             _plot_log_curve(axes, label, f"C{labels.index(label)}", points)
         if name.startswith(_RETURN):
             axes.set_ylim(*limits)
-        axes.set_title(name if name.startswith(_RETURN) else name.replace("_", " "), fontsize=9)
-        axes.grid(alpha=0.3)
-    for axes in grid[len(panels) :]:
-        axes.set_axis_off()
-    for axes in grid[max(0, len(panels) - columns) : len(panels)]:
-        axes.set_xlabel("training step", fontsize=8)
     figure.suptitle(title, fontsize=10)
     legend_below(figure)
     save_figure(figure, path)
+
+
+def _panel_grid(
+    titles: Sequence[str], columns: int, size: tuple[float, float], x_label: str, **sharing: bool
+) -> tuple[Any, list[Any]]:
+    """Return a figure and its axes: a panel of this size in inches for each title, and hidden ones in the last row."""
+    rows = -(-len(titles) // columns)
+    figure = new_figure(size[0] * columns + 0.3, size[1] * rows + 0.6)
+    grid: list[Any] = [*figure.subplots(rows, columns, squeeze=False, **sharing).flat]
+    for axes, title in zip(grid, titles, strict=False):
+        axes.set_title(title, fontsize=9)
+        axes.grid(alpha=0.3)
+    for axes in grid[len(titles) :]:
+        axes.set_axis_off()
+    for axes in grid[max(0, len(titles) - columns) : len(titles)]:
+        axes.set_xlabel(x_label, fontsize=8)
+    return figure, grid
 
 
 def _log_curves(lines: Sequence[Mapping[str, Any]], by_layout: bool) -> LogCurves:
@@ -114,9 +127,7 @@ def plot_return_curves(
         references: title -> reference ego, stay, random or oracle -> its mean return, drawn as a level line.
     """
     columns = min(4, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = new_figure(2.7 * columns + 0.5, 1.9 * rows + 0.7)
-    grid: list[Any] = [*figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat]
+    figure, grid = _panel_grid([*panels], columns, (2.7, 1.9), "episode", sharex=True, sharey=True)
     labels = list(dict.fromkeys(label for runs in panels.values() for label in runs))
     limits = []
     for axes, (title, runs) in zip(grid, panels.items(), strict=False):
@@ -126,13 +137,7 @@ def plot_return_curves(
             colour, dashes = _REFERENCE_LINES[name]
             axes.axhline(level, color=colour, linestyle=dashes, linewidth=1.1, label=name)
             limits.append(level)
-        axes.set_title(title, fontsize=9)
-        axes.grid(alpha=0.3)
-    for axes in grid[len(panels) :]:
-        axes.set_axis_off()
     grid[0].set_ylim(*return_limits(limits))
-    for axes in grid[-columns:]:
-        axes.set_xlabel("episode", fontsize=9)
     for axes in grid[::columns]:
         axes.set_ylabel("return", fontsize=9)
     legend_below(figure)

@@ -45,7 +45,7 @@ from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES
 from icrl4aht_baselines.training.trainer import format_loss, train
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
-from icrl4aht_data.dataset import Dataset, load_icrl4aht
+from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.progress import counted
@@ -185,20 +185,16 @@ def make_reference(
     if teacher is not None:
         check_taught(name)
     steps, recipe = _Steps(out, track, show, teacher), RECIPES[name]
-    if finished is not None:
-        run = finished
-    elif not recipe.data:
+    run = finished or out / f"{name}-{track}"
+    if finished is None and not recipe.data:
         run = steps.play()
-    else:
-        histories = steps.teacher_histories(recipe.data)
-        run = out / f"{name}-{track}"
-        if not recipe.own_round:
-            steps.train(recipe, histories, run)
-        else:
+    elif finished is None:
+        histories, first = steps.teacher_histories(recipe.data), None
+        if recipe.own_round:
             first = run.with_name(f"{run.name}-first")
             steps.train(recipe, histories, first)
-            mixed = steps.add_own_histories(histories, first, run)
-            steps.train(recipe, mixed, run, before=first)
+            histories = steps.add_own_histories(histories, first, run)
+        steps.train(recipe, histories, run, before=first)
     return ReferenceOutcome(name, track, run, steps.evaluate(name, run, recipe) if evaluates else {})
 
 
@@ -233,9 +229,14 @@ class _Steps:
                 raise OptionError(f"{folder}: `python {' '.join(command)}` failed; its messages are above")
         return folder / "lite"
 
-    def noise_histories(self) -> Dataset:
-        """Return the noise histories on the track's layouts."""
-        return load_icrl4aht(self.noise_release(), layout=list(TRACKS[self.track]["train"]))
+    def teammates(self, number: int = 0) -> Any:
+        """Return the teammates of the noise histories on the track's layouts, and diverse ones, see `collect_release`.
+
+        Args:
+            number: number of the collection, in the tasks' seeds.
+        """
+        noise = load_icrl4aht(self.noise_release(), layout=list(TRACKS[self.track]["train"]))
+        return release_teammates(noise, number, self.diverse_tasks())
 
     def diverse_tasks(self) -> list[Task]:
         """Return the training tasks with diverse teammates."""
@@ -259,7 +260,7 @@ class _Steps:
         folder = self.out / f"{kind}-{self.track}"
         if not folder.is_dir():
             agent = find_agent(self.teacher or self.play(), greedy=False)
-            teammates = release_teammates(self.noise_histories(), tasks=self.diverse_tasks())
+            teammates = self.teammates()
             with self.timed(folder.name):
                 collect_release(agent, teammates, RL2_HISTORIES[kind], folder, progress=self.show)
         return folder
@@ -267,13 +268,13 @@ class _Steps:
     def train(self, recipe: Recipe, root: Path, folder: Path, before: Path | None = None) -> None:
         """Train a model on a release, after a first training from `before` at a lower learning rate."""
         options = TrainOptions(**recipe.train)
-        if before is not None:
+        if before:
             options = replace(options, learning_rate=OWN_SHARE * options.learning_rate)
         views = {**recipe.histories, **TRACK_VIEWS[self.track]}
         histories = HistoryOptions(TRACKS[self.track]["train"], str(root), channels="canonical", **views)
         with self.timed(folder.name, was_done=_is_trained(folder, options)):
             job = prepare(recipe.method, ModelOptions(**recipe.model), options, histories)
-            params = None if before is None else start_from(before, job.method, job.about)
+            params = start_from(before, job.method, job.about) if before else None
             done = self._progress(folder.name, options.steps)
             train(job.method, job.data, job.options, folder, job.about, params=params, done=done)
 
@@ -283,8 +284,7 @@ class _Steps:
         if not mixed.is_dir():
             if not own.is_dir():
                 labeller = find_agent(self.teacher or self.play())
-                teammates = release_teammates(self.noise_histories(), 1, self.diverse_tasks())
-                agent = find_agent(first, greedy=False)
+                teammates, agent = self.teammates(number=1), find_agent(first, greedy=False)
                 with self.timed(own.name):
                     collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
             combine_releases(mixed, [histories, own])

@@ -11,17 +11,8 @@ import click
 from icrl4aht_generation.teammates.instances import INSTANCES, published_task
 from rich.console import Console
 
-from icrl4aht_baselines.commands.options import (
-    EGO_NAME,
-    PROTOCOL_NAME,
-    add_options,
-    default_batch_size,
-    experiment_options,
-    find_ego,
-    greedy_option,
-    protocol_option,
-    variant_names,
-)
+from icrl4aht_baselines.commands import options as shared
+from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, examples
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -48,14 +39,14 @@ def _experiment_command(name: str, text: str, *own: Callable[[Any], Any], usage:
         from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
 
         experiment, size = f"{name} {what}".strip(), size or "small"
-        sizes: Any = {"size": size, "batch_size": default_batch_size(size), "train": train}
+        sizes: Any = {"size": size, "batch_size": shared.default_batch_size(size), "train": train}
         chosen = ExperimentPlan(root=root and str(root), **sizes, **histories, **plan)
         with progress_bars() as show:
             found = run_experiment(experiment, chosen, out or Path("runs") / experiment.replace(" ", "-"), show)
         for line in [*found.notes, *(f"wrote {path}" for path in found.report)]:
             click.echo(line)
 
-    command = add_options(run, [*own, experiment_options(f"runs/{name}" + "-WHAT" * bool(usage))])
+    command = shared.add_options(run, [*own, shared.experiment_options(f"runs/{name}" + "-WHAT" * bool(usage))])
     return click.command(name, help=text, epilog=examples(*usage) if usage else None)(command)
 
 
@@ -65,7 +56,7 @@ sweep_command = _experiment_command(
 
     WHAT is context (K of 250 to 10,000) or size (small, medium, large). Writes runs, results and OUT/report.
     """,
-    click.argument("what", type=variant_names("sweep")),
+    click.argument("what", type=shared.variant_names("sweep")),
     usage=(
         "icrl4aht-data research sweep size --layout demo_wide",
         "icrl4aht-data research sweep context --only K250 --steps 20 --layout demo_wide --tasks 1 --episodes 5",
@@ -77,7 +68,7 @@ ablate_command = _experiment_command(
 
     WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both. Writes runs, results and OUT/report.
     """,
-    click.argument("what", type=variant_names("ablate")),
+    click.argument("what", type=shared.variant_names("ablate")),
     usage=("icrl4aht-data research ablate ta --layout demo_wide",),
 )
 tracks_command = _experiment_command(
@@ -126,9 +117,9 @@ def control_command(out: Path) -> None:
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/headroom", help="Write the results here.")
 @click.option(
     "--protocol",
-    type=PROTOCOL_NAME,
+    type=shared.PROTOCOL_NAME,
     multiple=True,
-    default=lambda: tuple(PROTOCOL_NAME.valid()),
+    default=lambda: tuple(shared.PROTOCOL_NAME.valid()),
     show_default="all",
     help="published or seeded; repeat for several.",
 )
@@ -155,7 +146,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
 @click.option(
     "--family", type=Names("family", HEURISTIC_KINDS.values), default="H4", help="Teammates: H1, H2, H3 or H4."
 )
-@protocol_option
+@shared.protocol_option
 @click.option("--episodes", type=COUNT, help="Episodes to play.", show_default="as many as fill the window three times")
 def drift_command(run: Path, layout: str | None, family: str, protocol: str, episodes: int | None) -> None:
     """Measure the difference between cached and exact acting.
@@ -195,11 +186,11 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 @click.option(
     "--agent",
     "agents",
-    type=EGO_NAME,
+    type=shared.EGO_NAME,
     multiple=True,
     help="A bundled model such as ad-reference, or a folder that `train` made; stay and oracle always play. Repeat.",
 )
-@greedy_option
+@shared.greedy_option
 @click.option(
     "--layout",
     "layouts",
@@ -222,14 +213,7 @@ def unseen_command(
     """
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks
     from icrl4aht_baselines.online.unseen import unseen_returns
-    from icrl4aht_baselines.report.comparison import (
-        StoredResults,
-        add_unseen,
-        read_stored,
-        results_file,
-        unseen_table,
-        write_stored,
-    )
+    from icrl4aht_baselines.report import comparison
     from icrl4aht_baselines.report.results import ENDS
 
     if store and episodes < 2 * ENDS:
@@ -255,6 +239,8 @@ def unseen_command(
             show("unseen layouts", done, total, what)
 
         found = unseen_returns({ego.name: ego.make for ego in egos}, tasks, versions, episodes, played)
-    click.echo(unseen_table(add_unseen(StoredResults(), found)))
+    click.echo(comparison.unseen_table(comparison.add_unseen(comparison.StoredResults(), found)))
     if store:
-        write_stored(results_file(), add_unseen(read_stored(results_file()), found))
+        comparison.write_stored(
+            comparison.results_file(), comparison.add_unseen(comparison.read_stored(comparison.results_file()), found)
+        )

@@ -9,17 +9,8 @@ from typing import Any
 import click
 from rich.console import Console
 
-from icrl4aht_baselines.commands.options import (
-    EGO_NAME,
-    HISTORIES_NAME,
-    REFERENCE_NAME,
-    check_alone,
-    find_ego,
-    greedy_option,
-    history_filters,
-    manifests_option,
-    root_option,
-)
+from icrl4aht_baselines.commands import options as shared
+from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue
@@ -43,14 +34,14 @@ _console = Console(soft_wrap=True)
 )
 @click.option(
     "--agent",
-    type=EGO_NAME,
+    type=shared.EGO_NAME,
     required=True,
     help="A folder that `train` made, a bundled model such as ad-reference, or a reference ego.",
 )
-@greedy_option
-@root_option
+@shared.greedy_option
+@shared.root_option
 @click.option("--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several.")
-@history_filters
+@shared.history_filters
 @click.option("--histories", type=COUNT, default=8, help="Histories with each teammate.")
 @click.option("--episodes", type=click.IntRange(min=10), default=60, help="Episodes of each history, of 100 steps.")
 @click.option(
@@ -63,16 +54,16 @@ _console = Console(soft_wrap=True)
 )
 @click.option(
     "--like",
-    type=HISTORIES_NAME,
+    type=shared.HISTORIES_NAME,
     help="As many and as long histories as the reference models learn from, with their noise: student, or rising, "
     "which begin at random. Not with --histories, --episodes and --noise.",
 )
 @click.option(
     "--labeller",
-    type=EGO_NAME,
+    type=shared.EGO_NAME,
     help="Another agent, such as rl2-reference, whose most probable actions become the expert actions.",
 )
-@manifests_option
+@shared.manifests_option
 @click.option("--number", type=COUNT_OR_NONE, default=0, help="Number of this collection, in the tasks' seeds.")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
 @overwrite_option
@@ -106,7 +97,7 @@ def collect_command(
     start, end = noise
     config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
     if like is not None:
-        check_alone("--like", "histories", "episodes", "noise")
+        shared.check_alone("--like", "histories", "episodes", "noise")
         config = RL2_HISTORIES[like]
     ego = find_ego("--agent", agent, greedy=greedy)
     other = find_ego("--labeller", labeller, greedy=True) if labeller else None
@@ -129,11 +120,18 @@ def collect_command(
     ),
 )
 @click.option(
-    "--name", "names", type=REFERENCE_NAME, multiple=True, required=True, help="Model, such as ad-student; repeat."
+    "--name",
+    "names",
+    type=shared.REFERENCE_NAME,
+    multiple=True,
+    required=True,
+    help="Model, such as ad-student; repeat.",
 )
 @click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of teammate or layout.")
 @click.option(
-    "--teacher", type=EGO_NAME, help="Learn from histories of this agent, such as rl2-reference, not of a new rl2."
+    "--teacher",
+    type=shared.EGO_NAME,
+    help="Learn from histories of this agent, such as rl2-reference, not of a new rl2.",
 )
 @click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
 @click.option(
@@ -220,22 +218,15 @@ def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, 
     Writes a page with tables and a figure from the package's stored results, to which those of RESULTS, folders that
     `evaluate` made, are added.
     """
-    from icrl4aht_baselines.report.comparison import (
-        RESULTS_FILES,
-        add_results,
-        read_stored,
-        results_file,
-        write_comparison,
-        write_stored,
-    )
+    from icrl4aht_baselines.report import comparison
 
-    check_output(out, overwrite, RESULTS_FILES)
-    stored = read_stored(results_file())
+    check_output(out, overwrite, comparison.RESULTS_FILES)
+    stored = comparison.read_stored(comparison.results_file())
     for folder in runs:
-        stored = add_results(stored, folder, about)
+        stored = comparison.add_results(stored, folder, about)
     if store:
-        write_stored(results_file(), stored)
-    for path in write_comparison(stored, out):
+        comparison.write_stored(comparison.results_file(), stored)
+    for path in comparison.write_comparison(stored, out):
         _console.print(f"wrote {path}")
 
 

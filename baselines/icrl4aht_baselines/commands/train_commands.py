@@ -9,37 +9,8 @@ import click
 from icrl4aht_generation.teammates.instances import published_task
 from rich.console import Console
 
-from icrl4aht_baselines.commands.options import (
-    EGO_NAME,
-    METHOD_NAME,
-    TRAINING_LAYOUT,
-    acting_option,
-    check_alone,
-    episodes_option,
-    evaluation_split_option,
-    find_ego,
-    forget_option,
-    gifs_option,
-    greedy_option,
-    hide_recipe_option,
-    history_filters,
-    join_processes,
-    manifests_option,
-    model_options,
-    play_options,
-    prepare_training,
-    process_options,
-    protocol_option,
-    root_option,
-    save_minutes_option,
-    seed_option,
-    seeds_option,
-    size_option,
-    suite_option,
-    tasks_option,
-    tensorboard_option,
-    training_options,
-)
+from icrl4aht_baselines.commands import options as shared
+from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.training.options import HistoryOptions
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
@@ -67,18 +38,18 @@ _console = Console(soft_wrap=True)
 )
 @click.option(
     "--agent",
-    type=EGO_NAME,
+    type=shared.EGO_NAME,
     required=True,
     help="stay, random, oracle, a bundled model such as ad-reference, or a folder that `train` made.",
 )
-@acting_option
-@greedy_option
-@forget_option
-@protocol_option
+@shared.acting_option
+@shared.greedy_option
+@shared.forget_option
+@shared.protocol_option
 @click.option(
     "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
 )
-@evaluation_split_option
+@shared.evaluation_split_option
 @click.option("--layout", type=LAYOUT, multiple=True, help="Only tasks on this layout; repeat for several.")
 @click.option(
     "--manifest",
@@ -86,11 +57,11 @@ _console = Console(soft_wrap=True)
     metavar="FILE",
     help="Tasks of this file instead of the tracks' tasks; not with --split.",
 )
-@tasks_option
-@episodes_option
-@suite_option
-@seeds_option
-@seed_option
+@shared.tasks_option
+@shared.episodes_option
+@shared.suite_option
+@shared.seeds_option
+@shared.seed_option
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the results here.")
 def evaluate_command(
     agent: str,
@@ -134,7 +105,7 @@ def evaluate_command(
     for name in {task.layout.name for task in chosen}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
     if chosen_seeds:
-        check_alone("--seed", "seeds")
+        shared.check_alone("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
     evaluate(ego.name, ego.make, chosen, rules, seeds=seeds_of_tasks, suite=suite, out=out, details=ego.details)
     note_results(out, ego.run, chosen if manifest or split != "test" else ())
@@ -156,8 +127,8 @@ def evaluate_command(
     help="Also write one HTML page: the summary, curves, episodes, tables.",
 )
 @overwrite_option
-@gifs_option
-@suite_option
+@shared.gifs_option
+@shared.suite_option
 def report_command(
     runs: tuple[Path, ...], out: Path | None, html: Path | None, overwrite: bool, gifs: bool, suite: Path | None
 ) -> None:
@@ -168,27 +139,21 @@ def report_command(
     training. Writes them as Markdown, CSV and curves, with a card for each trained model. Results of one agent on
     different layouts are merged.
     """
+    from icrl4aht_baselines.report import page
     from icrl4aht_baselines.report.cards import card_name, write_model_cards
-    from icrl4aht_baselines.report.page import (
-        check_can_render,
-        markdown,
-        report_files,
-        write_page_with_episodes,
-        write_report,
-    )
     from icrl4aht_baselines.report.results import merge, read_run
 
     loaded, folder = merge([read_run(run) for run in runs]), out or runs[0] / "report"
-    check_output(folder, overwrite, [*report_files(loaded), *map(card_name, loaded)])
+    check_output(folder, overwrite, [*page.report_files(loaded), *map(card_name, loaded)])
     if html:
-        check_can_render()
+        page.check_can_render()
         check_output(html, overwrite)
-    paths = write_report(loaded, folder)
+    paths = page.write_report(loaded, folder)
     if html:
         with progress_bars() as show:
-            paths.append(write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
+            paths.append(page.write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
     paths += write_model_cards(loaded, paths[0].parent)
-    click.echo(markdown(loaded))
+    click.echo(page.markdown(loaded))
     for path in paths:
         click.echo(f"wrote {path}")
 
@@ -202,9 +167,12 @@ def report_command(
     "--teammate", metavar="FAMILY/tN", default="H4/t0", help="A published teammate: its family, H1 to H4, and number."
 )
 @click.option(
-    "--ego", type=EGO_NAME, default="random", help="stay, random, oracle, a model such as ad-reference, or a run."
+    "--ego",
+    type=shared.EGO_NAME,
+    default="random",
+    help="stay, random, oracle, a model such as ad-reference, or a run.",
 )
-@protocol_option
+@shared.protocol_option
 @click.option("--seed", type=SEED, default=0, help="Seed of the episode.")
 @click.option("--out", type=NewFile(".gif"), metavar="FILE", required=True, help="The GIF to write.")
 @overwrite_option
@@ -230,36 +198,36 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
         "icrl4aht-data train ad --layout all --out runs/ad-all",
     ),
 )
-@click.argument("method", type=METHOD_NAME)
+@click.argument("method", type=shared.METHOD_NAME)
 @topic(
     "Data",
     click.option(
         "--layout",
         "layouts",
-        type=TRAINING_LAYOUT,
+        type=shared.TRAINING_LAYOUT,
         multiple=True,
         required=True,
         help="Training layout, such as demo_wide; repeat for several, or all: those that the release has histories of.",
     ),
-    root_option,
-    history_filters,
+    shared.root_option,
+    shared.history_filters,
     dataclass_options(HistoryOptions, "histories"),
-    hide_recipe_option,
+    shared.hide_recipe_option,
 )
-@topic("Model", size_option, model_options)
+@topic("Model", shared.size_option, shared.model_options)
 @topic(
     "Training",
     click.option("--init", type=Folder(), metavar="RUN", help="Start from the parameters of this run."),
-    training_options,
+    shared.training_options,
 )
-@topic("Playing, of rl2 only", play_options, manifests_option)
+@topic("Playing, of rl2 only", shared.play_options, shared.manifests_option)
 @topic(
     "Run",
     click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD"),
-    save_minutes_option,
-    tensorboard_option,
+    shared.save_minutes_option,
+    shared.tensorboard_option,
 )
-@process_options
+@shared.process_options
 def train_command(
     method: str,
     layouts: tuple[str, ...],
@@ -284,7 +252,7 @@ def train_command(
     Writes settings, checkpoints, metrics.jsonl and, with the extra plot, curves.png into OUT; the same command resumes
     from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second Ctrl-C does not wait for it.
     """
-    join_processes(**machines)
+    shared.join_processes(**machines)
     from icrl4aht_baselines.methods.registry import PLAYING
     from icrl4aht_baselines.training.histories import start_from
     from icrl4aht_baselines.training.run_folder import RUN_CURVES
@@ -296,7 +264,7 @@ def train_command(
     folder, plays = out or Path("runs") / method, method in PLAYING
     if plays and machines["processes"] > 1:
         raise click.UsageError(f"--processes {machines['processes']}: {method} is trained by one process on one device")
-    job, options, description = prepare_training(method, size, model, train, play, choice, manifests)
+    job, options, description = shared.prepare_training(method, size, model, train, play, choice, manifests)
     _console.print(description, highlight=False)
     with progress_bars(unit="steps") as show:
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -152,7 +153,7 @@ def _labels_of(method: Method, wanted: Labels | None) -> Labels | None:
 
 
 def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
-    """Opens the release, with state records if there are any and nothing else is required.
+    """Open the release, with state records if there are any and nothing else is required.
 
     Channels are canonical if all layouts or layouts with different own channels are chosen, unless an option says else.
 
@@ -171,20 +172,14 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
             f"unequal number: leave out --channels or take canonical, or train on one of them, such as --layout "
             f"{found.layouts[0].name}"
         )
-    state = "state" if histories.obs is None and found.has_states else None
-    found = found.with_options(obs=state, channels=channels)
-    return found, _validation_part(release.with_options(obs=state, channels=channels), found, histories)
-
-
-def _validation_part(release: Dataset, chosen: Dataset, histories: HistoryOptions) -> Dataset | None:
-    """Return the histories of split validation on the chosen layouts that pass the filters, if there are any."""
-    if histories.split == VALIDATION:
-        return None
+    options: Any = {"obs": "state" if histories.obs is None and found.has_states else None, "channels": channels}
     filters: Any = {FILTERS[name]: list(values) for name, values in histories.filters.items()}
-    try:
-        return release.filter(split=VALIDATION, layout=[layout.name for layout in chosen.layouts], **filters)
-    except EmptySelectionError:
-        return None
+    validation = None
+    if histories.split != VALIDATION:
+        with suppress(EmptySelectionError):
+            validation = release.filter(split=VALIDATION, layout=[one.name for one in found.layouts], **filters)
+            validation = validation.with_options(**options)
+    return found.with_options(**options), validation
 
 
 def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -> Dataset:
@@ -252,10 +247,12 @@ def _sampler(
     """Return the sampler of a part of the histories; `draws` are further options of it."""
     lengths, every = dataset.column("T"), histories.every
     if options.context > lengths.min():
-        raise OptionError(
-            f"context = {options.context}: the shortest history of {dataset!r} has {lengths.min()} steps; take fewer"
-            + _longer_source(dataset, options.context)
-        )
+        text = f"context = {options.context}: the shortest history of {dataset!r} has {lengths.min()} steps; take fewer"
+        for name in dataset.counts("source"):
+            if lengths[dataset.column("source") == name].min() >= options.context:
+                text += f", or choose --source {name}, whose histories are longer"
+                break
+        raise OptionError(text)
     shared: Any = {
         "batch_size": options.batch_size,
         "seed": options.seed,
@@ -265,7 +262,13 @@ def _sampler(
         **draws,
     }
     if method.data == "ad":
-        _check_thinned(dataset, options.context, every)
+        fewest = int(dataset.column("episodes").min())
+        steps = fewest // every * dataset.info.environment.kept_steps
+        if every > 1 and options.context > steps:
+            raise OptionError(
+                f"context = {options.context}, every = {every}: every {every}-th of the {fewest} episodes of the "
+                f"shortest history of {dataset!r} are {steps} steps; take fewer, or a smaller --every"
+            )
         if histories.queries > 1:
             raise OptionError(
                 f"queries = {histories.queries}: {method.name} learns from windows without queries; leave it out"
@@ -298,24 +301,6 @@ def _draws(dataset: Dataset, options: TrainOptions, histories: HistoryOptions) -
             )
         draws["curriculum"] = curriculum
     return draws
-
-
-def _check_thinned(dataset: Dataset, context: int, every: int) -> None:
-    """Check that every n-th episode of each history makes a complete window."""
-    fewest = int(dataset.column("episodes").min())
-    steps = fewest // every * dataset.info.environment.kept_steps
-    if every > 1 and context > steps:
-        raise OptionError(
-            f"context = {context}, every = {every}: every {every}-th of the {fewest} episodes of the shortest history "
-            f"of {dataset!r} are {steps} steps; take fewer, or a smaller --every"
-        )
-
-
-def _longer_source(dataset: Dataset, context: int) -> str:
-    """Return the advice to choose a source with histories of enough steps, or "" if there is none."""
-    lengths, sources = dataset.column("T"), dataset.column("source")
-    longer = [name for name in dataset.counts("source") if lengths[sources == name].min() >= context]
-    return f", or choose --source {longer[0]}, whose histories are longer" if longer else ""
 
 
 class HistorySplit(NamedTuple):
@@ -391,7 +376,7 @@ class TrainedModel(NamedTuple):
 
 
 def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
-    """Return the parameters of a run, to start another training from, and notes it in that training's settings.
+    """Return the parameters of a run, to start another training from, and note it in that training's settings.
 
     Args:
         run: run folder of the model.
@@ -446,8 +431,7 @@ def read_trained(folder: Path) -> TrainedModel:
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
     label += "+teammate" * model.teammate_loss
     label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # words is the network of paper
-    names = tuple(layout.name for layout in layouts)
-    digest = json_hash(config)
+    names, digest = tuple(layout.name for layout in layouts), json_hash(config)
     hidden = tuple(histories.get("hide_recipe", ()))
     return TrainedModel(
         method, params, step, context, names, channels, obs_shape, label, model.encoder, digest, cells, hidden

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+from msgspec import Struct, ValidationError, convert
+
 from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS, all_families
 from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.errors import OptionError, UnknownNameError
@@ -30,6 +32,15 @@ class SeenInTraining(NamedTuple):
     teammates: Mapping[str, tuple[str, ...] | None] = {}
 
 
+class _Entry(Struct):
+    """Entry of a record of training data, see `histories.training_cells`."""
+
+    layout: str
+    family: str
+    algorithm: str | None = None
+    teammates: list[str] | None = None
+
+
 def read_trained_on(entries: Any, where: str) -> SeenInTraining:
     """Return what a record of training data says.
 
@@ -42,41 +53,30 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
     Raises:
         OptionError: if it is no such list, or for an unknown layout, family or algorithm.
     """
-    if not isinstance(entries, list | tuple):
-        raise OptionError(f"{where}: {TRAINED_ON}: expected a list of entries, found {str(entries)[:200]!r}")
+    try:
+        read = convert(entries, list[_Entry])
+    except ValidationError as error:
+        raise OptionError(
+            f"{where}: {TRAINED_ON}: expected entries with layout and family: {error}; found {str(entries)[:200]!r}"
+        ) from error
     seen: dict[str, tuple[str, ...] | None] = {}
     layouts = []
-    for entry in entries:
-        layout, kinds, ids = _read_entry(entry, where)
-        layouts.append(layout)
-        for kind in kinds:
-            known = seen.get(kind, ())
+    for entry in read:
+        kinds = [kind for kind, family in KIND_FAMILIES.items() if family == entry.family]
+        kinds = kinds or [name for name in TEAMMATE_PLUGINS.names if name == entry.family]
+        if not kinds or entry.algorithm not in (None, *kinds):
+            raise OptionError(
+                f"{where}: {TRAINED_ON}: expected a family ({', '.join(all_families())}), perhaps with an algorithm of "
+                f"this family; found {entry}"
+            )
+        try:
+            layouts.append(get_layout(entry.layout).name)
+        except UnknownNameError as error:
+            raise OptionError(f"{where}: {TRAINED_ON}: {error}") from error
+        for kind in [entry.algorithm] if entry.algorithm else kinds:
+            ids, known = entry.teammates, seen.get(kind, ())
             seen[kind] = None if ids is None or known is None else tuple(sorted({*known, *ids}))
     return SeenInTraining(tuple(dict.fromkeys(layouts)), seen)
-
-
-def _kinds_of(family: str) -> tuple[str, ...]:
-    kinds = tuple(kind for kind, of in KIND_FAMILIES.items() if of == family)
-    return kinds or tuple(name for name in TEAMMATE_PLUGINS.names if name == family)
-
-
-def _read_entry(entry: Any, where: str) -> tuple[str, tuple[str, ...], list[str] | None]:
-    """Return an entry's layout, teammate kinds and teammate ids."""
-    fields = entry if isinstance(entry, dict) else {}
-    layout, family, algorithm = (fields.get(name) for name in ("layout", "family", "algorithm"))
-    ids = fields.get("teammates")
-    kinds = _kinds_of(family) if isinstance(family, str) else ()
-    valid_ids = ids is None or (isinstance(ids, list | tuple) and all(isinstance(name, str) for name in ids))
-    if not isinstance(layout, str) or not kinds or algorithm not in (None, *kinds) or not valid_ids:
-        raise OptionError(
-            f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(all_families())}), perhaps an algorithm "
-            f"of this family and a list of teammates' ids; found {str(entry)[:200]!r}"
-        )
-    try:
-        name = get_layout(layout).name
-    except UnknownNameError as error:
-        raise OptionError(f"{where}: {TRAINED_ON}: {error}") from error
-    return name, (algorithm,) if algorithm else kinds, ids if ids is None else list(ids)
 
 
 class OverlapKind(NamedTuple):

@@ -22,13 +22,9 @@ class TensorBoardLog:
     Args:
         folder: its content is replaced.
         metrics: the log so far.
-
-    Raises:
-        OptionError: if tensorboardX is not installed.
     """
 
     def __init__(self, folder: Path, metrics: Path) -> None:
-        check_installed()
         self._folder = folder
         self._writers: dict[str, Any] = {}
         shutil.rmtree(folder, ignore_errors=True)

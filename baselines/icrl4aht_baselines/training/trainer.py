@@ -87,19 +87,18 @@ def training_optimizer(options: TrainOptions) -> optax.GradientTransformation:
 
 
 class Trainer:
-    """A method's training step and validation, compiled for some devices.
+    """A method's training step and validation, compiled for all devices of all processes.
 
     Args:
         method: what to train.
         options: how.
-        devices: all devices of all processes by default.
 
     Raises:
         OptionError: if a batch cannot be divided among devices and parts.
     """
 
-    def __init__(self, method: Method, options: TrainOptions, devices: Any = None) -> None:
-        devices = jax.devices() if devices is None else devices
+    def __init__(self, method: Method, options: TrainOptions) -> None:
+        devices = jax.devices()
         share = len(devices) * options.accumulate
         if options.batch_size % share:
             raise OptionError(
@@ -203,7 +202,6 @@ def train(
     folder: Path,
     about: Mapping[str, Any],
     *,
-    devices: Any = None,
     trainer: Any = None,
     params: Any = None,
     tensorboard: bool = False,
@@ -221,7 +219,6 @@ def train(
         folder: receives config.json, metrics.jsonl (a function of the settings), timing.jsonl, checkpoints/ and, if
             matplotlib is installed, curves.png.
         about: further settings for config.json, such as the model's and the data's.
-        devices: all by default.
         trainer: what computes the steps, with the interface of `Trainer`, which is the default.
         params: initial parameters, such as those of another run; drawn by the seed by default.
         tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
@@ -239,7 +236,7 @@ def train(
     """
     if tensorboard:
         check_installed()
-    trainer = trainer or Trainer(method, options, devices)
+    trainer = trainer or Trainer(method, options)
     config = {**format_versions(), "method": method.name, **about, "train": asdict(options)}
     with ExitStack() as stack:
         # All processes compute the same state; one of them writes it.
