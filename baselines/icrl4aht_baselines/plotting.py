@@ -90,7 +90,7 @@ def _plot_log_curve(axes: Any, label: str, color: str, points: Mapping[int, Sequ
 
 
 def shrink_picture(picture: Path, path: Path) -> None:
-    """Write a PNG file with 64 colours instead of all: curves look the same in a third of the bytes."""
+    """Write a copy of a PNG file with 64 colours: curves look the same in a third of the bytes."""
     from PIL import Image
 
     with Image.open(picture) as image:

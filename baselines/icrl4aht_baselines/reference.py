@@ -1,4 +1,4 @@
-"""Reference models: from a release that one command makes to models that are evaluated, step by step.
+"""Make the reference models step by step, from a release of noise histories to evaluated models.
 
     OUT/noise/lite              release of noise histories, as `icrl4aht-data generate --profile noise` makes it
     OUT/rl2-TRACK               RL^2, trained by playing with the training teammates of that release
@@ -170,12 +170,12 @@ def make_reference(
         show: called with (description, units done, units, note), for progress.
         evaluates: whether to evaluate it as well.
         teacher: agent whose histories are recorded and who labels them, such as the bundled `rl2-reference`; without
-            it, RL^2 is trained first. Releases and runs that are there are used as they are, whoever taught them.
+            it, RL^2 is trained first. Existing releases and runs are kept, even if they were made with another teacher.
         finished: run folder of the model, such as that of a bundled one, which is then only evaluated.
 
     Raises:
         UnknownNameError: for an unknown recipe or track.
-        OptionError: if a run folder holds a run of other settings. Releases that are there are used as they are.
+        OptionError: if a run folder holds a run of other settings. Existing releases are not checked.
         TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
     """
     if name not in RECIPES:

@@ -207,9 +207,9 @@ def unseen_command(
 ) -> None:
     """Evaluate on rearranged layouts that no model was trained on.
 
-    They show whether a model knows the game or its training layouts, without a test task. Plays versions of training
-    layouts that have pots, piles and counters in other places, with the diverse validation teammates. Prints mean
-    returns on each layout and the normalised return, with 95 % intervals over the versions.
+    This shows whether a model learned the game or only its training layouts, and needs no test task. The versions have
+    pots, piles and counters in other places; the teammates are the diverse validation ones. Prints mean returns on each
+    layout and the normalised return, with 95 % intervals over the versions.
     """
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks
     from icrl4aht_baselines.online.unseen import unseen_returns

@@ -1,4 +1,4 @@
-"""Cards made of results, in Markdown: of trained models, and of the headroom of the benchmark."""
+"""Cards in Markdown: one for each trained model, and one with the headroom of the benchmark."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def add_results(stored: StoredResults, folder: Path, about: str) -> StoredResult
 
     Raises:
         OptionError: if the folder has no results, or mixed ones, if a task was played for fewer than 2 x `ENDS`
-            episodes or a published one is missing, or if nothing says how a new agent was made.
+            episodes or a published one is missing, or if `about` is empty for a new agent.
     """
     run = read_run(folder)
     for cell, returns in run.cells.items():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -153,23 +153,18 @@ def score_bars(runs: NumberedRuns, protocol: str) -> BarChart | None:
     headroom = cell_headroom(protocol)
     layouts: dict[str, list[BarRow]] = {}
     for cell in cells:
-        bars = [
-            _bar(number, run, scores[number][cell], scale) for number, run in runs.items() if cell in scores[number]
-        ]
-        marks = [
-            Mark(name, scale.position(value), f"the paper's {name}: {value:z.2f}")
-            for name, value in stated[cell].items()
-        ]
+        tips = {name: f"the paper's {name}: {value:z.2f}" for name, value in stated[cell].items()}
+        marks = [Mark(name, scale.position(value), tips[name]) for name, value in stated[cell].items()]
         ends = f"{headroom[cell]['stay']:z.1f} to {headroom[cell]['oracle']:z.1f}"
-        layouts.setdefault(cell.layout, []).append(BarRow(cell.family, ends, bars, marks))
+        row = BarRow(cell.family, ends, _bars(runs, scores, cell, scale), marks)
+        layouts.setdefault(cell.layout, []).append(row)
     flat = [cell for cell in played if cell in headroom and not has_headroom(headroom[cell])]
     partial = [cell for cell in played if cell in headroom and cell not in (*flat, *cells)]
     reasons = {"The oracle earns no more than an ego that stays": flat, "Not all tasks were played": partial}
     left_out = [f"{why}: {', '.join(f'{c.layout} {c.family}' for c in of)}." for why, of in reasons.items() if of]
     names = dict.fromkeys(name for of_cell in stated.values() for name in of_cell)
-    return BarChart(
-        [Tick(scale.position(0), "stay"), Tick(scale.position(1), "oracle")], layouts, list(names), left_out
-    )
+    ticks = [Tick(scale.position(0), "stay"), Tick(scale.position(1), "oracle")]
+    return BarChart(ticks, layouts, list(names), left_out)
 
 
 def return_bars(runs: NumberedRuns, kind: str) -> BarChart | None:
@@ -184,15 +179,17 @@ def return_bars(runs: NumberedRuns, kind: str) -> BarChart | None:
     scale = _Scale(*return_limits(float(score.means.mean()) for of_run in scores.values() for score in of_run.values()))
     layouts: dict[str, list[BarRow]] = {}
     for cell in cells:
-        bars = [
-            _bar(number, run, scores[number][cell], scale) for number, run in runs.items() if cell in scores[number]
-        ]
-        layouts.setdefault(cell.layout, []).append(BarRow(family_title(cell.family), "", bars, []))
+        row = BarRow(family_title(cell.family), "", _bars(runs, scores, cell, scale), [])
+        layouts.setdefault(cell.layout, []).append(row)
     return BarChart(scale.ticks(), layouts, [], [])
 
 
 def _in_order(scores: Iterable[Iterable[ResultCell]]) -> list[ResultCell]:
     return sorted({cell for of_run in scores for cell in of_run}, key=lambda cell: cell.order)
+
+
+def _bars(runs: NumberedRuns, scores: Mapping[int, Any], cell: ResultCell, scale: _Scale) -> list[Bar]:
+    return [_bar(number, run, scores[number][cell], scale) for number, run in runs.items() if cell in scores[number]]
 
 
 def _bar(number: int, run: EvaluationRun, score: CellScore, scale: _Scale) -> Bar:

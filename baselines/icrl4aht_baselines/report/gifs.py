@@ -102,7 +102,8 @@ def family_gifs(
         progress: called with (description, tasks drawn, tasks), from the calling thread.
 
     Returns:
-        Run after run, families in order. If an agent cannot be restored, the caption says why.
+        The episodes of each run in turn, families in the paper's order. If an agent cannot be restored, the caption
+        says why.
     """
     chosen = []
     for run in runs:
@@ -111,7 +112,12 @@ def family_gifs(
             cells = [cell for cell in run.cells if cell[1:] == group]
             chosen.append((run, next((cell for cell in cells if scores[cell].has_headroom), cells[0])))
     sources = {source.folder: source for source in (run.source(cell) for run, cell in chosen)}
-    egos = {name: _restore(source) for name, source in sources.items()}
+    egos: dict[str, MakeEgo | Icrl4ahtError] = {}
+    for name, source in sources.items():
+        try:
+            egos[name] = restore_ego(source)
+        except Icrl4ahtError as error:
+            egos[name] = error
 
     def draw(number: int) -> EpisodePair:
         run, cell = chosen[number]
@@ -143,13 +149,6 @@ def _draw_result(
         return EpisodePair(cell, title, origin, shown)
     except Icrl4ahtError as error:
         return EpisodePair(cell, title, f"No picture: {error}. {origin}")
-
-
-def _restore(source: ResultSource) -> MakeEgo | Icrl4ahtError:
-    try:
-        return restore_ego(source)
-    except Icrl4ahtError as error:
-        return error
 
 
 def restore_ego(source: ResultSource) -> MakeEgo:

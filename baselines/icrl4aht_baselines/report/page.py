@@ -182,7 +182,7 @@ def write_page_with_episodes(
         suite: folder of learned teammates' checkpoints.
         progress: called with (description, tasks drawn, tasks).
     """
-    # Trained agents come first, each of them once before any twice, and reference egos last.
+    # The page has few episodes: different agents come before the second run of one, and reference egos come last.
     repeats = [sum(earlier.agent == run.agent for earlier in runs[:number]) for number, run in enumerate(runs)]
     order = sorted(range(len(runs)), key=lambda k: (_REFERENCE_RANK.get(runs[k].agent, 0), repeats[k], k))
     shown = [runs[number] for number in order[:_RUNS_WITH_EPISODES]] if episodes else []

@@ -34,7 +34,7 @@ from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, 
 from icrl4aht_data.utils.text import counted_noun
 
 PAPER_METHODS = ("AD", "DPT")
-"""The paper's methods that agents are compared with which the paper does not have."""
+"""The published methods that an agent without published results is compared with."""
 
 AVERAGE = "Average"
 """Label of the row of means over families, as in cards/published.json."""
@@ -51,7 +51,7 @@ class CellScore(NamedTuple):
 
     Attributes:
         means: mean return of each instance, float64 (U,), over seeds and episodes.
-        first, last: the same of the first and the last episodes, see `results.BLOCKS`.
+        first, last: mean return of each instance in its first and last episodes, see `results.BLOCKS`.
         references: reference ego -> its mean return in the cell; None where it was not measured.
         normalised: normalised score of each instance; None without headroom or if the cell was not played completely.
         published: the paper's mean and std of the agent in this cell; None if it has none of these conditions.

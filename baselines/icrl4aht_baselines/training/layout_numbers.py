@@ -1,4 +1,4 @@
-"""Batches of several layouts: numbers of the layouts in batches, and mirrored histories."""
+"""Samplers whose batches number the layouts of the complete training data, and may mirror histories."""
 
 from __future__ import annotations
 

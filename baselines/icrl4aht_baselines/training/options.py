@@ -76,14 +76,14 @@ class PlayOptions:
 
 
 SAVE_MINUTES = 5.0
-"""Most minutes between checkpoints of a training run; no setting of the run, whose results do not depend on it."""
+"""Most minutes between checkpoints of a training run. Results do not depend on it, so it is no setting of a run."""
 
 FILTERS = {"teammate_family": "teammate_family", "algorithm": "teammate_kind", "source": "source"}
 """Field of `HistoryOptions` -> the field of a release's index that it filters by."""
 
 
 ALL_LAYOUTS = "all"
-"""In place of the names of layouts: all layouts on which the release has histories that pass the other filters."""
+"""Value of `layouts` that stands for all layouts with histories that pass the other filters."""
 
 
 @dataclass(frozen=True)

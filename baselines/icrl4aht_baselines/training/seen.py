@@ -16,7 +16,7 @@ TRAINED_ON = "trained_on"
 """Key of the record of training data in a run's config.json, and in the `details` of evaluation settings."""
 
 TASKS_SOURCE = "tasks"
-"""In that record, the `source` of teammates that a model has played with and that have no histories."""
+"""Value of `source` in that record for teammates that a model played with itself, without histories."""
 
 
 class SeenInTraining(NamedTuple):
