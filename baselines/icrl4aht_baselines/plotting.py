@@ -50,7 +50,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
 
 
 def _panel_grid(
-    titles: Sequence[str], columns: int, size: tuple[float, float], x_label: str, **sharing: bool
+    titles: Sequence[str], columns: int, size: tuple[float, float], x_label: str, **sharing: Any
 ) -> tuple[Any, list[Any]]:
     """Return a figure and its axes: a panel of this size in inches for each title, and hidden ones in the last row."""
     rows = -(-len(titles) // columns)
