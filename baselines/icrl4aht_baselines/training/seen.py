@@ -53,22 +53,21 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
     Raises:
         OptionError: if it is no such list, or for an unknown layout, family or algorithm.
     """
+    expected = (
+        f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(all_families())}), perhaps an algorithm of this "
+        f"family and a list of teammates' ids"
+    )
     try:
         read = convert(entries, list[_Entry])
     except ValidationError as error:
-        raise OptionError(
-            f"{where}: {TRAINED_ON}: expected entries with layout and family: {error}; found {str(entries)[:200]!r}"
-        ) from error
+        raise OptionError(f"{expected}; found {str(entries)[:200]!r} ({error})") from error
     seen: dict[str, tuple[str, ...] | None] = {}
     layouts = []
     for entry in read:
         kinds = [kind for kind, family in KIND_FAMILIES.items() if family == entry.family]
         kinds = kinds or [name for name in TEAMMATE_PLUGINS.names if name == entry.family]
         if not kinds or entry.algorithm not in (None, *kinds):
-            raise OptionError(
-                f"{where}: {TRAINED_ON}: expected a family ({', '.join(all_families())}), perhaps with an algorithm of "
-                f"this family; found {entry}"
-            )
+            raise OptionError(f"{expected}; found {entry}")
         try:
             layouts.append(get_layout(entry.layout).name)
         except UnknownNameError as error:
