@@ -54,8 +54,8 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
         OptionError: if it is no such list, or for an unknown layout, family or algorithm.
     """
     expected = (
-        f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(all_families())}), perhaps an algorithm of this "
-        f"family and a list of teammates' ids"
+        f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(all_families())}), perhaps an algorithm of "
+        f"this family and a list of teammates' ids"
     )
     try:
         read = convert(entries, list[_Entry])
