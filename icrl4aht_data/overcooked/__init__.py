@@ -1,1 +1,1 @@
-"""OvercookedV2: layouts, state record, rules, observations, pictures. Batch first, for NumPy and JAX, no randomness."""
+"""OvercookedV2: layouts, state record, rules, observations, pictures. The functions take NumPy or JAX arrays, batch axes first."""

@@ -1,4 +1,4 @@
-"""Numbers of actions and of the two agents."""
+"""Ids of the six actions and of the two agents."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ ACTIONS = ("up", "down", "left", "right", "stay", "interact")
 UP, DOWN, LEFT, RIGHT, STAY, INTERACT = range(6)
 
 PUBLISHED_ACTIONS = ("right", "down", "left", "up", "stay", "interact")
-"""Action names by their id in the published code's files, which are remapped on reading."""
+"""Action names in the order of the published code's ids, which are remapped on reading."""
 
 EGO, TEAMMATE = 0, 1
-"""Agent slots. The ego learns or is evaluated (drawn blue); the teammate is fixed and unknown to it (drawn red)."""
+"""Agent slots. The ego (blue) learns or is evaluated; its teammate (red) has a fixed policy unknown to it."""

@@ -1,8 +1,8 @@
 """Names of observation channels, and the canonical channels, which observations of all layouts share.
 
 A layout's own channels depend on its number of ingredient types and on its delivery indicator, so observations of
-different layouts can differ in shape. The canonical channels are the union: each layout's own channels are put into
-their places among them, and channels that a layout does not have are 0.
+different layouts can differ in shape. The canonical channels are the union of all layouts' channels; channels that a
+layout does not have are 0.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def channel_names(layout: Layout) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def canonical_positions(layout: Layout) -> np.ndarray:
-    """Return the place of each own channel of a layout among the canonical channels, int64 (C,), ascending.
+    """Return the canonical position of each of a layout's own channels, int64 (C,), ascending.
 
     Raises:
-        OptionError: if the layout has a channel that is not canonical, of an ingredient that no published layout has.
+        OptionError: if the layout has an ingredient that no published layout has, and so no canonical channel.
     """
     names = channel_names(layout)
     missing = [name for name in names if name not in CANONICAL_CHANNELS]
@@ -58,9 +58,9 @@ def canonical_positions(layout: Layout) -> np.ndarray:
             f"layout {layout.name}: channels {missing} are not among the {len(CANONICAL_CHANNELS)} canonical channels: "
             f"take its own channels, or give its piles ingredients that the published layouts have"
         )
-    places = np.array([CANONICAL_CHANNELS.index(name) for name in names])
-    places.flags.writeable = False  # callers share it
-    return places
+    positions = np.array([CANONICAL_CHANNELS.index(name) for name in names])
+    positions.flags.writeable = False  # the cached array is shared by all callers
+    return positions
 
 
 def observation_shape(layout: Layout, canonical: bool = False) -> tuple[int, int, int]:
@@ -69,12 +69,12 @@ def observation_shape(layout: Layout, canonical: bool = False) -> tuple[int, int
 
 
 def to_canonical(layout: Layout, obs: Array) -> Array:
-    """Return observations (..., C) with a layout's own channels as (..., 46) with canonical channels, in NumPy or JAX.
+    """Convert observations (..., C) with a layout's own channels to the canonical channels, (..., 46), in NumPy or JAX.
 
-    Equal to what `observe` renders with canonical=True.
+    The result equals `observe` with canonical=True.
     """
     xp = obs.__array_namespace__()
-    # The channel after the last one is 0; every canonical channel that the layout does not have is taken from it.
+    # A channel of zeros is appended; canonical channels that the layout does not have are taken from it.
     source = np.full(len(CANONICAL_CHANNELS), layout.channels)
     source[canonical_positions(layout)] = np.arange(layout.channels)
     return xp.take(xp.concat([obs, xp.zeros_like(obs[..., :1])], axis=-1), xp.asarray(source), axis=-1)

@@ -1,4 +1,4 @@
-"""Drawings of the parts of a state: cells, pots, buttons, items and chefs, from a few primitive shapes on any `Canvas`.
+"""Draws the parts of a state (cells, pots, buttons, items, chefs) from a few primitive shapes on any `Canvas`.
 
 `render` draws them as pixels; other canvases may record the shapes. Positions and lengths are in cells, (0, 0) is the
 map's top left corner.
@@ -26,7 +26,7 @@ FOOTER = 0.8
 """Height of the strip with the recipe below the map."""
 
 AGENT_COLOURS = {EGO: (33, 104, 222), TEAMMATE: (213, 33, 53)}
-"""Coats of the chefs."""
+"""Colour of each agent's coat."""
 
 INK, _STEEL, _DARK_STEEL, _WHITE = (43, 48, 58), (124, 133, 146), (58, 64, 75), (255, 255, 255)
 _FLOOR, _FAR_WALL, PAPER = ((248, 245, 238), (239, 234, 224)), (199, 193, 184), (255, 252, 240)
@@ -57,20 +57,20 @@ _INGREDIENTS = {
         (0.36, (90, 170, 80), (0.48, -0.44), (0.72, -0.7)),
     ),
 }
-"""ingredient id -> its edge colour and the strokes that draw it within a radius of 1, see `Canvas.strokes`."""
+"""ingredient id -> edge colour and strokes that draw it within a radius of 1, see `Canvas.strokes`."""
 _OTHER_INGREDIENT = (INK, (1.6, _STEEL, (0, 0)))
 
 
 class Canvas(ABC):
-    """Something to draw on; positions and lengths are in cells."""
+    """Base class of canvases; positions and lengths are in cells."""
 
     @abstractmethod
     def box(self, x: float, y: float, width: float, height: float, fill: Colour, radius: float = 0) -> None:
-        """Draw a filled rectangle with centre (x, y) and round corners."""
+        """Draw a filled rectangle with centre (x, y) and rounded corners."""
 
     @abstractmethod
     def disc(self, x: float, y: float, radius: float, fill: Colour, part: float = 1) -> None:
-        """Draw a disc, or the first `part` (0..1) of one, clockwise from the top."""
+        """Draw a disc, or a sector of `part` (0..1) of it, clockwise from the top."""
 
     @abstractmethod
     def line(self, points: Sequence[tuple[float, float]], thickness: float, fill: Colour) -> None:
@@ -84,7 +84,7 @@ class Canvas(ABC):
     def text(
         self, x: float, y: float, words: str, size: float, fill: Colour, anchor: str = "mm", room: float = 99
     ) -> None:
-        """Draw text, smaller than `size` where that is wider than `room`; `anchor` as in Pillow."""
+        """Draw text, shrunk if it is wider than `room`; `anchor` is one of Pillow's."""
 
     def strokes(
         self,
@@ -96,9 +96,9 @@ class Canvas(ABC):
         edge: Colour | None = None,
         rim: float = 0.0,
     ) -> None:
-        """Draw lines with round ends, or discs, (thickness, fill, *points), within one rim of the colour `edge`.
+        """Draw lines or discs, each given as (thickness, fill, *points), with a common outline of colour `edge`.
 
-        The points are relative to (x, y), in units of `size`; their first axis points to `turn`.
+        The points are relative to (x, y), in units of `size`; their first axis points in the direction `turn`.
         """
         for colour, grow in ((edge, 2 * rim), (None, 0)) if edge else ((None, 0),):
             for thick, fill, *points in parts:
@@ -112,8 +112,8 @@ class StatePart(NamedTuple):
 
     Attributes:
         name: parts of one layout with the same name and values look the same.
-        moves: whether the cell around which it is drawn depends on the state.
-        anchor: this cell; of a part that moves, the column of the state record that has it.
+        moves: whether its position depends on the state.
+        anchor: number of its cell; for a moving part, the column of the state record that contains the cell.
         columns: columns of the state record whose values determine the drawing.
         draw: called with a canvas, the coordinates of the cell's centre, and the values.
     """
@@ -131,7 +131,7 @@ VIEW = "view"
 
 @lru_cache(maxsize=32)
 def state_parts(layout: Layout) -> tuple[StatePart, ...]:
-    """Return all parts of a layout's states in the order in which they are drawn."""
+    """Return all parts of a layout's states in drawing order."""
     at, number = columns(layout), np.arange(record_size(layout))
     ego = int(number[at.positions][EGO])
     parts = [
@@ -154,7 +154,7 @@ def state_parts(layout: Layout) -> tuple[StatePart, ...]:
 
 
 def cell_centre(layout: Layout, cell: int) -> tuple[float, float]:
-    """Coordinates of a cell's centre."""
+    """Return the coordinates (x, y) of a cell's centre."""
     return cell % layout.width + 0.5, cell // layout.width + 0.5
 
 
@@ -164,7 +164,7 @@ def item_contents(layout: Layout, item: int) -> list[int]:
 
 
 def _fixture(layout: Layout, cell: int, recipe: int, delivered: int) -> tuple[tuple[int, ...], Callable[..., None]]:
-    """The columns, of those of the recipe and the delivery, that a cell's constant part shows, and its drawing."""
+    """Return the record columns that a cell's drawing depends on (recipe or delivery), and the drawing function."""
     if layout.kinds[cell] == layouts.INDICATOR:
         return (recipe,), partial(_draw_indicator, layout)
     if layout.kinds[cell] == layouts.GOAL:
@@ -173,7 +173,7 @@ def _fixture(layout: Layout, cell: int, recipe: int, delivered: int) -> tuple[tu
 
 
 def _draw_constant(layout: Layout, cell: int, canvas: Canvas, x: float, y: float) -> None:
-    """Floor, walls, supplies; under pots and buttons only the counter."""
+    """Draw floor, a wall or a pile; below pots and buttons only the counter."""
     kind, odd = layout.kinds[cell], (cell % layout.width + cell // layout.width) % 2
     if kind == layouts.EMPTY:
         canvas.box(x, y, 1, 1, _FLOOR[1 - odd])
@@ -197,7 +197,7 @@ def _draw_counter(canvas: Canvas, x: float, y: float) -> None:
 
 
 def _draw_goal(canvas: Canvas, x: float, y: float, delivered: int) -> None:
-    """A serving bell, its hatch lit in the step after a correct delivery."""
+    """Draw the goal: a serving bell, lit in the step after a correct delivery."""
     hatch = _LAMP if delivered else _READY
     _draw_counter(canvas, x, y)
     canvas.box(x, y, 0.88, 0.88, hatch, 0.08)
@@ -214,7 +214,7 @@ def _draw_indicator(layout: Layout, canvas: Canvas, x: float, y: float, recipe: 
 
 
 def _draw_pot(layout: Layout, canvas: Canvas, x: float, y: float, item: int, timer: int) -> None:
-    """A pot: free slots as rings; while cooking an orange rim and the steps left; when cooked green with a tick."""
+    """Draw a pot: rings for free slots, an orange rim and the remaining steps while cooking, a green tick when cooked."""
     contents, cooked = item_contents(layout, item), item & COOKED > 0
     canvas.box(x, y, 0.9, 0.9, _DARK_STEEL, 0.08)
     canvas.strokes([(0.12, _STEEL, (-0.4, 0), (0.4, 0))], x, y - 0.05)
@@ -232,7 +232,7 @@ def _draw_pot(layout: Layout, canvas: Canvas, x: float, y: float, item: int, tim
 
 
 def _draw_button(layout: Layout, canvas: Canvas, x: float, y: float, recipe: int, timer: int) -> None:
-    """A knob with a question mark; while lit a lamp with the recipe, whose ring shows the time left."""
+    """Draw a button: a knob with a question mark, or while lit the recipe in a ring that shows the remaining time."""
     canvas.box(x, y, 0.88, 0.88, _DARK_STEEL, 0.2)
     canvas.disc(x, y, 0.42, _LAMP, timer / BUTTON_STEPS)
     canvas.disc(x, y, 0.35, PAPER if timer else _STEEL)
@@ -243,7 +243,7 @@ def _draw_button(layout: Layout, canvas: Canvas, x: float, y: float, recipe: int
 
 
 def _draw_item(layout: Layout, canvas: Canvas, x: float, y: float, item: int, *, radius: float) -> None:
-    """An item byte: nothing, one ingredient, or a plate with its content."""
+    """Draw an item byte: nothing, one ingredient, or a plate with its content."""
     contents = item_contents(layout, item)
     if item & PLATE:
         for part, colour in ((1, _PLATE_RIM), (0.88, _WHITE), (0.7, _PLATE_RIM), (0.62, _WHITE)):
@@ -254,7 +254,7 @@ def _draw_item(layout: Layout, canvas: Canvas, x: float, y: float, item: int, *,
 
 
 def _draw_trio(canvas: Canvas, contents: list[int], x: float, y: float, radius: float, empty=None) -> None:
-    """Up to three ingredients in a triangle, and rings of the colour `empty` in the free slots."""
+    """Draw up to three ingredients in a triangle, with rings of colour `empty` for free slots."""
     for number, (dx, dy) in enumerate(((0, -0.95), (-1.02, 0.75), (1.02, 0.75))):
         centre = (x + dx * radius, y + dy * radius)
         if number < len(contents):
@@ -270,7 +270,7 @@ def _draw_ingredient(canvas: Canvas, ingredient: int, x: float, y: float, radius
 
 
 def _draw_view(layout: Layout, canvas: Canvas, x: float, y: float, cell: int) -> None:
-    """The outline of the ego's window, clipped to the map."""
+    """Draw the outline of the ego's window, clipped to the map."""
     column, row = cell_centre(layout, cell)
     reach = WINDOW / 2
     visible = np.clip([column - reach, row - reach, column + reach, row + reach], 0, [layout.width, layout.height] * 2)
@@ -280,7 +280,7 @@ def _draw_view(layout: Layout, canvas: Canvas, x: float, y: float, cell: int) ->
 
 
 def _draw_chef(layout: Layout, agent: int, canvas: Canvas, x: float, y: float, facing: int, hand: int) -> None:
-    """A chef from above: coat in the agent's colour, white hat; eyes, arms and the item in hand point forward."""
+    """Draw a chef from above: coat in the agent's colour, white hat; eyes, arms and held item point forward."""
     forward = STEP[FACINGS[facing]]
     body = [
         (0.42, AGENT_COLOURS[agent], (-0.16, -0.2), (-0.16, 0.2)),
@@ -299,7 +299,7 @@ def _draw_chef(layout: Layout, agent: int, canvas: Canvas, x: float, y: float, f
 
 
 def _draw_footer(layout: Layout, canvas: Canvas, x: float, y: float, recipe: int) -> None:
-    """The current recipe in the strip below the map, from its left edge."""
+    """Draw the current recipe in the strip below the map, from its left edge."""
     left, middle = x - 0.5, y + 0.5 + FOOTER / 2
     canvas.text(left + 0.15, middle, "Recipe", 0.34, INK, "lm", room=1.15)
     for number, ingredient in enumerate(item_contents(layout, recipe)):

@@ -1,7 +1,7 @@
-"""Renders the ego's observations from state records at the speed of memory, with NumPy into reusable buffers.
+"""Fast rendering of the ego's observations from state records, with NumPy into reusable buffers.
 
-`observe` defines what an observation is, for NumPy and JAX. This module calls `observe` once for every value that one
-element of a record can have, keeps the answers as lookup tables, and renders a step as a copy of a background and a few
+`observe` defines what an observation is, for NumPy and JAX. This module calls `observe` once for every value of each
+record element, keeps the results as lookup tables, and renders a step as a copy of a background and a few
 small patches: the background by the ego's cell, recipe and delivery; both agents by facing and item; and what is on
 counters, in pots and on lit buttons.
 
@@ -21,11 +21,11 @@ from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, record_size
 from icrl4aht_data.utils.system import in_slices
 
-_SLAB = 8192  # steps rendered at a time: fewer cost more in calls than they save in cache misses
-_IMPOSSIBLE = -(2**40)  # makes every sum of lookups negative
+_SLAB = 8192  # steps rendered at a time: smaller blocks lose more time in calls than they save in cache misses
+_IMPOSSIBLE = -(2**40)  # so negative that any sum of lookups with it is negative
 _TIMERS = 32  # values of a timer's five bits
 _ON_COUNTER, _ON_BUTTON, _IN_POT = 0, 256, 512
-"""First patch of each kind of cell. An item byte b on a counter is patch b, a lit button that shows recipe byte b patch
+"""Number of the first patch of each kind of cell. An item byte b on a counter is patch b, a lit button that shows recipe byte b patch
 256 + b, and a pot with item byte b and timer t patch 512 + 256 * t + b."""
 
 
@@ -63,7 +63,7 @@ def fast_observe(
 
 
 class _Renderer:
-    """Lookup tables of one layout, dtype and kind of channels, and the rendering with them."""
+    """Renderer for one layout, dtype and kind of channels, with its lookup tables."""
 
     def __init__(self, layout: Layout, dtype: str, canonical: bool) -> None:
         self._layout, self._dtype, self._canonical = layout, np.dtype(dtype), canonical
@@ -71,7 +71,7 @@ class _Renderer:
         self._columns = columns(layout)
         fixed = fixed_channels(layout, canonical)
         self._agent: int = fixed.start // 2  # A: the channels of two agents precede the fixed ones
-        self._first: int = fixed.stop  # first channel of what changes on a cell
+        self._first: int = fixed.stop  # first channel whose value on a cell can change
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.unique(np.array([0, *layout.recipe_items], np.uint8))
         self._in_window = layout.window_position.astype(np.intp)
@@ -82,17 +82,17 @@ class _Renderer:
         self._make_cell_lookups()
 
     def render(self, record: np.ndarray, out: np.ndarray) -> None:
-        """Render uint8 (n, S) into (n, 25, C)."""
+        """Render state records uint8 (n, S) into `out` (n, 25, C)."""
         # The first eight columns as pairs of bytes, the ego's in the low byte: with the ego on cell 17 and the teammate
-        # on cell 20, `positions` is 17 + 20 * 256 = 5137. One lookup by a pair replaces two by bytes and their sum.
+        # on cell 20, `positions` is 17 + 20 * 256 = 5137. One lookup by pair replaces two by byte and an addition.
         positions, facings, hands, recipe = record[:, :8].copy().view("<u2").T.astype(np.intp)
         background = self._by_positions.take(positions)
         background += self._by_recipe.take(recipe)
         if background.min() < 0 or (facings & 0xFCFC).any() or (record[:, self._columns.pot_timers] >= _TIMERS).any():
-            # The rules make no such record, so the lookup tables do not have it: one is enough for the slow way.
+            # A negative number: the rules cannot produce such a record, so the tables lack it; use the slow renderer.
             out.reshape(len(out), *self._shape)[...] = self._observe(record)
             return
-        # The default mode would write into a copy of `out` first, to leave it as it is if an index is out of range.
+        # The default mode first writes into a copy of `out`, to keep `out` unchanged if an index is out of range.
         np.take(self._background, background, axis=0, out=out.reshape(len(out), -1), mode="clip")
         cells = out.reshape(-1, self._shape[-1])
         self._render_agents(positions, facings, hands, cells)
@@ -111,7 +111,7 @@ class _Renderer:
         teammate[seen * VISIBLE + where[seen]] = self._agents.take((facings[seen] & 0xFF00) + (hands[seen] >> 8))
 
     def _render_cells(self, record: np.ndarray, positions: np.ndarray, cells: np.ndarray) -> None:
-        """Render pots, lit buttons and items on counters that are in view; most cells are empty and need nothing."""
+        """Render pots, lit buttons and items on counters that are in view; empty cells need no patch."""
         filled = record[:, self._cell_columns].copy()
         filled[:, : self._pots] |= record[:, self._columns.pot_timers]
         row, cell = np.divmod(np.flatnonzero(filled), filled.shape[1])
@@ -130,7 +130,7 @@ class _Renderer:
     def _make_pair_lookups(self) -> None:
         """Make lookup tables by a pair of bytes, low byte first: intp (2**16,), negative for pairs that cannot occur.
 
-        The first two sum up to a row of the background.
+        The sum of the first two is a row of the background.
         """
         low, high = np.arange(2**16) & 255, np.arange(2**16) >> 8
         cells = self._layout.cells
@@ -147,11 +147,11 @@ class _Renderer:
         self._cell_columns = np.r_[where.pot_items, where.buttons, where.counters]
         self._cell_in_window = self._in_window[:, [*layout.pots, *layout.buttons, *layout.counters]].reshape(-1)
         self._first_patch = np.repeat([_IN_POT, _ON_BUTTON, _ON_COUNTER], (pots, buttons, counters))
-        # A lit button shows the recipe, whatever its own timer says.
+        # A lit button shows the recipe, whatever its remaining time.
         self._patch_column = np.where(self._first_patch == _ON_BUTTON, where.recipe, self._cell_columns)
 
     def _make_background(self) -> np.ndarray:
-        """Return all but agents and items by the ego's cell, recipe and delivery, (floor * recipes * 2, 25 * C)."""
+        """Return observations without agents and items by ego cell, recipe and delivery, (floor * recipes * 2, 25 * C)."""
         shape = len(self._floor), len(self._recipes), 2
         record = np.zeros((*shape, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., self._columns.recipe] = self._floor[:, None, None], self._recipes[:, None]
@@ -161,7 +161,7 @@ class _Renderer:
         return obs.reshape(np.prod(shape), -1).astype(self._dtype)
 
     def _make_agents(self) -> np.ndarray:
-        """Return an agent's channels by facing and item byte, (4 * 256, A)."""
+        """Return the channels of one agent for each facing and item byte, (4 * 256, A)."""
         record = np.zeros((4, 256, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., 1] = self._floor[0], self._floor[-1]
         record[..., self._columns.facings] = np.arange(4)[:, None, None]
@@ -170,7 +170,7 @@ class _Renderer:
         return obs[:, CENTRE, : self._agent].astype(self._dtype)
 
     def _make_patches(self) -> np.ndarray:
-        """Return what changes on a cell, (512 + 32 * 256, C - first), numbered as said at `_ON_COUNTER`."""
+        """Return the changing channels of a cell, (512 + 32 * 256, C - first), one row per patch, see `_ON_COUNTER`."""
         layout, where = self._layout, self._columns
         every_byte = np.arange(256, dtype=np.uint8)
         record = np.zeros((2 + _TIMERS, 256, record_size(layout)), np.uint8)
@@ -181,7 +181,7 @@ class _Renderer:
         patches = np.zeros((*record.shape[:2], self._shape[-1] - self._first), self._dtype)
         kinds = (slice(0, 1), layout.counters), (slice(1, 2), layout.buttons), (slice(2, None), layout.pots)
         for rows, cells in kinds:
-            # Any cell of the kind will do, seen from any cell of the floor.
+            # The patch is the same for all cells of a kind, from every floor cell.
             views = [(ego, cell) for cell in cells for ego in self._floor if self._in_window[ego, cell] != NOWHERE]
             if views:
                 record[rows, :, 0] = views[0][0]

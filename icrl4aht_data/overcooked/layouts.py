@@ -1,4 +1,4 @@
-"""The ten layouts: maps, recipes, aliases, and the lookup tables computed from them; layouts of other packages.
+"""The ten layouts (maps, recipes, aliases), their lookup tables, and layouts registered by other packages.
 
 A cell is (x, y), x = column, y = row, origin top-left; its flat number is y * width + x.
 Map letters: W wall (= counter), A agent, X goal, B plate pile, P pot, R recipe indicator, L button,
@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.utils.plugins import Plugins
 
 EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
-"""Kinds of cells. A wall is a counter that holds one item; PLATES and PILE are endless supplies."""
+"""Kinds of cells. A wall is a counter for one item; PLATES and PILE never run out."""
 
 FACINGS = ("up", "down", "right", "left")
 """Facing names by number, the order of the observation's facing channels."""
@@ -30,7 +30,7 @@ FACING_OF = np.array([FACINGS.index(name) for name in ACTIONS if name in FACINGS
 """int64 (4,): the facing after a directional action (up, down, left, right)."""
 
 PLATE, COOKED = 1, 2
-"""Flag bits of an item byte. The counts of the layout's piled ingredients follow, two bits each."""
+"""Flag bits of an item byte. The higher bits count the ingredients, two bits each."""
 
 WINDOW = 5
 """Side of the square observation window."""
@@ -108,7 +108,7 @@ class Layout:
 
     @cached_property
     def agent_cells(self) -> tuple[int, ...]:
-        """Cells of `A` in reading order: the ego's, then the teammate's."""
+        """Cells with the letter `A` in reading order: the ego's, then the teammate's."""
         return tuple(i for i, c in enumerate("".join(self.rows)) if c == "A")
 
     @cached_property
@@ -123,7 +123,7 @@ class Layout:
 
     @cached_property
     def ingredient_types(self) -> int:
-        """n, the number of ingredient channels: highest pile id + 1."""
+        """Number n of ingredient channels: highest pile id + 1."""
         return max(self.ingredients) + 1
 
     @cached_property
@@ -134,20 +134,20 @@ class Layout:
 
     @cached_property
     def channels(self) -> int:
-        """C, the number of observation channels: 25 + 5n, + 1 with the delivery indicator."""
+        """Number C of observation channels: 25 + 5n, + 1 with the delivery indicator."""
         return 25 + 5 * self.ingredient_types + int(self.indicates_delivery)
 
     @property
     def obs_shape(self) -> tuple[int, int, int]:
-        """(5, 5, C), the shape of an observation."""
+        """Shape of an observation, (5, 5, C)."""
         return (WINDOW, WINDOW, self.channels)
 
     def ingredient_item(self, ingredient: int) -> int:
-        """The item byte of one piece of `ingredient`."""
+        """Return the item byte of one piece of an ingredient."""
         return 4 << (2 * self.ingredients.index(ingredient))
 
     def recipe_item(self, recipe: tuple[int, int, int]) -> int:
-        """The item byte of a recipe: the sum of its three ingredients, no flags."""
+        """Return the item byte of a recipe: the sum of its three ingredients, no flags."""
         return sum(self.ingredient_item(i) for i in recipe)
 
     @cached_property
@@ -166,7 +166,7 @@ class Layout:
         room, edge = set(), {start}
         while edge:
             room |= edge
-            # A step off the map's edge may arrive in another row, but a map whose edge can be reached is refused.
+            # A step off the map's edge would end in another row; maps whose edge can be reached are refused.
             edge = {cell + dy * self.width + dx for cell in edge for dx, dy in STEP.values()} & floor - room
         return np.array(sorted(room), np.uint8)
 
@@ -289,13 +289,13 @@ LAYOUTS: dict[str, Layout] = {layout.name: layout for layout in _ALL}
 _BY_ALIAS = {layout.alias: layout for layout in _ALL}
 
 LAYOUT_PLUGINS = Plugins("icrl4aht.layouts", (*LAYOUTS, *_BY_ALIAS))
-"""Layouts of other installed packages, which belong to no published task."""
+"""Layouts registered by other installed packages; no published task uses them."""
 
 
 def get_layout(name: str) -> Layout:
     """Return the layout with a short name (coord_simple) or environment name (grounded_coord_simple).
 
-    A layout that another installed package registers has one name, see docs/extending.md.
+    A layout registered by another package has one name, see docs/extending.md.
 
     Raises:
         UnknownNameError: lists the valid names and the nearest.
@@ -315,5 +315,5 @@ def get_layout(name: str) -> Layout:
 
 
 def all_layout_names() -> list[str]:
-    """Return the names that `get_layout` knows: short names, those of other packages, environment names."""
+    """Return all names that `get_layout` accepts: short names, registered names and environment names."""
     return [*LAYOUTS, *LAYOUT_PLUGINS.names, *_BY_ALIAS]

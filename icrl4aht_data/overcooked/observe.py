@@ -11,7 +11,7 @@ Channels, in order, for n ingredient types:
     pot timer   1       0..19
     delivery    1       on goal cells in the step after a correct delivery; only test_simple and test_wide
 
-`channels` names them, and the canonical channels, which all layouts share: these with n = 4 and delivery.
+`channels` lists their names. The canonical channels, shared by all layouts, have n = 4 and delivery.
 Cells outside the map are all zero. Every value is an integer in 0..19: uint8 holds it without loss.
 """
 
@@ -46,7 +46,7 @@ from icrl4aht_data.overcooked.state import Array, unpack
 
 _STATIC = (WALL, GOAL, POT, INDICATOR, BUTTON, PLATES)
 
-# Every visible cell is packed into two 32-bit words, so that lookups move words and only the last operation writes C
+# Every visible cell is packed into two 32-bit words: lookups move words, and only the last operation writes C
 # channels. Bits of the word of the cell: item 0..7, pot timer 8..12, recipe 13..18, delivery 19, static 20..25, and one
 # per piled type 26..28. Bits of the word of the agents on it: self 0..12 (position 1, facing 4, hand 8), other 13..25.
 _TIMER, _RECIPE, _DELIVERY, _FIXED, _PILES = 8, 13, 19, 20, 26
@@ -57,12 +57,12 @@ class _Lookup(NamedTuple):
     """Constants of one layout, with its own or the canonical channels.
 
     Args:
-        view: int32 (cells, 25), for each agent position and window cell: number of the cell's changing word, then from
-            bit 8 on the fixed bits of its word, shifted down by _FIXED.
+        view: int32 (cells, 25), for each agent position and window cell: number of the cell's changing word; from bit
+            8 on, the fixed bits of its word, shifted down by _FIXED.
         shift: uint32 (C,), lowest bit of each channel in its word.
-        mask: uint32 (C,), bits of each channel; 0 for what the layout does not have, such as an ingredient type
-            without a pile.
-        agent_channels: the first channels, which come from the word of the agents.
+        mask: uint32 (C,), bits of each channel; 0 for channels that the layout does not have, such as an ingredient
+            type without a pile.
+        agent_channels: number of channels, from the first, that come from the word of the agents.
     """
 
     view: np.ndarray
@@ -72,7 +72,7 @@ class _Lookup(NamedTuple):
 
 
 def observe(layout: Layout, record: Array, agent: int, canonical: bool = False) -> Array:
-    """Return the observations of one agent, its window of 5 x 5 cells.
+    """Return the observations of one agent: the 5 x 5 cells around it.
 
     Args:
         layout: the layout.
@@ -81,7 +81,7 @@ def observe(layout: Layout, record: Array, agent: int, canonical: bool = False) 
         canonical: whether to return the canonical channels, see `channels`, instead of the layout's own.
 
     Returns:
-        uint8 (B, 5, 5, C). Equal bytes from NumPy and JAX.
+        uint8 (B, 5, 5, C). NumPy and JAX give equal bytes.
     """
     return _expand(layout, *_words(layout, record, agent), canonical)
 
@@ -95,7 +95,7 @@ def observe_both(layout: Layout, record: Array, canonical: bool = False) -> Arra
 
 
 def fixed_channels(layout: Layout, canonical: bool = False) -> slice:
-    """The channels that are constant for a cell: its kind, and the ingredient piled on it."""
+    """Return the slice of channels that are constant for a cell: its kind and its ingredient pile."""
     names = CANONICAL_CHANNELS if canonical else channel_names(layout)
     return slice(names.index("wall"), names.index("item_plate"))
 
@@ -111,7 +111,7 @@ def _expand(layout: Layout, agents: Array, cells: Array, canonical: bool) -> Arr
 
 
 def _words(layout: Layout, record: Array, agent: int) -> tuple[Array, Array]:
-    """uint32 (B, 25) twice: the word of the agents on each visible cell, and the word of the cell itself."""
+    """Return two uint32 (B, 25): for each visible cell the word of the agents on it, and its own word."""
     xp = record.__array_namespace__()
     lookup = _lookup(layout)
     state = unpack(layout, record)
@@ -134,8 +134,8 @@ def _words(layout: Layout, record: Array, agent: int) -> tuple[Array, Array]:
 
 
 def _changing_words(xp, state) -> Array:
-    """uint32 (B, 3 + P + L + K): the words that cells refer to: nothing, indicator, goal, pots, buttons, counters."""
-    # Without the flags of plate and cooked, which a recipe does not have.
+    """Return the changing words, uint32 (B, 3 + P + L + K): nothing, indicator, goal, pots, buttons, counters."""
+    # The plate and cooked flags are dropped: a recipe has neither.
     recipe = xp.astype(state.recipe >> 2, xp.uint32)[..., None] << _RECIPE
     delivered = xp.astype(state.delivered, xp.uint32)[..., None] << _DELIVERY
     pots = xp.astype(state.pot_items, xp.uint32) | xp.astype(state.pot_timers, xp.uint32) << _TIMER
@@ -149,7 +149,7 @@ def _changing_words(xp, state) -> Array:
 def _lookup(layout: Layout, canonical: bool = False) -> _Lookup:
     if canonical:
         own, places = _lookup(layout), canonical_positions(layout)
-        shift, mask = np.zeros((2, len(CANONICAL_CHANNELS)), np.uint32)  # mask 0: the layout does not have it
+        shift, mask = np.zeros((2, len(CANONICAL_CHANNELS)), np.uint32)  # mask 0: the layout does not have this channel
         shift[places], mask[places] = own.shift, own.mask
         return own._replace(shift=shift, mask=mask, agent_channels=CANONICAL_CHANNELS.index("wall"))
     column = np.zeros(layout.cells, np.int32)
@@ -184,11 +184,11 @@ def _lookup(layout: Layout, canonical: bool = False) -> _Lookup:
 
 
 def _item_bits(layout: Layout, first: int) -> list[tuple[int, int]]:
-    """(shift, mask) of the channels of an item byte that starts at bit `first`: plate, cooked, counts."""
+    """Return (shift, mask) of the channels of an item byte that starts at bit `first`: plate, cooked, counts."""
     return [(first, 1), (first + 1, 1), *_ingredient_bits(layout, first + 2, 2, 3)]
 
 
 def _ingredient_bits(layout: Layout, first: int, width: int, mask: int) -> list[tuple[int, int]]:
-    """(shift, mask) of each ingredient channel; mask 0 for a type without a pile."""
+    """Return (shift, mask) of each ingredient channel; mask 0 for a type without a pile."""
     order = {ingredient: number for number, ingredient in enumerate(layout.ingredients)}
     return [(first + width * order[i], mask) if i in order else (0, 0) for i in range(layout.ingredient_types)]

@@ -1,6 +1,7 @@
-"""Pictures of state records, for people: a frame as an array or PNG, an episode as an animated GIF.
+"""Pictures of state records: a frame as an array or PNG, an episode as an animated GIF.
 
-Positions and lengths are in cells, (0, 0) is the map's top left corner. Drawn enlarged, then reduced, for smooth edges.
+Positions and lengths are in cells, (0, 0) is the map's top left corner. Pictures are drawn enlarged,
+then reduced, for smooth edges.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 _ENLARGE = 4
 _CELL_SIZES = 16, 128  # pixels: below, details vanish; above, the frames of an episode take more than 400 MB
-_GIF_COLOURS = 127  # and one transparent colour for pixels that do not change
+_GIF_COLOURS = 127  # the last palette entry is transparent, for pixels that do not change
 
 
 def draw_frame(
@@ -69,7 +70,7 @@ def save_episode(
     cell: int = 32,
     fps: int = 8,
 ) -> None:
-    """Write an episode as a GIF of T frames that loops endlessly. The file appears complete or not at all.
+    """Write an episode as a GIF of T frames that loops endlessly. The file is written atomically.
 
     Args:
         path: the file to write.
@@ -93,7 +94,7 @@ def encode_episode(
         fps: frames per second, 1 to 50.
 
     Raises:
-        OptionError: as in `draw_frame`, if there is no record, or if rewards or fps do not fit.
+        OptionError: as in `draw_frame`, or for no records, rewards of another shape, or an impossible fps.
     """
     records = _checked(layout, records, 2, cell)
     rewards = np.full(len(records), np.nan) if rewards is None else np.asarray(rewards)
@@ -107,7 +108,7 @@ def encode_episode(
     colours, dither = _shared_palette(frames), _pillow()[0].Dither.NONE
     first, *rest = (frame.quantize(palette=colours, dither=dither) for frame in frames)
     other = {"duration": round(1000 / fps), "loop": 0}
-    palette = bytes(colours.getpalette() or [])  # passed explicitly, it is written once instead of once per frame
+    palette = bytes(colours.getpalette() or [])  # an explicit palette is written once, not once per frame
     content = BytesIO()
     first.save(content, format="GIF", save_all=True, append_images=rest, palette=palette, optimize=True, **other)
     return content.getvalue()
@@ -139,7 +140,7 @@ def _checked(layout: Layout, records: np.ndarray, dimensions: int, cell: int) ->
 
 
 def _shared_palette(frames: list[Image.Image]) -> Image.Image:
-    """The colours that are most frequent in any single frame, so that a colour of few frames is kept."""
+    """Return the palette: the most frequent colours of any single frame, which keeps colours of few frames."""
     most = Counter()
     for frame in frames:
         most |= Counter({colour: count for count, colour in frame.getcolors(frame.width * frame.height) or []})
@@ -154,7 +155,7 @@ def _font(pixels: int) -> Any:
 
 
 class _Picture(Canvas):
-    """An enlarged picture."""
+    """Canvas that draws an enlarged Pillow image."""
 
     def __init__(self, width: float, height: float, cell: int) -> None:
         image, draw, _ = _pillow()
@@ -167,7 +168,7 @@ class _Picture(Canvas):
         self.pen.rounded_rectangle((left, top, left + wide - 1, top + high - 1), self.unit * radius, fill)
 
     def disc(self, x: float, y: float, radius: float, fill: tuple, part: float = 1) -> None:
-        """A disc, or the first `part` (0..1) of one, clockwise from the top."""
+        """Draw a disc, or a sector of `part` (0..1) of it, clockwise from the top."""
         bounds = [self.unit * v for v in (x - radius, y - radius, x + radius, y + radius)]
         self.pen.pieslice(bounds, -90, 360 * part - 90, fill)
 
@@ -181,7 +182,7 @@ class _Picture(Canvas):
         self.pen.rectangle(scaled, outline=fill, width=round(self.unit * thickness))
 
     def text(self, x: float, y: float, words: str, size: float, fill: tuple, anchor="mm", room: float = 99) -> None:
-        """Text, smaller than `size` where that is wider than `room`."""
+        """Draw text, shrunk if it is wider than `room`."""
         width = self.pen.textlength(words, _font(round(self.unit * size))) / self.unit
         font = _font(max(1, int(self.unit * size * room / max(room, width))))
         self.pen.text((self.unit * x, self.unit * y), words, fill, font, anchor, stroke_width=round(font.size / 40))

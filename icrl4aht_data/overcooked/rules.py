@@ -1,4 +1,4 @@
-"""The rules: one step of the game as a pure function of its arguments, batch first, for NumPy and JAX alike.
+"""The rules: one step of the game as a pure function, for NumPy and JAX arrays, batch axes first.
 
 Order of a step (paper, App. A.1; constants checked against OvercookedV2):
 1. agents turn and move; 2. collisions and 3. exchanges of cells are undone; 4. agent 0 interacts, then agent 1, in the
@@ -35,8 +35,8 @@ CORRECT, WRONG, PRESSED, PLACED, USEFUL_PLACEMENT, TOOK_DISH, USEFUL_DISH, USEFU
 
     CORRECT, WRONG      delivered the current recipe's dish, or another one
     PRESSED             pressed a button
-    PLACED              put an ingredient into a pot; USEFUL_PLACEMENT: one that the recipe still needs there
-    TOOK_DISH           took a dish out of a pot; USEFUL_DISH: the current recipe's
+    PLACED              put an ingredient into a pot; USEFUL_PLACEMENT: an ingredient that the recipe still needs
+    TOOK_DISH           took a dish out of a pot; USEFUL_DISH: a dish of the current recipe
     USEFUL_PLATE        took a plate while more pots are in use than plates in hands, and no plate is on a counter
 """
 
@@ -47,7 +47,7 @@ class StepResult(NamedTuple):
     Args:
         state: uint8 (B, S), the next state record.
         reward: float32 (B,), the team's reward.
-        shaped: float32 (B, 2), each agent's own shaped reward, not part of the team's.
+        shaped: float32 (B, 2), each agent's shaped reward, not part of the team's.
         events: uint8 (B, 2), event bits of each agent.
     """
 
@@ -64,15 +64,15 @@ def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> S
         layout: the layout.
         record: uint8 (B, S), the state record.
         actions: integers (B, 2), action ids 0..5 of ego and teammate.
-        next_recipe: uint8 (B,), item byte of the recipe that follows if this step has a correct delivery.
+        next_recipe: uint8 (B,), item byte of the recipe that a correct delivery in this step is followed by.
 
     Returns:
-        The next states, rewards and events; equal bytes from NumPy and JAX.
+        The next states, rewards and events; NumPy and JAX give equal bytes.
     """
     xp = record.__array_namespace__()
     state = unpack(layout, record)
     state = _move(layout, xp, state, actions)
-    # Both agents are judged by the plates in hand before either interacts.
+    # Both agents' events count the plates in hand before either interacts.
     plates_in_hand = xp.sum(state.hands == PLATE, axis=-1, dtype=xp.uint8)
     recipe = state.recipe
     events = []
@@ -83,7 +83,7 @@ def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> S
     happened = xp.stack(events, axis=-1)
     correct = xp.any((happened & CORRECT) > 0, axis=-1)
 
-    # Timers set in this step count down in it as well: a press is visible in BUTTON_STEPS - 1 observations.
+    # Timers set in this step also count down in it: a press is visible in BUTTON_STEPS - 1 observations.
     ticking = state.pot_timers > 0
     pot_timers = xp.astype(state.pot_timers - ticking, xp.uint8)
     pot_items = xp.astype(state.pot_items | ((ticking & (pot_timers == 0)) * np.uint8(COOKED)), xp.uint8)
@@ -99,12 +99,12 @@ def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> S
 
 
 def team_reward(events: Array) -> Array:
-    """float32 (B,): the team reward of the event bits uint8 (B, 2)."""
+    """Return the team reward, float32 (B,), of event bits uint8 (B, 2)."""
     return _score(events, {CORRECT: DELIVERY_REWARD, WRONG: WRONG_DELIVERY_REWARD, PRESSED: PRESS_REWARD}).sum(axis=-1)
 
 
 def shaped_rewards(events: Array) -> Array:
-    """float32 (B, 2): the shaped rewards of the event bits uint8 (B, 2), each agent's own."""
+    """Return each agent's shaped reward, float32 (B, 2), of event bits uint8 (B, 2)."""
     return _score(
         events,
         {
@@ -121,13 +121,13 @@ def _score(events: Array, values: dict[int, float]) -> Array:
 
 
 def look_up(table: np.ndarray, index: Array) -> Array:
-    """`table[index]` with a NumPy table and an index of either library."""
+    """Return `table[index]` for a NumPy table and a NumPy or JAX index."""
     xp = index.__array_namespace__()
     return xp.take(xp.asarray(table), xp.astype(index, xp.int32), axis=0)
 
 
 def _move(layout: Layout, xp, state: State, actions: Array) -> State:
-    """Steps 1 to 3: a directional action always turns; no agent enters an occupied or contested cell."""
+    """Apply steps 1 to 3 (movement): a directional action always turns; no agent enters an occupied or contested cell."""
     moved = look_up(layout.moves.reshape(-1), xp.astype(state.positions, xp.int32) * 6 + actions)
     old0, old1 = state.positions[..., 0], state.positions[..., 1]
     new0, new1 = moved[..., 0], moved[..., 1]
@@ -144,7 +144,7 @@ def _move(layout: Layout, xp, state: State, actions: Array) -> State:
 def _interact(
     layout: Layout, xp, state: State, agent: int, acting: Array, plates_in_hand: Array
 ) -> tuple[State, Array]:
-    """Step 4 for one agent, where `acting` bool (B,): the new state and the agent's event bits uint8 (B,)."""
+    """Apply step 4 (interaction) of one agent where `acting`, bool (B,); return state and event bits uint8 (B,)."""
     hand = state.hands[..., agent]
     pose = xp.astype(state.positions[..., agent], xp.int32) * 4 + state.facings[..., agent]
     faced = look_up(_faced(layout), pose)
@@ -170,7 +170,7 @@ def _interact(
 
     dish = state.recipe | np.uint8(PLATE | COOKED)
     correct = delivers & (hand == dish)
-    # The hand has a count of 1, the lower bit of its type; with the upper bit it masks the type's count.
+    # The hand has a count of 1, the lower bit of its type's count; both bits together mask that count.
     same_type = hand | hand << 1
     useful_placement = adds & ((content & same_type) < (state.recipe & same_type))
     useful_dish = takes_dish & ((content | PLATE) == dish)
@@ -208,7 +208,7 @@ def _interact(
 
 
 def _faced(layout: Layout) -> np.ndarray:
-    """int32 (cells * 4,): kind | pile << 8 | number << 16 of the cell that an agent faces, by position and facing.
+    """Return int32 (cells * 4,): kind | pile << 8 | number << 16 of the faced cell, by position and facing.
 
     The number counts the cells of the same kind: pots, counters or buttons.
     """
@@ -224,5 +224,5 @@ def _range(xp, n: int) -> Array:
 
 
 def _read(xp, at: Array, values: Array) -> Array:
-    """uint8 (B,): the value of (B, K) selected by the one-hot `at` (B, K), or 0 if it selects none."""
+    """Return uint8 (B,): the value of (B, K) selected by the one-hot `at` (B, K), or 0 if it selects none."""
     return xp.sum(xp.where(at, values, xp.zeros_like(values)), axis=-1, dtype=xp.uint8)

@@ -1,4 +1,4 @@
-"""The state record: everything the rules and the observations need, in S bytes (uint8), S = 14..36 by layout.
+"""The state record: all inputs of the rules and the observations in S bytes (uint8), S = 14..36 by layout.
 
 Columns, in order (a = agent 0, the ego, then agent 1, the teammate):
 
@@ -27,17 +27,17 @@ import numpy as np
 from icrl4aht_data.overcooked.layouts import COOKED, FACINGS, PLATE, Layout
 
 Array = Any
-"""A NumPy or JAX array: the code in this package runs on either, through `__array_namespace__`."""
+"""A NumPy or JAX array; functions find the library through `__array_namespace__`."""
 
 POT_STEPS = 20
-"""Steps that a full pot cooks (paper, App. A.1)."""
+"""Steps until a full pot is cooked (paper, App. A.1)."""
 
 BUTTON_STEPS = 10
-"""Timer that a press sets (paper, App. A.1)."""
+"""Timer value set by pressing a button (paper, App. A.1)."""
 
 
 class State(NamedTuple):
-    """A state record's columns, uint8. `B` denotes the batch dimensions, which come first everywhere.
+    """The columns of a state record, uint8. `B` denotes the batch dimensions, which come first.
 
     Args:
         positions: (B, 2), flat cell numbers of ego and teammate.
@@ -63,7 +63,7 @@ class State(NamedTuple):
 
 
 def columns(layout: Layout) -> State:
-    """Position of each field in the record: slices, and an int for the two single columns."""
+    """Return the position of each field in the record: slices, and an int for the two single columns."""
     pots, buttons, counters = len(layout.pots), len(layout.buttons), len(layout.counters)
     ends = np.cumsum([8, pots, pots, buttons, counters]).tolist()
     rest = [slice(a, b) for a, b in pairwise(ends)]
@@ -71,7 +71,7 @@ def columns(layout: Layout) -> State:
 
 
 def record_size(layout: Layout) -> int:
-    """S, the number of bytes of a state record."""
+    """Return S, the number of bytes of a layout's state record."""
     return 8 + 2 * len(layout.pots) + len(layout.buttons) + len(layout.counters)
 
 
@@ -95,7 +95,7 @@ def swapped(record: Array) -> Array:
 
 
 def start(layout: Layout, positions: Array, facings: Array, recipe: Array) -> Array:
-    """The record of an episode's first step: hands, pots and counters empty (paper, App. A.1).
+    """Return the record of an episode's first step: hands, pots and counters empty (paper, App. A.1).
 
     Args:
         layout: the layout.
@@ -113,7 +113,7 @@ def start(layout: Layout, positions: Array, facings: Array, recipe: Array) -> Ar
 
 
 def faults(layout: Layout, record: np.ndarray) -> list[str]:
-    """Descriptions of impossible values in the records uint8 (B, S); empty if every value is in range.
+    """Return descriptions of impossible values in records uint8 (B, S); empty if every value is in range.
 
     Checks ranges only (distinct positions on floor, item bytes that the rules can produce, timers, recipe made of three
     ingredients), not whether the state can be reached.
@@ -143,12 +143,12 @@ def faults(layout: Layout, record: np.ndarray) -> list[str]:
 
 
 def ingredient_count(item: Array) -> Array:
-    """The number of ingredients in an item byte."""
+    """Return the number of ingredients in an item byte."""
     return ((item >> 2) & 3) + ((item >> 4) & 3) + ((item >> 6) & 3)
 
 
 def possible_items(layout: Layout) -> np.ndarray:
-    """bool (256,): the item bytes that the rules can produce: nothing, a plate, 1..3 ingredients, soups, dishes."""
+    """Return bool (256,), True for the item bytes that the rules can produce: nothing, a plate, 1..3 ingredients, soups, dishes."""
     item = np.arange(256)
     count = ingredient_count(item)
     known = item >> (2 + 2 * len(layout.ingredients)) == 0

@@ -1,7 +1,7 @@
-"""State records -> the 25 visible cells as numbers of words, batch first, for NumPy and JAX alike.
+"""Words: ids of the contents of the 25 visible cells, computed from state records, for NumPy and JAX.
 
-A *word* is what one visible cell shows, that is its observation channels. The rules allow only a few hundred words on a
-layout, so what a network computes of every cell by itself can be computed once per word and looked up. Records of
+A *word* is the vector of observation channels of one visible cell. The rules allow only a few hundred words on a
+layout, so a network can compute its per-cell layers once per word and look them up. Records of
 several layouts share their lookup tables, so one batch may mix layouts.
 
 `B` denotes the batch dimensions, `S` the bytes of a state record, `V` the number of words, `C` channels.
@@ -29,14 +29,14 @@ from icrl4aht_data.overcooked.state import (
 )
 
 # What a cell shows follows from its kind and two numbers of the record: a byte (an item or a recipe), and a timer, flag
-# or facing. Lookup tables have an entry for every pair of numbers, so that no value of a record can index outside.
+# or facing. Lookup tables have an entry for every pair of numbers, so no record can index outside.
 _SECONDS = 32
 _PAIRS = 256 * _SECONDS
 _FIXED, _RECIPE, _GOAL, _POT, _BUTTON, _COUNTER, _SELF, _OTHER = range(8)
 
 
 class _Slot(NamedTuple):
-    """Cells that show the same part of the record.
+    """A part of the record and the cells that show it.
 
     Args:
         kind: selects the lookup table.
@@ -52,13 +52,13 @@ class _Slot(NamedTuple):
 
 
 class CellWords:
-    """The words of the cells that are visible on one or several layouts; `cell_words` makes it.
+    """Vocabulary of the visible cells on one or several layouts; created by `cell_words`.
 
     Attributes:
         layouts: the layouts; their observations have the same channels.
-        canonical: whether these are the canonical channels, or the layouts' own.
-        channels: uint8 (V + 1, C), observation channels of each word. The last row, 255 everywhere, is the word
-            of contents that the rules cannot produce.
+        canonical: whether the channels are the canonical ones, or the layouts' own.
+        channels: uint8 (V + 1, C), observation channels of each word. The last row, 255 everywhere, stands for
+            contents that the rules cannot produce.
     """
 
     def __init__(self, layouts: Sequence[Layout], canonical: bool = False) -> None:
@@ -66,7 +66,7 @@ class CellWords:
         fixed = [_fixed_cells(layout, canonical) for layout in layouts]
         contents = [_contents(layout, canonical) for layout in layouts]
         shown = fixed + [channels for kinds in contents for _, channels in kinds.values()]
-        # Rows are sorted, so that word 0 shows nothing: empty floor, and what is outside the map.
+        # Rows are sorted, so word 0 is all zero: empty floor, and cells outside the map.
         words, numbers = np.unique(np.concatenate(shown), axis=0, return_inverse=True)
         self.channels = np.append(words, np.full_like(words[:1], 255), axis=0)
         parts = iter(np.split(numbers.reshape(-1).astype(np.int16), np.cumsum([len(rows) for rows in shown])[:-1]))
@@ -79,7 +79,7 @@ class CellWords:
                 self._words[number, kind, pairs] = next(parts)
 
     def _fill_views(self, fixed: list[np.ndarray]) -> None:
-        """Fills the lookup tables by the observer's cell, and those of the slots; slot 0 is that of all fixed cells."""
+        """Fill the lookup tables of observer cells and of slots; slot 0 stands for all fixed cells."""
         count, cells = len(self.layouts), max(layout.cells for layout in self.layouts)
         slots = [[_Slot(_FIXED, [], 0), *_slots(layout)] for layout in self.layouts]
         self._slot = np.zeros((count, cells, VISIBLE), np.uint8)
@@ -120,7 +120,7 @@ class CellWords:
             number = xp.astype(xp.broadcast_to(number, batch), xp.int32)
 
         def at(table: np.ndarray, *indices: Array) -> Array:
-            """Returns table[number, *indices]; the table's other axes stay."""
+            """Return table[number, *indices], with the table's other axes."""
             flat = number
             for index, size in zip(indices, table.shape[1:], strict=False):
                 flat = flat * size + xp.astype(index, xp.int32)
@@ -154,8 +154,8 @@ class CellWords:
         """Return the entries of a flat observation that can differ from 0 on these layouts.
 
         Args:
-            agents: the agents that observe: 0 (ego), 1 (teammate). An agent stays in its room, so one sees less than
-                both.
+            agents: the agents that observe: 0 (ego), 1 (teammate). An agent never leaves its room, so both together see more
+                than one.
 
         Returns:
             int64 (E,), ascending: cell * C + channel, with cells of the window in reading order.
@@ -175,10 +175,10 @@ class CellWords:
 
 
 def cell_words(layouts: Sequence[Layout], canonical: bool = False) -> CellWords:
-    """Return the words of the cells that are visible on these layouts.
+    """Return the vocabulary of the visible cells on these layouts, cached.
 
     Args:
-        layouts: one or several, with as many own channels unless they are canonical.
+        layouts: one or several; with their own channels, all must have equally many.
         canonical: whether words show the canonical channels, see `channels`, instead of the layouts' own.
     """
     return _cached(tuple(layouts), canonical)
@@ -202,7 +202,7 @@ def _slots(layout: Layout) -> list[_Slot]:
 
 
 def _fixed_cells(layout: Layout, canonical: bool) -> np.ndarray:
-    """uint8 (cells * 25, C): what the window of an observer on each cell shows of an empty map, without agents."""
+    """Return uint8 (cells * 25, C): the window around each cell of an empty map without agents."""
     record = np.zeros((layout.cells, record_size(layout)), np.uint8)
     record[:, 0] = np.arange(layout.cells)
     obs = observe(layout, record, 0, canonical)
@@ -211,7 +211,7 @@ def _fixed_cells(layout: Layout, canonical: bool) -> np.ndarray:
 
 
 def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Kind -> pairs of numbers that the rules allow, int (n,), and what the cell shows then, uint8 (n, C)."""
+    """Return kind -> pairs of numbers that the rules allow, int (n,), and the channels they show, uint8 (n, C)."""
     item = np.arange(256)
     possible, count = possible_items(layout), ingredient_count(item)
     carried = np.flatnonzero(possible & ((item & PLATE > 0) | (count <= 1)))
@@ -232,13 +232,13 @@ def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np
     record[:, 0] = np.flatnonzero(layout.walkable)[0]
     record[:, where.facings.start], record[:, where.hands.start] = bodies >> 8, bodies & 255
     own = observe(layout, record, 0, canonical).reshape(len(bodies), VISIBLE, -1)[:, CENTRE]
-    channels = fixed_channels(layout, canonical).start // 2  # of one agent; those of the other one follow
+    channels = fixed_channels(layout, canonical).start // 2  # channels of one agent; the other agent's follow
     own[:, channels:] = 0
     return found | {_SELF: (bodies, own), _OTHER: (bodies, np.roll(own, channels, axis=-1))}
 
 
 def _shown(layout: Layout, slot: _Slot, pairs: np.ndarray, observer: int, cell: int, canonical: bool) -> np.ndarray:
-    """uint8 (n, C): what a slot's cell shows to an observer on another cell."""
+    """Return uint8 (n, C): the channels of a slot's cell, seen from another cell."""
     record = np.zeros((len(pairs), record_size(layout)), np.uint8)
     record[:, slot.byte] = pairs & 255
     if slot.second is not None:

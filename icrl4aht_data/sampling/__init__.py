@@ -1,1 +1,1 @@
-"""AD and DPT batches: draws, samplers, prefetching."""
+"""Samplers of AD and DPT batches, random draws, and prefetching."""

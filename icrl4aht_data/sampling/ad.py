@@ -1,4 +1,4 @@
-"""Batches for Algorithm Distillation (paper, App. D.4). `B` denotes the batch size, `L` the windows' length."""
+"""Batches for Algorithm Distillation (paper, App. D.4). `B` denotes the batch size, `L` the window length."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import jax  # noqa: F401 - in the sampler's base class
 
 A = TypeVar("A")
-"""The type of a batch's arrays: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
+"""Type of the arrays of a batch: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
 
 
 class ADBatch(NamedTuple, Generic[A]):
@@ -29,22 +29,21 @@ class ADBatch(NamedTuple, Generic[A]):
 
     Rows are padded with zeros if the history, or the part selected by `episodes` or `curriculum`, is shorter than L.
     The `prev_*` fields hold the values of the previous step of the history, also at the first step of a window or of an
-    episode. Where `is_first` is True no step precedes; the zeros there are no values, though 0 is the action "up".
+    episode. Where `is_first` is True there is no previous step: the zeros are fillers, although 0 is the action "up".
 
     Attributes:
         obs: float32 or uint8 (B, L, 5, 5, C): the ego's observations; with obs="state" uint8 (B, L, S): state records.
         prev_actions: int32 (B, L): the ego's actions in the previous steps, 0..5; 0 at a history's first step.
         prev_rewards: float32 (B, L): the team's rewards in the previous steps; 0 at a history's first step.
-        target_actions: int32 (B, L): what a model learns to predict, 0..5: the ego's actions, or with `labels` what the
-            expert or the oracle would do instead. The actions taken are then those of the next column of
-            `prev_actions`.
+        target_actions: int32 (B, L): what a model learns to predict, 0..5: the ego's actions, or with `labels` those of the
+            expert or the oracle. The actions taken are then in the next column of `prev_actions`.
         dones: bool (B, L): True at the last step of an episode.
         attention_mask: bool (B, L): False on padding.
         prev_teammate_actions: int32 (B, L): the teammate's actions in the previous steps, 0..5, and 0 at a history's
             first step; None unless the sampler was made with teammate_actions=True.
         layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
             several layouts.
-        is_first: bool (B, L): True at a history's first step, where the `prev_*` fields are fillers.
+        is_first: bool (B, L): True at the first step of a history, where the `prev_*` fields are fillers.
         families: int32 (B,): index of the family of each row's teammate in `benchmark.facts.all_families()`; None
             unless the sampler was made with families=True.
     """
@@ -65,13 +64,13 @@ class ADBatch(NamedTuple, Generic[A]):
 
 
 class _Windows(NamedTuple):
-    """Windows of a batch.
+    """The drawn windows of a batch.
 
     Attributes:
         position: int64 (B,), positions in the selection.
         starts: int64 (B,), first steps.
-        rows: the steps of each window, as in `ReadRequest`: `starts`, or all of them, int64 (B, L).
-        previous: the steps before them, in the same way; -1 before a history's first step.
+        rows: the steps of each window as in `ReadRequest`: `starts`, or every step, int64 (B, L).
+        previous: the step before each of `rows`; -1 before the first step of a history.
         valid: int64 (B,), number of steps of each window; padding follows them.
     """
 
@@ -83,7 +82,7 @@ class _Windows(NamedTuple):
 
 
 class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
-    """Windows for Algorithm Distillation: a sequence of batches, each a pure function of (selection, options, seed, i).
+    """A sequence of batches for Algorithm Distillation, each a pure function of (selection, options, seed, i).
 
     A history is drawn uniformly from the selection (or by `weights`), a start uniformly from 0..T - L. Windows cross
     episode boundaries. Rows are padded with zeros at the end if the history, or the part selected by `episodes` or
@@ -93,30 +92,29 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
     lite or full. To resume, continue with the next i.
 
     Args:
-        dataset: a selection with observations of one shape: of layouts with as many channels, or channels="canonical".
+        dataset: a selection with observations of one shape: layouts with equally many channels, or channels="canonical".
         batch_size: B, over all processes.
         length: L, in steps.
-        every: windows consist of every n-th episode of a history, so that a window of few episodes spans learning. The
-            first of them is drawn for each window, and `prev_*` are of the episode before in the window.
-        labels: targets are labels of this kind, "expert" or "oracle", instead of the actions that were taken; see
+        every: windows consist of every n-th episode of a history, so a window of few episodes spans learning. The first
+            episode is drawn for each window; `prev_*` come from the previous episode of the window.
+        labels: targets are labels of this kind, "expert" or "oracle", instead of the actions taken; see
             `history.LABELS`.
         families: whether batches have `families`, which a model may learn to predict.
         seed: any non-negative integer below 2**63.
         teammate_actions: whether batches have `prev_teammate_actions`.
         weights: probabilities of the histories: "uniform", "length" (proportional to the steps that windows may
-            contain) or one number per history, float (H,), to which they are proportional.
+            contain) or one non-negative number per history, float (H,).
         episodes: windows stay inside these episodes of each history, such as (0, 10) or (-10, None).
         curriculum: windows stay inside a part of each history that moves with i; see `Curriculum`.
         process_index, process_count: number of this process and of all processes; each gets batch_size / process_count
             rows of every batch.
 
     Warns:
-        WeakLabelsWarning: with `labels`, as `DPTSampler`.
+        WeakLabelsWarning: with `labels`, for the same tasks as in `DPTSampler`.
 
     Raises:
         OptionError: for impossible options, or a selection with observations of several shapes.
-        LabelsMissingError: with teammate_actions=True, if some history has none; with `labels`, if some history has not
-            these.
+        LabelsMissingError: with teammate_actions=True, or with `labels`, if some history does not have them.
     """
 
     batch_type = ADBatch
@@ -134,14 +132,14 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
     ) -> None:
         super().__init__(dataset, batch_size=batch_size, length=length, **options)
         self.every = check_int("every", every, 1)
-        self.drawn_bytes = 32 if every > 1 else 0  # four numbers of each step
+        self.drawn_bytes = 32 if every > 1 else 0  # bytes per step of the four int64 arrays that `_draw` makes
         self.families, self.labels = families, labels
         if labels is not None:
             check_labels(dataset, labels)
             warn_of_weak_labels(dataset, labels)
 
     def options(self) -> dict[str, Any]:
-        # An option with its default is left out, so that positions stored before it existed can be resumed.
+        # Options at their defaults are left out: positions stored before an option existed can still be resumed.
         chosen = {"every": self.every > 1, "labels": self.labels is not None, "families": self.families}
         return super().options() | {name: getattr(self, name) for name, differs in chosen.items() if differs}
 
@@ -163,7 +161,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
 
     @cached_property
     def _family_numbers(self) -> np.ndarray:
-        """The value of `families` for each history of the selection, int32 (H,)."""
+        """Index of each history's family in `all_families()`, int32 (H,)."""
         families = all_families()
         return np.array([families.index(str(name)) for name in self.dataset.column("teammate_family")], np.int32)
 
@@ -182,8 +180,8 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
         low, high = self._draws.steps(i)
         position = weighted_choice(for_history, self._draws.history_weights(low, high), 0, len(low))
         low, high, steps = low[position], high[position], self._draws.kept_steps
-        # A window is drawn from every n-th episode of a history's range, which are `total` steps, and without `every`
-        # from all of its steps. An episode that the history did not finish is no n-th one: it would be a gap.
+        # A window is drawn from the `total` steps of every n-th episode of a history's range, or without `every` from
+        # all steps of the range. An unfinished episode is never one of the n-th: its missing steps would be a gap.
         first, total = np.zeros_like(low), high - low
         if self.every > 1:
             episodes = total // steps
@@ -192,21 +190,21 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
         start = scale_to_range(for_start, np.maximum(total - self.length, 0) + 1)
         valid = np.minimum(total - start, self.length)
         if self.every == 1:
-            # One number for each window: sources copy it as a block, ten times faster than L single rows.
+            # A window is given by its first row: sources then copy it as a block, ten times faster than L single rows.
             return _Windows(position, low + start, low + start, low + start - 1, valid)
-        # Step t of these episodes is step t % steps of the episode number first + n * (t // steps) in the range. The
-        # row of step -1 comes first, for `prev_*`; padding repeats the last step, so that all rows exist.
+        # Step t of these episodes is step t % steps of episode first + n * (t // steps) of the range. The row of step
+        # -1 comes first, for `prev_*`. Padding repeats the last step, since all rows must exist.
         t = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
         rows = low[:, None] + (first[:, None] + self.every * (t // steps)) * steps + t % steps
-        # Nothing in the window's episodes precedes their first step: there `prev_*` are of the history's step before.
+        # Before the first of these episodes, `prev_*` come from the step that precedes it in the history.
         rows[start == 0, 0] = (low + first * steps - 1)[start == 0]
         return _Windows(position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid)
 
     def batch(self, i: int, out: ADBatch[np.ndarray] | None = None) -> ADBatch[np.ndarray]:
-        batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
+        batch = self._buffer(out)  # before drawing, so that a batch that is too large is refused at once
         position, starts, rows, previous, valid = self._draw(i)
         if self.every > 1:
-            previous = np.maximum(previous, 0)  # sources read a window from row -1 on, but no single row -1
+            previous = np.maximum(previous, 0)  # sources accept -1 as first row of a window, not as a single row
 
         records = self._observer.records(batch.obs)
         targets = "actions" if self.labels is None else f"{self.labels}_actions"
@@ -234,7 +232,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
         batch.attention_mask[...] = True
         if valid.min() < self.length:
             np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)
-            # What was read on padding is of later episodes, or rendered of the zeros after the history's end.
+            # Padding was filled with rows of later episodes, or with observations rendered from zeros.
             for array in (batch.obs, *(read.out for read in reads[1:])):
                 array[~batch.attention_mask] = 0
         return batch

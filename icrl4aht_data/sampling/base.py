@@ -1,4 +1,4 @@
-"""Base of the AD and the DPT sampler: a sequence of batches with declared arrays, divided among processes."""
+"""Base class of the AD and DPT samplers: a sequence of batches of declared shapes, divided among processes."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ B = TypeVar("B", bound=tuple)
 """A batch: a named tuple of NumPy arrays, some of which may be None."""
 
 D = TypeVar("D", bound=tuple)
-"""A batch on a device: the named tuple with JAX arrays."""
+"""A batch on a device: a named tuple of JAX arrays."""
 
 
 class SamplerOptions(TypedDict, total=False):
-    """Options of both samplers; `ADSampler` and `DPTSampler` describe them."""
+    """Options that both samplers share; see `ADSampler` and `DPTSampler`."""
 
     seed: int
     teammate_actions: bool
@@ -42,8 +42,7 @@ class SamplerOptions(TypedDict, total=False):
 class Sampler(Generic[B, D]):
     """A sequence of batches, each a pure function of its number; see `ADSampler` and `DPTSampler` for the options.
 
-    `len(sampler)` is the number of batches that together have as many steps as the selection; larger batch numbers are
-    valid too.
+    `len(sampler)` batches have as many steps as the selection; larger batch numbers are valid too.
 
     Attributes:
         dataset: the selection.
@@ -57,9 +56,9 @@ class Sampler(Generic[B, D]):
 
     batch_type: type[B]
     length_option = "length"
-    """The option that sets `length`, for messages."""
+    """Name of the option that sets `length`, for messages."""
     drawn_bytes = 0
-    """Bytes of memory that drawing takes for each step of a batch."""
+    """Bytes of temporary memory per step of a batch while drawing."""
 
     def __init__(
         self,
@@ -91,7 +90,7 @@ class Sampler(Generic[B, D]):
 
     @cached_property
     def specs(self) -> dict[str, ArraySpec]:
-        """Declared dtype and shape of every array of a batch."""
+        """Field -> dtype and shape of the array in every batch."""
         raise NotImplementedError
 
     def __len__(self) -> int:
@@ -120,7 +119,7 @@ class Sampler(Generic[B, D]):
         return self.batch_size // self.process_count
 
     def batch(self, i: int, out: B | None = None) -> B:
-        """Return batch i; it is written into `out`, a batch from `empty()`, if that is given.
+        """Return batch i, written into `out`, a batch from `empty()`, if given.
 
         Raises:
             OptionError: if `out` is of another kind, shape or dtype, or the batch is larger than the free memory.
@@ -128,7 +127,7 @@ class Sampler(Generic[B, D]):
         raise NotImplementedError
 
     def empty(self) -> B:
-        """Return a batch of uninitialised arrays to pass to `batch` as `out`: reuse is faster than new memory.
+        """Return a batch of uninitialised arrays to pass to `batch` as `out`: reusing memory is faster.
 
         Raises:
             OptionError: if it is larger than the free memory.
@@ -136,7 +135,7 @@ class Sampler(Generic[B, D]):
         self._check_memory()
         try:
             return self.batch_type(**{name: np.empty(spec.shape, spec.dtype) for name, spec in self.specs.items()})
-        except MemoryError as error:  # a limit of the process, or memory that was taken meanwhile
+        except MemoryError as error:  # the process has a memory limit, or memory was taken since the check
             raise self._too_large() from error
 
     @overload
@@ -150,11 +149,11 @@ class Sampler(Generic[B, D]):
     ) -> Batches[D]: ...
 
     def batches(self, start: int = 0, stop: int | None = None, **options: Any) -> Batches[Any]:
-        """Return an iterator over batches start, start + 1, .. that prefetches on a thread; see `Batches`."""
+        """Return an iterator over batches from `start` on that prefetches on a thread; see `Batches`."""
         return Batches(self, start, stop, **options)
 
     def options(self) -> dict[str, Any]:
-        """Return all options that determine the batches, as JSON; `Batches` compares them when it resumes."""
+        """Return the options that determine the batches, as JSON; `Batches` compares them on resuming."""
         return {
             "sampler": type(self).__name__,
             "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),
@@ -170,13 +169,13 @@ class Sampler(Generic[B, D]):
 
     def _random(self, i: int, count: int) -> np.ndarray:
         """Return this process's share of batch i's random integers below 2**32, uint64 (count, local_size)."""
-        # Every process draws for all rows, so that a batch does not depend on how many processes share it.
+        # Every process draws all rows, so a batch does not depend on the number of processes.
         first = self.process_index * self.local_size
         return random_uint32(self.seed, i, count, self.batch_size)[:, first : first + self.local_size]
 
     @cached_property
     def _bytes(self) -> int:
-        """Bytes of memory that making a batch takes: its arrays, the records they are rendered from, and the draws."""
+        """Bytes of memory needed to make a batch: its arrays, the records rendered into them, and the draws."""
         arrays = sum(array_bytes(spec.shape, spec.dtype) for spec in self.specs.values())
         records = sum(self._observer.record_bytes(spec.shape) for spec in self.specs.values() if len(spec.shape) > 3)
         return arrays + records + self.drawn_bytes * self.local_size * self.length
@@ -194,7 +193,7 @@ class Sampler(Generic[B, D]):
         """Return the error for batches that do not fit into memory: the sizes, and the options that change them."""
         free, rows = free_memory(), self.local_size
         name, spec = max(self.specs.items(), key=lambda item: array_bytes(item[1].shape, item[1].dtype))
-        most = free * rows // self._bytes // 2 * self.process_count  # half of it: the next batch is made meanwhile
+        most = free * rows // self._bytes // 2 * self.process_count  # half of it, because the next batch is prefetched
         advice = f"take batch_size = {most} or less" if most else f"take a smaller {self.length_option}"
         lighter = ', or obs = "uint8" or "state"' if self.dataset.obs == "float32" else ""
         return OptionError(
@@ -204,12 +203,12 @@ class Sampler(Generic[B, D]):
         )
 
     def _layout_specs(self) -> dict[str, ArraySpec]:
-        """Return the spec of `layouts`, which batches of state records of several layouts have."""
+        """Return the spec of the field `layouts`, present in batches of state records of several layouts."""
         several = self.dataset.obs == "state" and len(self.layouts) > 1
         return {"layouts": ArraySpec("int32", (self.local_size,))} if several else {}
 
     def _buffer(self, out: B | None) -> B:
-        """Return `out` if it has the declared arrays, or a new batch for None; see `empty`."""
+        """Return `out` after checking its arrays, or a new batch if it is None; see `empty`."""
         if out is None:
             return self.empty()
         if not isinstance(out, self.batch_type):
@@ -227,7 +226,7 @@ class Sampler(Generic[B, D]):
 
 
 def warn_of_mixed_splits(dataset: Selection) -> None:
-    """Warn if training histories are sampled together with those of other splits, by which a model is judged."""
+    """Warn if training histories are sampled together with validation or test histories."""
     counts = dataset.counts("split")
     if "train" in counts and len(counts) > 1:
         found = ", ".join(f"{split} ({number})" for split, number in counts.items())
@@ -235,23 +234,25 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
             f"the histories are of several splits, {found}: a model trained on them all has seen the teammates that it "
             f'is judged with. Choose the training histories: load_icrl4aht(split="train"), or ds.filter(split="train")',
             MixedSplitsWarning,
-            stacklevel=3,  # the call of Dataset.ad or Dataset.dpt
+            stacklevel=3,  # the line that called Dataset.ad or Dataset.dpt
         )
 
 
 def describe_batch(self: Any) -> str:
-    """Return the fields with dtypes and shapes as text, one per line."""
+    """Return the dtype and shape of each field as text, one field per line."""
     present = {name: array for name, array in self._asdict().items() if array is not None}
     width = max(map(len, present), default=0)
     return "\n".join(f"{name:<{width}}  {_describe_array(array)}" for name, array in present.items())
 
 
 def _describe_array(array: Any) -> str:
-    if not hasattr(array, "dtype") or not hasattr(array, "shape"):  # a tree of something else, such as shardings
+    if not hasattr(array, "dtype") or not hasattr(
+        array, "shape"
+    ):  # a batch type that contains other objects, such as shardings
         return repr(array)
     return f"{str(array.dtype).removeprefix('torch.'):<8} {tuple(array.shape)}"
 
 
 def batch_repr(self: Any) -> str:
-    """Return a batch's type, and its fields with dtypes and shapes instead of the arrays' numbers."""
+    """Return a batch's type, and the dtype and shape of each field."""
     return f"{type(self).__name__}(\n{indent(describe_batch(self), '    ')}\n)"

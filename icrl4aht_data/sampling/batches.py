@@ -20,35 +20,35 @@ class BatchSource(Protocol[B]):
     """The methods of a sampler that `Batches` calls."""
 
     def batch(self, i: int, out: B | None = None) -> B:
-        """Batch i, written into `out` if it is given."""
+        """Return batch i, written into `out` if given."""
         ...
 
     def empty(self) -> B:
-        """A batch of uninitialised arrays for `out`."""
+        """Return a batch of uninitialised arrays for `out`."""
         ...
 
     def options(self) -> dict[str, Any]:
-        """All options that determine the batches, as JSON."""
+        """Return the options that determine the batches, as JSON."""
         ...
 
 
 class Batches(Iterator[B], Generic[B]):
     """An iterator over `sampler[start]`, `sampler[start + 1]`, .., prefetched by a thread.
 
-    A loop that is left by `break` and started again continues with the next batch; after batch `stop - 1` there are no
-    more. `len(sampler)` batches have as many steps as the selection, which makes one pass over the data on average.
+    After `break`, a new loop continues with the next batch; batch `stop - 1` is the last. `len(sampler)` batches have as
+    many steps as the selection: one pass over the data on average.
 
-    An exception of the thread is raised by `next`. The thread stops at the end of a `with` block, after `close()` and
-    at the end of the iterator. A forked process does not have it: make another iterator of the sampler there.
+    Exceptions in the thread are raised by `next`. The thread stops at the end of a `with` block, after `close()` and at
+    the end of the iterator. Threads do not survive a fork: make a new iterator in the forked process.
 
     Args:
         sampler: makes the batches.
         start: number of the first batch.
         stop: number after the last batch; None for an endless iterator.
-        prefetch: number of batches prepared in advance; with 0 `next` makes each one itself, without a thread.
+        prefetch: number of batches prepared in advance; with 0, `next` makes each batch itself, without a thread.
         device: a jax.Device or Sharding to which batches are copied as JAX arrays, while the previous batch is in use.
             If a sharding spans processes, each process contributes its share of the rows. Needs JAX.
-        reuse: fill the same few buffers instead of allocating memory, which is slower. A batch is then valid only until
+        reuse: fill the same few buffers, which is faster than allocating memory. A batch is then valid only until
             the next one is taken. With a device, host buffers are always reused.
 
     Attributes:
@@ -81,7 +81,7 @@ class Batches(Iterator[B], Generic[B]):
         self._submitted = start
         self._pending: deque[tuple[Future[B], B | None]] = deque()  # submitted batches with their buffers
         self._free: list[B] = []
-        self._lent: B | None = None  # the buffer of the batch that the consumer has
+        self._lent: B | None = None  # buffer of the batch in use by the consumer
 
     def __iter__(self) -> Batches[B]:
         return self
@@ -97,8 +97,8 @@ class Batches(Iterator[B], Generic[B]):
             raise StopIteration
         if self._process != os.getpid():
             raise OptionError(
-                f"this iterator belongs to process {self._process}, and its thread does not exist in this one, a fork: "
-                f"make another here by sampler.batches(start={self.next}), or take sampler[{self.next}]"
+                f"this iterator belongs to process {self._process}; its thread does not exist in this forked process: "
+                f"make a new one here with sampler.batches(start={self.next}), or take sampler[{self.next}]"
             )
         started = time.perf_counter()
         if self._lent is not None:
@@ -115,12 +115,12 @@ class Batches(Iterator[B], Generic[B]):
         return batch
 
     def _take(self) -> B:
-        """Return the next batch, and have the thread make the following ones."""
+        """Return the next batch; the thread prepares the following ones."""
         if not self._prefetch:
             buffer = self._buffer()
             batch = _make(self._sampler, self.next, buffer, self._put)
         else:
-            # One is taken off before the last one is submitted, so that `prefetch + 1` buffers are enough.
+            # A batch is taken before another is submitted, so `prefetch + 1` buffers are enough.
             self._submit(self.next + self._prefetch)
             future, buffer = self._pending.popleft()
             self._submit(self.next + self._prefetch + 1)
@@ -130,7 +130,7 @@ class Batches(Iterator[B], Generic[B]):
         return batch
 
     def _submit(self, stop: int) -> None:
-        """Submit all batches below `stop` that are not yet submitted to the thread."""
+        """Submit the next batches below `stop` to the thread."""
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, thread_name_prefix="icrl4aht-prefetch")
             self._submitted = self.next
@@ -141,12 +141,12 @@ class Batches(Iterator[B], Generic[B]):
             self._submitted = i + 1
 
     def _buffer(self) -> B | None:
-        """Return a buffer for one more batch; None to allocate new memory."""
+        """Return a free buffer; None if the batch is to allocate new memory."""
         if not self._reuse:
             return None
         buffer = self._free.pop() if self._free else self._sampler.empty()
         if self._put is not None:
-            self._free.append(buffer)  # a batch is on the device before the same thread makes the next one
+            self._free.append(buffer)  # the thread copies a batch to the device before it makes the next one
         return buffer
 
     def close(self) -> None:
@@ -176,23 +176,23 @@ class Batches(Iterator[B], Generic[B]):
         """Continue from the position at which `state_dict` was called.
 
         Raises:
-            OptionError: if the state is of a sampler with other options or another selection; names them.
+            OptionError: if the state comes from a sampler with other options or another selection; names the differences.
         """
         expected, given = self._sampler.options(), {name: value for name, value in state.items() if name != "next"}
         if "channels" in expected:
-            given.setdefault("channels", "own")  # states of version 0.1 do not name them
+            given.setdefault("channels", "own")  # states of version 0.1 do not contain this option
         if "order" in expected:
-            given.setdefault("labels", "expert")  # nor those of DPT the labels before there were two kinds
+            given.setdefault("labels", "expert")  # older DPT states do not contain `labels`, which had one value
         wrong = [name for name in expected.keys() | given.keys() if expected.get(name) != given.get(name)]
         if wrong or "next" not in state:
             found = ", ".join(f"{name} = {given.get(name)!r}, not {expected.get(name)!r}" for name in sorted(wrong))
-            raise OptionError(f"the state is of other batches: it has {found or 'no `next`'}")
+            raise OptionError(f"the state belongs to other batches: it has {found or 'no `next`'}")
         self._stop_thread()
         self._closed = False
         self.next = check_int("next", state["next"], 0)
 
 
-# A function, not a method: what the thread holds must not keep an abandoned iterator, and so the thread, alive.
+# A function, not a method: a reference from the thread to the iterator would keep an abandoned iterator alive.
 def _make(sampler: BatchSource[B], i: int, buffer: B | None, put: Callable[[B], B] | None) -> B:
     batch = sampler.batch(i, buffer)
     return batch if put is None else put(batch)
@@ -214,7 +214,7 @@ def _device_put(device: Any) -> Callable[[Any], Any]:
         return jax.make_array_from_process_local_data(device, x.copy())
 
     def put(batch: Any) -> Any:
-        # jax.device_put may keep using a host buffer, on a CPU for good; ours is filled again as soon as this returns.
+        # jax.device_put may keep using the host buffer, on a CPU forever, but the buffer is refilled when this returns.
         return jax.block_until_ready(jax.tree.map(one, batch))
 
     return put

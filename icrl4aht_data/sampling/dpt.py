@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import jax  # noqa: F401 - in the sampler's base class
 
 A = TypeVar("A")
-"""The type of a batch's arrays: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
+"""Type of the arrays of a batch: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
@@ -32,18 +32,17 @@ class DPTBatch(NamedTuple, Generic[A]):
     """Queries with contexts (paper, App. D.4).
 
     With obs="state", observations are state records: uint8 (B, S) and (B, K, S) instead of (B, 5, 5, C) and
-    (B, K, 5, 5, C). With several queries a context, the query's arrays have an axis Q behind B.
+    (B, K, 5, 5, C). With several queries per context, the query arrays have an axis Q after B.
 
     Attributes:
         query_obs: float32 or uint8 (B, 5, 5, C): the ego's observation at the query step.
-        query_target: int32 (B,): the label of the query step, an expert's or the oracle's action 0..5, which a model
-            learns to predict.
+        query_target: int32 (B,): the label to predict at the query step: the action 0..5 of the expert or the oracle.
         context_obs: float32 or uint8 (B, K, 5, 5, C): observations of transitions of the same task.
         context_actions: int32 (B, K): the ego's actions in these transitions, 0..5.
-        context_next_obs: float32 or uint8 (B, K, 5, 5, C): the observations after them, in the same episode.
-        context_rewards: float32 (B, K): the team's rewards in them.
-        context_teammate_actions: int32 (B, K): the teammate's actions in them, 0..5; None unless the sampler was made
-            with teammate_actions=True.
+        context_next_obs: float32 or uint8 (B, K, 5, 5, C): the observations after these transitions, in the same episode.
+        context_rewards: float32 (B, K): the team's rewards in these transitions.
+        context_teammate_actions: int32 (B, K): the teammate's actions in these transitions, 0..5; None unless the
+            sampler was made with teammate_actions=True.
         layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
             several layouts.
     """
@@ -62,11 +61,11 @@ class DPTBatch(NamedTuple, Generic[A]):
 
 
 class _Contexts(NamedTuple):
-    """Queries and contexts of a batch.
+    """The drawn queries and contexts of a batch.
 
     Attributes:
         query: int64 (B,), histories of the queries as positions in the selection.
-        query_steps: int64 (B, Q), their steps.
+        query_steps: int64 (B, Q), steps of the queries.
         context: int64 (B,), histories of the contexts as positions in the selection.
         steps: int64 (B, K), the steps of the contexts' transitions.
     """
@@ -78,19 +77,19 @@ class _Contexts(NamedTuple):
 
 
 class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
-    """Queries with contexts: a sequence of batches, each a pure function of (selection, options, seed, i).
+    """A sequence of batches of queries with contexts, each a pure function of (selection, options, seed, i).
 
     For each row a task is drawn uniformly, then two of its histories independently (uniformly or by `weights`): one for
     the query, whose step is drawn uniformly, and one for the context of K transitions. These are `contiguous` (as
-    published) or `random` (independent and unordered, as in the original DPT). With `queries` = Q > 1, so many steps
-    are drawn independently from the query's history, so that a context teaches Q answers instead of one.
+    published) or `random` (independent and unordered, as in the original DPT). With `queries` = Q > 1, Q steps are
+    drawn independently from the query's history, and a context teaches Q answers instead of one.
 
     In releases of kind `observations`, contexts skip the last kept step of each episode, whose next observation is not
     stored, so in contiguous contexts the second to last step is followed by the first step of the next episode.
 
     Args:
-        dataset: a selection whose histories all have the wanted labels, with observations of one shape: of layouts with
-            as many channels, or channels="canonical".
+        dataset: a selection whose histories all have the labels, with observations of one shape: layouts with equally many
+            channels, or channels="canonical".
         batch_size: B, over all processes.
         context: K, in transitions.
         order: "contiguous" or "random".
@@ -102,17 +101,17 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
             `process_count`.
 
     Warns:
-        WeakLabelsWarning: for tasks whose labels are actions of a policy, or of the oracle, that earns less than half
-            of what their histories earn at the end, as far as the release says what it earns.
+        WeakLabelsWarning: for tasks whose labels come from a policy or an oracle that earns less than half of what
+            the histories earn at the end. Tasks without measured returns are not checked.
 
     Raises:
         LabelsMissingError: if a history does not have these labels; says which labels the selection has.
         OptionError: for impossible options, a selection with observations of several shapes, or contiguous contexts
-            longer than some history, or than the part of it that `episodes` or `curriculum` selects.
+            longer than some history or than its part selected by `episodes` or `curriculum`.
     """
 
     batch_type, length_option = DPTBatch, "context"
-    drawn_bytes = 48  # six numbers of each transition: draws, steps, rows, episodes
+    drawn_bytes = 48  # temporary bytes per transition: six int64 numbers (draws, steps, rows, episodes)
 
     def __init__(
         self,
@@ -130,7 +129,9 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         if order not in CONTEXT_ORDERS:
             raise unknown("order", order, CONTEXT_ORDERS)
         self.labels = check_labels(dataset, labels)
-        ranges = (map(self._transitions, self._draws.steps(i)) for i in (0, 2**62))  # a curriculum's first and last
+        ranges = (
+            map(self._transitions, self._draws.steps(i)) for i in (0, 2**62)
+        )  # the first and the last part of a curriculum
         shortest = min(int((high - low).min()) for low, high in ranges)
         if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; take fewer")
@@ -158,19 +159,19 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         }
 
     def batch(self, i: int, out: DPTBatch[np.ndarray] | None = None) -> DPTBatch[np.ndarray]:
-        batch = self._buffer(out)  # first: a batch that is too large is refused before anything is drawn
+        batch = self._buffer(out)  # before drawing, so that a batch that is too large is refused at once
         query, query_steps, context, steps = self._draw(i)
 
         observer, kept_steps = self._observer, self._draws.kept_steps
         query_records = observer.records(batch.query_obs)
         records, next_records = observer.records(batch.context_obs), observer.records(batch.context_next_obs)
         if self.order == "contiguous" and self.dataset.has_states:
-            # One number for each window, which sources copy as a block. The row after a history's end reads as zeros.
+            # A window is given by its first row: sources copy it as a block. The row after a history's end reads as zeros.
             rows, next_rows = steps[:, 0], steps[:, 0] + 1
         else:
-            # Single rows must exist: where a history ends, its last row is read twice and replaced below.
+            # Single rows must exist: at the end of a history its last row is read twice, and replaced below.
             rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
-        # The axis Q is there while reading, also with one query, whose arrays have none.
+        # Requests need the axis Q, which arrays with one query do not have.
         queries, record = query_steps.shape, records.shape[2:]
         reads = [
             ReadRequest(f"{self.labels}_actions", query, query_steps, batch.query_target.reshape(queries)),
@@ -182,7 +183,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         ]
         if batch.context_teammate_actions is not None:
             reads.append(ReadRequest("teammate_actions", context, rows, batch.context_teammate_actions))
-        # An episode's last step is followed by the episode's end, never by the next episode's first step.
+        # The observation after an episode's last step is its end state, not the next episode's first one.
         episodes = steps // kept_steps
         ends = np.nonzero((steps == episodes * kept_steps + kept_steps - 1) & self.dataset.has_states)
         end_records = np.empty((len(ends[0]), 1, *record), next_records.dtype)
@@ -194,14 +195,16 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         observer.observe(context, records, batch.context_obs)
         observer.observe(context, next_records, batch.context_next_obs)
         if batch.layouts is not None:
-            batch.layouts[...] = self.dataset.layout_numbers[query]  # a task, and so a row, has one layout
+            batch.layouts[...] = self.dataset.layout_numbers[
+                query
+            ]  # query and context of a row have the same task, so the same layout
         return batch
 
     def _draw(self, i: int) -> _Contexts:
         drawn = self.length if self.order == "random" else 1
         random = self._random(i, 3 + self.queries + drawn)
         for_task, for_query, for_context = random[:3]
-        # The first query's number precedes those of the context, so that it is the same with any number of queries.
+        # The first query is drawn before the context, so it does not depend on the number of queries.
         for_query_steps = np.concatenate([random[3:4], random[4 + drawn :]]).T
         for_steps = random[4 : 4 + drawn].T
 
@@ -214,7 +217,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
             members[weighted_choice(number, weights, begins[task], ends[task])] for number in (for_query, for_context)
         )
         query_steps = low[query][:, None] + scale_to_range(for_query_steps, (high - low)[query][:, None])
-        # A window of K transitions from each number drawn, or, in random order, one transition.
+        # Each number drawn is the start of a window of K transitions, or with random order a single transition.
         window = self.length // drawn
         low, high = self._transitions(low)[context][:, None], self._transitions(high)[context][:, None]
         transitions = low + scale_to_range(for_steps, high - low - window + 1) + np.arange(window)
@@ -222,20 +225,20 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions in the selection (H,), task by task in order of appearance; begin and end of each task in them."""
+        """Return positions in the selection (H,), sorted by task in order of appearance, and begin and end of each task."""
         _, first, task = np.unique(self.dataset.column_codes("task_id"), return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
         rank[np.argsort(first)] = np.arange(len(first))
         sizes = np.bincount(rank[task])
         return np.argsort(rank[task], kind="stable"), np.cumsum(sizes) - sizes, np.cumsum(sizes)
 
-    # Transitions are the steps whose next observation is stored: all of them in a release with states, all but each
-    # episode's last in one without. They are drawn by number and mapped to steps.
+    # Transitions are the steps whose next observation is stored: all steps in a release with states, otherwise all but
+    # the last one of each episode. They are drawn by number and mapped to steps.
 
     def _transitions(self, steps: np.ndarray) -> np.ndarray:
         """Return the number of transitions among a history's first `steps` steps."""
         return steps if self.dataset.has_states else steps - -(-steps // self._draws.kept_steps)
 
     def _step_of(self, transition: np.ndarray) -> np.ndarray:
-        """Return numbers of steps for numbers of transitions, both counted from the first one of the history."""
+        """Return the step of each transition; steps and transitions are numbered from the start of the history."""
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)
