@@ -1,1 +1,1 @@
-"""OvercookedV2: layouts, state record, rules, observations, pictures. The functions take NumPy or JAX arrays, batch axes first."""
+"""OvercookedV2 for NumPy and JAX, batch axes first: layouts, state record, rules, observations, pictures."""

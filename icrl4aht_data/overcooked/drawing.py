@@ -214,7 +214,7 @@ def _draw_indicator(layout: Layout, canvas: Canvas, x: float, y: float, recipe: 
 
 
 def _draw_pot(layout: Layout, canvas: Canvas, x: float, y: float, item: int, timer: int) -> None:
-    """Draw a pot: rings for free slots, an orange rim and the remaining steps while cooking, a green tick when cooked."""
+    """Draw a pot: rings for free slots, an orange rim and the steps left while cooking, a green tick when cooked."""
     contents, cooked = item_contents(layout, item), item & COOKED > 0
     canvas.box(x, y, 0.9, 0.9, _DARK_STEEL, 0.08)
     canvas.strokes([(0.12, _STEEL, (-0.4, 0), (0.4, 0))], x, y - 0.05)

@@ -64,7 +64,7 @@ def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> S
         layout: the layout.
         record: uint8 (B, S), the state record.
         actions: integers (B, 2), action ids 0..5 of ego and teammate.
-        next_recipe: uint8 (B,), item byte of the recipe that a correct delivery in this step is followed by.
+        next_recipe: uint8 (B,), item byte of the recipe that follows a correct delivery in this step.
 
     Returns:
         The next states, rewards and events; NumPy and JAX give equal bytes.
@@ -127,7 +127,7 @@ def look_up(table: np.ndarray, index: Array) -> Array:
 
 
 def _move(layout: Layout, xp, state: State, actions: Array) -> State:
-    """Apply steps 1 to 3 (movement): a directional action always turns; no agent enters an occupied or contested cell."""
+    """Apply steps 1 to 3: a directional action always turns; no agent enters an occupied or contested cell."""
     moved = look_up(layout.moves.reshape(-1), xp.astype(state.positions, xp.int32) * 6 + actions)
     old0, old1 = state.positions[..., 0], state.positions[..., 1]
     new0, new1 = moved[..., 0], moved[..., 1]

@@ -148,7 +148,7 @@ def ingredient_count(item: Array) -> Array:
 
 
 def possible_items(layout: Layout) -> np.ndarray:
-    """Return bool (256,), True for the item bytes that the rules can produce: nothing, a plate, 1..3 ingredients, soups, dishes."""
+    """Return bool (256,), True for possible item bytes: nothing, a plate, 1..3 ingredients, soups, dishes."""
     item = np.arange(256)
     count = ingredient_count(item)
     known = item >> (2 + 2 * len(layout.ingredients)) == 0

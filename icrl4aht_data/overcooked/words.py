@@ -154,8 +154,8 @@ class CellWords:
         """Return the entries of a flat observation that can differ from 0 on these layouts.
 
         Args:
-            agents: the agents that observe: 0 (ego), 1 (teammate). An agent never leaves its room, so both together see more
-                than one.
+            agents: the agents that observe: 0 (ego), 1 (teammate). An agent never leaves its room, so both together
+                see more than one.
 
         Returns:
             int64 (E,), ascending: cell * C + channel, with cells of the window in reading order.
