@@ -1,7 +1,7 @@
-"""Facts of the benchmark: tracks, splits, teammate families, lengths, and which layouts belong to which split.
+"""Constants of the benchmark: tracks, splits and their layouts, teammate families, episode lengths.
 
-The constants are those of the published benchmark. The functions also know the layouts and heuristic teammates that
-other installed packages register, see docs/extending.md.
+The constants are those of the published benchmark. The functions also accept layouts and heuristic teammates
+registered by other installed packages, see docs/extending.md.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ TESTED_ON = {
 LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
 """Every layout of the benchmark, in the paper's order."""
 
-_OTHER_NUMBERS = 10_000  # different numbers of layouts that are not among these
+_OTHER_NUMBERS = 10_000  # number of possible `layout_number` values of registered layouts
 
 SPLITS = ("train", "validation", "test", "heldout")
-"""Splits of the tasks. `validation` combines training layouts with heuristic teammates that are neither in `train`
-nor in `test`, for choosing models; `heldout` with learned teammates that are not in `train` (paper, App. F)."""
+"""Splits of the tasks. Both of the following use training layouts: `validation`, for choosing models, has
+heuristic teammates in neither `train` nor `test`; `heldout` has learned teammates not in `train` (paper, App. F)."""
 
 FAMILIES = ("rl", "H1", "H2", "H3", "H4")
 """Families of teammates: "rl" (learned policies) and the heuristics "H1".."H4" (paper, App. B)."""
@@ -65,15 +65,15 @@ KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
 """teammate kind -> family, for algorithms and heuristics."""
 
 TEAMMATE_PLUGINS = Plugins("icrl4aht.teammates", (*FAMILIES, *KIND_FAMILIES))
-"""Heuristic teammates of other installed packages. Each is a family of its own, of the same name."""
+"""Heuristic teammates registered by other packages. Each is a separate family with the same name."""
 
 SOURCES = ("ppo", "noise", "student")
-"""How histories are made: by an ego that learns with PPO; by a script whose actions are replaced by random ones, ever
-more rarely (noise distillation, Zisman et al. 2024); by a trained agent, whose actions may be replaced in the same way.
-Releases may name others."""
+"""How histories are made: by an ego that learns with PPO; by a script whose random actions become rarer (noise
+distillation, Zisman et al. 2024); by a trained agent, perhaps with random actions in the same way. Releases may name
+other sources."""
 
 REBUILT_SOURCES = SOURCES[:2]
-"""The sources that a release is rebuilt from nothing with."""
+"""Sources of histories that `generate` can make without a trained agent."""
 
 EPISODE_STEPS = 400
 """Steps of an episode in training (paper, App. C)."""
@@ -94,37 +94,37 @@ PAPER_TEAMMATES = 20
 """Training teammates of each algorithm and layout (paper, App. B.1)."""
 
 LEAST_HEADROOM = 5.0
-"""Difference of the reference egos' returns with a teammate from which the ego matters."""
+"""Least difference between a best response and `stay` with a teammate that is kept."""
 
 SAME_BEHAVIOUR = 0.02
 """Hamming distance below which two teammates count as one behaviour."""
 
 
 def all_families() -> tuple[str, ...]:
-    """Families of teammates: those of the benchmark, then registered ones."""
+    """Return all families of teammates: the benchmark's, then registered ones."""
     return (*FAMILIES, *TEAMMATE_PLUGINS.names)
 
 
 def family_order(family: str) -> tuple[int, str]:
-    """Sort key of a family: those of the benchmark come first, in its order, then others by name."""
+    """Return the sort key of a family: the benchmark's families in order, then others by name."""
     return (FAMILIES.index(family), "") if family in FAMILIES else (len(FAMILIES), family)
 
 
 def kind_family(kind: str) -> str | None:
-    """Family of a teammate kind; None for a kind that is neither of the benchmark nor registered."""
+    """Return the family of a teammate kind; None for an unknown kind."""
     return KIND_FAMILIES.get(kind) or (kind if kind in TEAMMATE_PLUGINS.names else None)
 
 
 def track_layouts(track: str, split: str) -> tuple[str, ...]:
-    """Short names of the layouts of a track and split; registered layouts belong to every split of track `layout`."""
+    """Return the short names of a track's layouts in a split; registered layouts are in every split of `layout`."""
     return (*TRACKS[track][split], *(LAYOUT_PLUGINS.names if track == "layout" else ()))
 
 
 def track_of(layout: str) -> str:
-    """The track whose train or test layouts include `layout` (short name).
+    """Return the track whose layouts include `layout` (short name).
 
     Raises:
-        UnknownNameError: if there is none.
+        UnknownNameError: if no track includes it.
     """
     for track, splits in TRACKS.items():
         if any(layout in layouts for layouts in splits.values()):
@@ -135,15 +135,14 @@ def track_of(layout: str) -> str:
 
 
 def layout_order(layout: str) -> tuple[int, str]:
-    """Sort key of a layout (short name): those of the benchmark come first, in its order, then others by name."""
+    """Return the sort key of a layout (short name): the benchmark's layouts in order, then others by name."""
     return (LAYOUT_NAMES.index(layout), "") if layout in LAYOUT_NAMES else (len(LAYOUT_NAMES), layout)
 
 
 def layout_number(layout: str) -> int:
-    """Number of a layout (short name), for seeds: its position in `LAYOUT_NAMES`.
+    """Return the number of a layout (short name), for seeds: its position in `LAYOUT_NAMES`.
 
-    The number of a layout that is not there follows from its name alone, so that it does not depend on which other
-    packages are installed.
+    The number of a registered layout is a hash of its name, so it does not depend on the packages installed.
     """
     if layout in LAYOUT_NAMES:
         return LAYOUT_NAMES.index(layout)

@@ -1,4 +1,4 @@
-"""Mean returns of the reference egos in every test cell: the headroom that the benchmark leaves to an ego."""
+"""Mean returns of the reference egos in every test cell, which show where an ego can improve on `stay`."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ REFERENCES = ("stay", "random", "oracle")
 HEURISTICS = FAMILIES[1:]
 """The teammate families of the test tasks."""
 
-_NO_HEADROOM = 1.0  # an ego cannot improve a cell where `oracle` exceeds `stay` by no more than this
+_NO_HEADROOM = 1.0  # a cell has headroom if `oracle` exceeds `stay` by more than this
 
 Cell = tuple[str, str]
 """(layout, family)."""
 
 
 def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
-    """cell -> mean returns of the reference egos; empty if none was measured under this protocol."""
+    """Return cell -> mean returns of the reference egos; empty if the protocol was not measured."""
     content = json.loads(card_file("headroom.json").read_text(encoding="utf-8")).get(protocol, {})
     return {(layout, family): agents for layout, families in content.items() for family, agents in families.items()}
 
 
 def has_headroom(references: Mapping[str, float]) -> bool:
-    """Whether the oracle's return exceeds that of an ego that only stays by more than one point."""
+    """Return whether `oracle` earns over one point more than `stay`."""
     return references["oracle"] - references["stay"] > _NO_HEADROOM
 
 
 def headroom_table(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str]) -> str:
-    """A Markdown table of `stay / random / oracle`, and a line that names the cells without headroom.
+    """Return a Markdown table of `stay / random / oracle`, and a line that lists the cells without headroom.
 
     One row per family, one column per layout; cells with headroom are bold.
     """

@@ -3,7 +3,7 @@
     {"task_id": ..., "track": "teammate", "split": "train", "layout_name": "demo_cook_wide", "seed": 0,
      "teammate": {"kind": "heuristic", "family": "utility_greedy", "theta_id": 0, "base_seed": 0, "theta": {...}}}
 
-The id ends in a hash of the rest, so that a task cannot change and keep its name.
+The id ends in a hash of the other fields, so a changed task has another id.
 """
 
 from __future__ import annotations
@@ -64,24 +64,24 @@ class Task:
 
     @property
     def teammate_key(self) -> tuple[str, str]:
-        """What this task shares with all others with the same teammate on the same layout, such as those of another
-        source: the layout's name and a hash of the teammate."""
+        """Key shared by all tasks with the same teammate on the same layout, such as tasks of another source: the
+        layout's name and a hash of the teammate."""
         return self.layout.name, json_hash(self.teammate)
 
     @property
     def teammate_kind(self) -> str:
-        """The index's `teammate_kind`: the heuristic's or algorithm's name."""
+        """Field `teammate_kind` of the index: name of the heuristic or the algorithm."""
         return self.teammate["family"]
 
     @property
     def teammate_family(self) -> str:
-        """The index's `teammate_family`: rl, H1..H4, or the name of a registered heuristic."""
+        """Field `teammate_family` of the index: rl, H1..H4, or the name of a registered heuristic."""
         return "rl" if self.teammate["kind"] == "rl" else HEURISTIC_KINDS.get(self.teammate_kind, self.teammate_kind)
 
 
 @dataclass(frozen=True)
 class NamedTask(Task):
-    """A task known only from index lines: without the parameters of its teammate, and with seed -1.
+    """A task known only from index lines; its teammate has no parameters and its seed is -1.
 
     Args:
         teammate: the line's teammate_kind and teammate_family.
@@ -97,7 +97,7 @@ class NamedTask(Task):
 
 
 def named_task(line: Mapping[str, Any]) -> NamedTask:
-    """The task of an index line with the paper's fields.
+    """Return the task of an index line with the paper's fields.
 
     Raises:
         UnknownNameError: for names that the benchmark does not know.
@@ -110,7 +110,7 @@ def named_task(line: Mapping[str, Any]) -> NamedTask:
 
 
 def teammate_id(teammate: Mapping[str, Any]) -> str:
-    """Return 16 hexadecimal digits that are the same for teammates of one kind with one policy.
+    """Return 16 hexadecimal digits, equal for teammates with the same kind and policy.
 
     Args:
         teammate: kind and theta, as in a task. The numbers of a heuristic are compared in single precision, since some
@@ -123,7 +123,7 @@ def teammate_id(teammate: Mapping[str, Any]) -> str:
 
 
 def make_task(track: str, split: str, layout: str, teammate: dict[str, Any], seed: int) -> Task:
-    """A task with its id.
+    """Return a task with its id.
 
     Raises:
         UnknownNameError: if the layout does not belong to that split of that track.
@@ -145,7 +145,7 @@ def task_id(track: str, split: str, layout_name: str, teammate: dict[str, Any], 
 
 
 def manifest_path(track: str, split: str, teammates: Literal["", "diverse"] = "") -> Path:
-    """Path of the bundled manifest of a track's tasks.
+    """Return the path of the bundled manifest of a track's tasks.
 
     Args:
         track: the track.
@@ -163,7 +163,7 @@ def manifest_path(track: str, split: str, teammates: Literal["", "diverse"] = ""
 
 
 def read_tasks(path: Path) -> list[Task]:
-    """The tasks of a JSONL file.
+    """Return the tasks of a JSONL file.
 
     Raises:
         TaskFormatError: names the file and the line.
@@ -186,10 +186,10 @@ def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
 
 
 def parse_task(fields: Any) -> Task:
-    """Return the task of the fields of a manifest's line; `dataclasses.asdict` makes them of a task.
+    """Parse the fields of a manifest line as a task; the inverse of `dataclasses.asdict`.
 
     Raises:
-        TaskFormatError: for fields that are missing, unknown or of impossible content.
+        TaskFormatError: for missing or unknown fields, or impossible values.
         UnknownNameError: for names that the benchmark does not know.
     """
     if not isinstance(fields, dict) or fields.keys() != _FIELDS.keys():
@@ -199,7 +199,7 @@ def parse_task(fields: Any) -> Task:
         if not isinstance(fields[name], kind):
             raise TaskFormatError(f"{name}: expected {kind.__name__}, found {fields[name]!r}")
     if abs(fields["seed"]) >= 2**63:
-        raise TaskFormatError(f"seed: expected at most 64 bits, found {fields['seed']}")
+        raise TaskFormatError(f"seed: expected an integer of at most 64 bits, found {fields['seed']}")
     task = Task(**fields)
     check_membership(task.track, task.split, task.layout.name)
     _check_teammate(task.teammate)
@@ -217,7 +217,9 @@ def _check_teammate(teammate: dict[str, Any]) -> None:
         kinds = (*HEURISTIC_KINDS, *TEAMMATE_PLUGINS.names) if is_heuristic else ALGORITHMS
         raise unknown(f"{teammate['kind']} family", teammate["family"], kinds)
     if teammate.get("slot", TEAMMATE) != TEAMMATE:
-        raise TaskFormatError(f"teammate.slot: a task's teammate plays slot {TEAMMATE}, found {teammate['slot']!r}")
+        raise TaskFormatError(
+            f"teammate.slot: expected {TEAMMATE}, the teammate's agent slot, found {teammate['slot']!r}"
+        )
     fields = set(teammate) - {"slot"}
     if fields != set(_HASHED):
         raise TaskFormatError(f"teammate: expected the fields {sorted(_HASHED)}, found {sorted(fields)}")

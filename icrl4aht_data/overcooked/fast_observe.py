@@ -25,8 +25,8 @@ _SLAB = 8192  # steps rendered at a time: smaller blocks lose more time in calls
 _IMPOSSIBLE = -(2**40)  # so negative that any sum of lookups with it is negative
 _TIMERS = 32  # values of a timer's five bits
 _ON_COUNTER, _ON_BUTTON, _IN_POT = 0, 256, 512
-"""Number of the first patch of each kind of cell. An item byte b on a counter is patch b, a lit button that shows recipe
-byte b patch 256 + b, and a pot with item byte b and timer t patch 512 + 256 * t + b."""
+"""Number of the first patch of each kind of cell. An item byte b on a counter is patch b, a lit button that shows
+recipe byte b patch 256 + b, and a pot with item byte b and timer t patch 512 + 256 * t + b."""
 
 
 def fast_observe(
@@ -89,7 +89,7 @@ class _Renderer:
         background = self._by_positions.take(positions)
         background += self._by_recipe.take(recipe)
         if background.min() < 0 or (facings & 0xFCFC).any() or (record[:, self._columns.pot_timers] >= _TIMERS).any():
-            # The rules cannot produce a record with a negative number; one such record makes the block take the slow path.
+            # The rules never produce such a record, so the tables have no entry; the block takes the slow path.
             out.reshape(len(out), *self._shape)[...] = self._observe(record)
             return
         # The default mode first writes into a copy of `out`, to keep `out` unchanged if an index is out of range.
@@ -151,7 +151,7 @@ class _Renderer:
         self._patch_column = np.where(self._first_patch == _ON_BUTTON, where.recipe, self._cell_columns)
 
     def _make_background(self) -> np.ndarray:
-        """Return observations without agents and items, (floor * recipes * 2, 25 * C), by ego cell, recipe, delivery."""
+        """Return empty maps by ego cell, recipe and delivery flag, (floor * recipes * 2, 25 * C)."""
         shape = len(self._floor), len(self._recipes), 2
         record = np.zeros((*shape, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., self._columns.recipe] = self._floor[:, None, None], self._recipes[:, None]

@@ -35,8 +35,8 @@ class ADBatch(NamedTuple, Generic[A]):
         obs: float32 or uint8 (B, L, 5, 5, C): the ego's observations; with obs="state" uint8 (B, L, S): state records.
         prev_actions: int32 (B, L): the ego's actions in the previous steps, 0..5; 0 at a history's first step.
         prev_rewards: float32 (B, L): the team's rewards in the previous steps; 0 at a history's first step.
-        target_actions: int32 (B, L): what a model learns to predict, 0..5: the ego's actions, or with `labels` those of the
-            expert or the oracle. The actions taken are then in the next column of `prev_actions`.
+        target_actions: int32 (B, L): what a model learns to predict, 0..5: the ego's actions, or with `labels` those of
+            the expert or the oracle. The actions taken are then in the next column of `prev_actions`.
         dones: bool (B, L): True at the last step of an episode.
         attention_mask: bool (B, L): False on padding.
         prev_teammate_actions: int32 (B, L): the teammate's actions in the previous steps, 0..5, and 0 at a history's
@@ -92,7 +92,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
     lite or full. To resume, continue with the next i.
 
     Args:
-        dataset: a selection with observations of one shape: layouts with equally many channels, or channels="canonical".
+        dataset: a selection with observations of one shape: layouts with as many channels, or channels="canonical".
         batch_size: B, over all processes.
         length: L, in steps.
         every: windows consist of every n-th episode of a history, so a window of few episodes spans learning. The first

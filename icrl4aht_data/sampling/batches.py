@@ -35,8 +35,8 @@ class BatchSource(Protocol[B]):
 class Batches(Iterator[B], Generic[B]):
     """An iterator over `sampler[start]`, `sampler[start + 1]`, .., prefetched by a thread.
 
-    After `break`, a new loop continues with the next batch; batch `stop - 1` is the last. `len(sampler)` batches have as
-    many steps as the selection: one pass over the data on average.
+    After `break`, a new loop continues with the next batch; batch `stop - 1` is the last. `len(sampler)` batches have
+    as many steps as the selection: one pass over the data on average.
 
     Exceptions in the thread are raised by `next`. The thread stops at the end of a `with` block, after `close()` and at
     the end of the iterator. Threads do not survive a fork: make a new iterator in the forked process.
@@ -176,7 +176,7 @@ class Batches(Iterator[B], Generic[B]):
         """Continue from the position at which `state_dict` was called.
 
         Raises:
-            OptionError: if the state comes from a sampler with other options or another selection; names the differences.
+            OptionError: if the state comes from a sampler with other options or another selection; names them.
         """
         expected, given = self._sampler.options(), {name: value for name, value in state.items() if name != "next"}
         if "channels" in expected:

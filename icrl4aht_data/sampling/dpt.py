@@ -39,7 +39,7 @@ class DPTBatch(NamedTuple, Generic[A]):
         query_target: int32 (B,): the label to predict at the query step: the action 0..5 of the expert or the oracle.
         context_obs: float32 or uint8 (B, K, 5, 5, C): observations of transitions of the same task.
         context_actions: int32 (B, K): the ego's actions in these transitions, 0..5.
-        context_next_obs: float32 or uint8 (B, K, 5, 5, C): the observations after these transitions, in the same episode.
+        context_next_obs: float32 or uint8 (B, K, 5, 5, C): the next observations in the same episode.
         context_rewards: float32 (B, K): the team's rewards in these transitions.
         context_teammate_actions: int32 (B, K): the teammate's actions in these transitions, 0..5; None unless the
             sampler was made with teammate_actions=True.
@@ -88,8 +88,8 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
     stored, so in contiguous contexts the second to last step is followed by the first step of the next episode.
 
     Args:
-        dataset: a selection whose histories all have the labels, with observations of one shape: layouts with equally many
-            channels, or channels="canonical".
+        dataset: a selection whose histories all have the labels, with observations of one shape: layouts with equally
+            many channels, or channels="canonical".
         batch_size: B, over all processes.
         context: K, in transitions.
         order: "contiguous" or "random".
@@ -166,7 +166,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
         query_records = observer.records(batch.query_obs)
         records, next_records = observer.records(batch.context_obs), observer.records(batch.context_next_obs)
         if self.order == "contiguous" and self.dataset.has_states:
-            # A window is given by its first row: sources copy it as a block. The row after a history's end reads as zeros.
+            # Windows given by their first row are copied as blocks. The row after a history's end reads as zeros.
             rows, next_rows = steps[:, 0], steps[:, 0] + 1
         else:
             # Single rows must exist: at the end of a history its last row is read twice, and replaced below.
@@ -225,7 +225,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions in the selection (H,), sorted by task in order of appearance, and begin and end of each task."""
+        """Return positions in the selection (H,) sorted by task, and begin and end of each task."""
         _, first, task = np.unique(self.dataset.column_codes("task_id"), return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
         rank[np.argsort(first)] = np.arange(len(first))

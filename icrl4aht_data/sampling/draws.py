@@ -1,4 +1,4 @@
-"""Random draws that are functions of their arguments alone, and the steps of histories that they are made from.
+"""Random draws as pure functions of their arguments, and the ranges of steps that samplers draw from.
 
 `H` denotes the number of histories in a selection, `B` the batch size.
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.random import Philox  # np.random is imported when it is used, which a fork must not interrupt
+from numpy.random import Philox  # np.random is imported late, on first use; a fork must not interrupt that
 
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.reading.selection import Selection
@@ -18,21 +18,21 @@ from icrl4aht_data.utils.options import check_int
 
 Weights = Literal["uniform", "length"] | Sequence[float] | np.ndarray
 WEIGHTS = ("uniform", "length")
-"""Named weights of histories in a draw: equal, or proportional to the steps to draw from. Other weights are numbers."""
+"""Named weights of histories in a draw: equal, or proportional to the steps to draw from."""
 
 EpisodeRange = tuple[int | None, int | None]
-"""The first episode and the one after the last, as in a slice: (None, 10) the first ten, (-10, None) the last ten."""
+"""Range of episodes as in a slice: (None, 10) are the first ten, (-10, None) the last ten."""
 
 
 @dataclass(frozen=True)
 class Curriculum:
     """A part of every history from which windows are drawn; it moves linearly with the batch number.
 
-    Parts are fractions of a history's episodes, or of those that the sampler's option `episodes` selects. The part
+    Parts are fractions of a history's episodes, or of the range `episodes` of the sampler. The part
     moves from `first` at batch 0 to `last` at batch `batches` and does not change afterwards.
 
     Args:
-        batches: number of the batch from which the part is `last`, at least 1.
+        batches: number of the first batch with the part `last`, at least 1.
         first: the part at batch 0: fractions (low, high), such as (0.0, 0.25) for the first quarter.
         last: the final part: fractions (low, high).
 
@@ -56,7 +56,7 @@ class Curriculum:
                 raise OptionError(f"curriculum {name} = {part!r}: expected fractions 0 <= low < high <= 1")
 
     def part(self, i: int) -> tuple[float, float]:
-        """Return the part at batch i: low and high fraction."""
+        """Return the low and the high fraction of the part at batch i."""
         share = min(1.0, i / self.batches)
         low, high = (a + (b - a) * share for a, b in zip(self.first, self.last, strict=True))
         return low, high
@@ -65,15 +65,15 @@ class Curriculum:
 def random_uint32(seed: int, i: int, count: int, batch_size: int) -> np.ndarray:
     """Return random integers below 2**32, uint64 (count, batch_size), a function of (seed, i) and the shape."""
     i = check_int("batch", i, 0)
-    # Philox's raw output is fixed by its definition, so batches stay the same across NumPy versions.
+    # The raw output of Philox is specified, so batches do not depend on the NumPy version.
     raw = Philox(key=np.array([seed, i], np.uint64)).random_raw(count * batch_size)
     return (raw >> np.uint64(32)).reshape(count, batch_size)
 
 
 def draw_subset(seed: int, total: int, count: int) -> np.ndarray:
-    """Return different integers below `total`, int64 (count,), ascending; every subset of that size is equally likely.
+    """Return a uniformly random subset of 0..total - 1 of size `count`, int64 (count,), ascending.
 
-    This is Floyd's algorithm (Bentley and Floyd 1987): one random integer for each member, whatever the total.
+    Floyd's algorithm (Bentley and Floyd 1987) takes one random integer per member.
     """
     raw = Philox(key=np.array([seed, total], np.uint64)).random_raw(count)
     chosen: set[int] = set()
@@ -90,7 +90,7 @@ def scale_to_range(random: np.ndarray, n: Any) -> np.ndarray:
 
 
 def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, stop: Any) -> np.ndarray:
-    """Return positions first..stop - 1, drawn in proportion to their weights; one of weight 0 is never drawn.
+    """Return positions in first..stop - 1 drawn with probabilities proportional to their weights.
 
     Args:
         random: uint64 (B,), integers below 2**32.
@@ -102,21 +102,21 @@ def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, 
     """
     if weights is None:
         return first + scale_to_range(random, stop - first)
-    # A weight of 0 makes two equal edges, and searching from the right skips the empty interval between them.
+    # side="right": a weight of 0 makes two equal edges, and its empty interval must be skipped.
     edges = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
     low, high = edges[first], edges[stop]
     position = np.searchsorted(edges, low + random.astype(np.float64) / 2**32 * (high - low), side="right") - 1
-    return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding may have led out of the range
+    return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding can leave the range
 
 
 class HistoryDraws:
-    """Steps of each history that a sampler draws from at batch i, and the weights of the histories.
+    """Range of steps of each history to draw from at batch i, and the weights of the histories.
 
     Args:
         selection: the histories.
         weights: see `WEIGHTS`.
         episodes: see `EpisodeRange`; None for all.
-        curriculum: None for all of these episodes at every batch.
+        curriculum: None for the same episodes in every batch.
 
     Attributes:
         lengths: int64 (H,), steps of each history.
@@ -134,19 +134,21 @@ class HistoryDraws:
         ended, cut = np.divmod(self.lengths, self.kept_steps)
         # Only histories of releases without states may end within an episode.
         if (ended != self._counts).any() or (selection.has_states and cut.any()):
-            raise OptionError(f"some history's episodes have not {self.kept_steps} steps; run `icrl4aht-data verify`")
+            raise OptionError(
+                f"some history's episodes do not have {self.kept_steps} steps each; run `icrl4aht-data verify`"
+            )
         if curriculum is not None and not isinstance(curriculum, Curriculum):
             raise OptionError(f"curriculum = {curriculum!r}: expected a Curriculum, such as Curriculum(batches=1000)")
         self.weights, self.episodes, self.curriculum = _check_weights(weights, len(selection)), episodes, curriculum
         self._range = _episode_range(episodes, self._counts)
 
     def steps(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the first step, and the one after the last, of each history's range at batch i: int64 (H,) each."""
+        """Return the first step of each history's range at batch i and its end (exclusive), int64 (H,) each."""
         first, stop = self._range
         if self.curriculum is not None:
             low, high = self.curriculum.part(i)
             count = stop - first
-            # Complete episodes, at least one. The small number keeps 0.3 * 10 episodes from being rounded up to 4.
+            # Complete episodes, at least one. The small number prevents 0.3 * 10 episodes from becoming 4.
             low = np.minimum(np.floor(low * count + 1e-9).astype(np.int64), count - 1)
             high = np.maximum(np.ceil(high * count - 1e-9).astype(np.int64), low + 1)
             first, stop = first + low, first + high
@@ -154,10 +156,10 @@ class HistoryDraws:
         return first * self.kept_steps, np.where(stop == self._counts, self.lengths, stop * self.kept_steps)
 
     def history_weights(self, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
-        """Return weights of histories with steps low..high to draw from, float64 (H,); None for equal weights."""
+        """Return the weight of each history, which has steps low..high to draw from, float64 (H,); None if equal."""
         if isinstance(self.weights, str):
             return None if self.weights == "uniform" else (high - low).astype(np.float64)
-        # Sums of weights near 1e308 would be infinite. A power of 2 changes no digit of a weight, and so no draw.
+        # Sums of weights near 1e308 would be infinite. Scaling by a power of 2 is exact and changes no draw.
         return np.ldexp(self.weights, -np.frexp(self.weights.max())[1])
 
     def options(self) -> dict[str, Any]:
@@ -171,10 +173,10 @@ class HistoryDraws:
 
 
 def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
-    """Return the name, or the numbers as float64 (H,).
+    """Return the name of the weights, or the numbers as float64 (H,).
 
     Raises:
-        UnknownNameError, OptionError: if they are neither a known name nor H numbers of which some is positive.
+        UnknownNameError, OptionError: unless they are a known name, or H numbers, none negative and not all 0.
     """
     if isinstance(weights, str):
         if weights not in WEIGHTS:
@@ -186,14 +188,14 @@ def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
         raise OptionError(f"weights: expected numbers, found {weights!r}") from error
     if numbers.shape != (histories,) or not np.isfinite(numbers).all() or (numbers < 0).any() or not numbers.any():
         raise OptionError(
-            f"weights: expected {histories} numbers, one a history, none negative and not all zero; found shape "
+            f"weights: expected {histories} numbers, one per history, none negative and not all zero; found shape "
             f"{numbers.shape} with {numbers.min(initial=0):g}..{numbers.max(initial=0):g}"
         )
     return numbers
 
 
 def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first episode and the one after the last in histories of `counts` episodes: int64 (H,) each.
+    """Return first episode and end (exclusive) of a range in histories of `counts` episodes, int64 (H,) each.
 
     Raises:
         OptionError: if the range is malformed, or some history has no episode in it.
@@ -205,7 +207,7 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
             raise TypeError
         first, stop = episodes
         bounds = slice(first, stop)
-        # Most histories have equally many episodes, so that Python resolves few slices.
+        # Most histories have equally many episodes, so the Python loop is short.
         distinct, number = np.unique(counts, return_inverse=True)
         first, stop = np.array([bounds.indices(count)[:2] for count in distinct.tolist()], np.int64)[number].T
     except (TypeError, ValueError) as error:

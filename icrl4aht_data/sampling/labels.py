@@ -1,4 +1,4 @@
-"""Labels that samplers take instead of an ego's own actions: whether histories have them, and whether they are good."""
+"""Checks of the labels that samplers use as targets: whether histories have them, and whether they are good."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
 
     Raises:
         UnknownNameError: for labels that do not exist.
-        LabelsMissingError: if a history does not have them; says which labels the selection has.
+        LabelsMissingError: if a history does not have them; names the labels that the selection has.
     """
     if labels not in LABELS:
         raise unknown("labels", labels, LABELS)
@@ -42,7 +42,7 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
     )
 
 
-_NAMED = 5  # tasks that a warning names
+_NAMED = 5  # most tasks that a warning names
 
 
 def warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
@@ -73,5 +73,5 @@ def warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
         f"the {labels} actions of {len(weak)} of {len(codes)} tasks come from {player} less than half of what their "
         f"histories earn at the end: {named}{more}. A model would learn to play worse than its contexts: {advice}",
         WeakLabelsWarning,
-        stacklevel=4,  # the call of Dataset.ad or Dataset.dpt
+        stacklevel=4,  # the line that called Dataset.ad or Dataset.dpt
     )

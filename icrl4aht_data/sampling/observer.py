@@ -1,4 +1,4 @@
-"""Rendering of records as the observations that the `obs` option of a selection names."""
+"""Renders stored records as the observations chosen by the `obs` option of a selection."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.utils.system import in_slices
 
-_STEPS = 8192  # steps of several layouts rendered at a time, so that the copies in between stay small
+_STEPS = 8192  # steps rendered at a time if there are several layouts, which keeps temporary copies small
 
 
 class ArraySpec(NamedTuple):
@@ -31,11 +31,10 @@ class ArraySpec(NamedTuple):
 
 
 class Observer:
-    """Renders records of a selection.
+    """Renders the records of a selection as observations.
 
     A record is a state record, or in a release without states the stored observation. `R` denotes the shape of one
-    record: (S,) for the bytes of the selection's longest state record, or (5, 5, C) for the most own channels of a
-    layout.
+    record: (S,) with the longest state record of the selection, or (5, 5, C) with the most channels of its layouts.
 
     Args:
         selection: histories whose observations have one shape (5, 5, C).
@@ -55,7 +54,7 @@ class Observer:
         self._record_shape: tuple[int, ...] = (max(record_size(layout) for layout in self._layouts),)
         if not selection.has_states:
             self._record_shape = (*self._shape[:-1], max(layout.channels for layout in self._layouts))
-        # Otherwise records are read into the batch directly.
+        # If nothing is rendered, records are read directly into the batch.
         self._renders = selection.obs != "state" and (selection.has_states or self._canonical)
 
     def spec(self, *shape: int) -> ArraySpec:
@@ -65,7 +64,7 @@ class Observer:
         return ArraySpec(self._selection.obs, (*shape, *self._shape))
 
     def record_bytes(self, shape: tuple[int, ...]) -> int:
-        """Return the bytes of the array that `records` makes for observations of this shape (..., 5, 5, C)."""
+        """Return the size in bytes of the array from `records` for observations (..., 5, 5, C)."""
         return math.prod((*shape[:-3], *self._record_shape)) if self._renders else 0
 
     def records(self, out: np.ndarray) -> np.ndarray:
@@ -73,7 +72,7 @@ class Observer:
         return np.empty((*out.shape[:-3], *self._record_shape), np.uint8) if self._renders else out
 
     def observe(self, histories: np.ndarray, records: np.ndarray, out: np.ndarray) -> None:
-        """Render the observations of egos, unless the records were read into `out` directly.
+        """Render the egos' observations, unless the records were read directly into `out`.
 
         Args:
             histories: int (B,), positions in the selection.
@@ -100,7 +99,7 @@ class Observer:
             in_slices(render, len(rows), threads, least=slab)
 
     def _rendered(self, layout: Layout, records: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Observations of records of one layout; `out` is zeros to write them into."""
+        """Write the observations of records of one layout into `out`, which is zero."""
         if self._selection.has_states:
             return fast_observe(layout, records[..., : record_size(layout)], out, canonical=self._canonical)
         out[..., canonical_positions(layout)] = records[..., : layout.channels]
