@@ -1,1 +1,1 @@
-"""Reading histories: shards, chunk cache, sources held in memory, memory-mapped or streamed."""
+"""Reading histories: selections, shards, chunk cache, and sources in memory, memory-mapped or streamed."""

@@ -1,8 +1,7 @@
-"""The index and the episodes as Arrow tables, behind Parquet files and Hugging Face datasets.
+"""Arrow tables of the index and the episodes, used for Parquet files and Hugging Face datasets.
 
-A row of the episodes has all that a release stores of one. Every list has a fixed length: `steps` elements, one for
-each step of an episode, and `width` bytes for a state record. Shorter records are padded with zeros, so that the
-episodes of all layouts fit into one table.
+A row contains one episode with all stored fields. Lists have fixed lengths: `steps` elements, one per step, and `width`
+bytes for a state record. Shorter records are padded with zeros, so one table can hold episodes of all layouts.
 """
 
 from __future__ import annotations
@@ -53,11 +52,11 @@ EPISODE_COLUMNS: dict[str, EpisodeColumn] = {
     "state": EpisodeColumn("uint8", ("steps", "width")),
     "episode_end_state": EpisodeColumn("uint8", ("width",)),
 }
-"""The columns of the table of episodes, in order; those of `Entry` have the values of the episode's history."""
+"""Columns of the table of episodes, in order. Columns named like fields of `Entry` hold the history's values."""
 
 
 def index_schema() -> pa.Schema:
-    """Return the Arrow schema of the index, a column for each field of `Entry`.
+    """Return the Arrow schema of the index, with one column per field of `Entry`.
 
     Raises:
         OptionError: if pyarrow is not installed.
@@ -69,12 +68,12 @@ def index_schema() -> pa.Schema:
 
 
 def record_width(layouts: Sequence[Layout]) -> int:
-    """Return the number of bytes of the longest state record of some layouts."""
+    """Return the number of bytes of the layouts' longest state record."""
     return max(map(record_size, layouts))
 
 
 def episode_schema(dataset: Selection) -> pa.Schema:
-    """Return the Arrow schema of the episodes of a release with state records, or of a part of one.
+    """Return the Arrow schema of the episodes of a selection with state records.
 
     Raises:
         OptionError: if pyarrow is not installed.
@@ -91,7 +90,7 @@ def episode_schema(dataset: Selection) -> pa.Schema:
 
 
 def episode_table(history: History, schema: pa.Schema) -> pa.Table:
-    """Return a history's episodes, one row for each, in order.
+    """Return a table of a history's episodes, one row each, in order.
 
     Args:
         history: a history of a release with state records; all of its arrays are read.
@@ -128,7 +127,7 @@ def episode_table(history: History, schema: pa.Schema) -> pa.Table:
 
 
 def _nested_lists(array: np.ndarray, kind: pa.DataType) -> pa.Array:
-    """Return an array's elements, in order, as an Arrow array of fixed-size lists or of single values."""
+    """Convert an array to an Arrow array of fixed-size lists or of single values, in order."""
     arrow = import_pyarrow()
     if not arrow.types.is_fixed_size_list(kind):
         return arrow.array(array.reshape(-1).astype(kind.to_pandas_dtype(), copy=False))

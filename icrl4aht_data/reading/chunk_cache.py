@@ -12,7 +12,7 @@ _CACHE_BYTES = 256 * 2**20
 
 
 class ChunkCache:
-    """Decoded chunks of all shards of a release; the least recently used are dropped beyond a size. Thread-safe.
+    """Cache of a release's decoded chunks of limited size; drops the least recently used. Thread-safe.
 
     Args:
         size: limit in bytes. The newest chunk is kept even if it alone is larger.
@@ -28,14 +28,14 @@ class ChunkCache:
         self._bytes, self._process, self._lock = 0, os.getpid(), threading.Lock()
 
     def __getstate__(self) -> int:
-        return self._size  # a pickled cache is empty: the receiver reads what it needs
+        return self._size  # a pickled cache is empty: the receiving process fills its own
 
     def __setstate__(self, size: int) -> None:
         self.__init__(size)
 
     def get(self, key: tuple[str, int]) -> np.ndarray | None:
         """Return the chunk with the key (shard, row of its chunk table), or None."""
-        if self._process != os.getpid():  # a fork, where the lock may be held by a thread that does not exist
+        if self._process != os.getpid():  # after a fork, a thread that no longer exists may hold the lock
             self.clear()
         with self._lock:
             rows = self._chunks.get(key)

@@ -1,4 +1,4 @@
-"""The episodes of a history, whose arrays are read when they are used."""
+"""Episodes of a history, whose arrays are read on access."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 
 class Episode:
-    """One episode of a history: T consecutive steps, of which the last one is done.
+    """One episode of a history: T consecutive steps, the last one with done = True.
 
     `episode.actions`, `.rewards`, `.obs` and so on are NumPy arrays, read from the release at each access;
     `episode["actions"]` is the same as `episode.actions`.
 
     Args:
-        history: its history.
+        history: the history that contains it.
         number: number of the episode in its history, from 0.
 
     Attributes:
         entry: the history's entry of the index.
         number: number of the episode in its history, from 0.
-        start, stop: the episode's first step in its history, and the one after its last.
+        start, stop: first step of the episode in its history, and its end (exclusive).
     """
 
     def __init__(self, history: History, number: int) -> None:
@@ -48,7 +48,7 @@ class Episode:
         )
 
     def _repr_html_(self) -> str:
-        """The episode's facts and its return by step, for notebooks."""
+        """Return the episode's facts and its return by step as HTML, for notebooks."""
         e, rewards = self.entry, self.rewards
         given = ", ".join(f"{reward:+g} at step {step}" for step, reward in enumerate(rewards) if reward)
         facts = {
@@ -66,7 +66,7 @@ class Episode:
         return self._history.rows(name, self.start, self.stop)
 
     __iter__ = None
-    """Disabled: Python would otherwise count through `episode[0]`, `episode[1]`, which are no fields."""
+    """Disabled, since Python would otherwise iterate over `episode[0]`, `episode[1]`, which do not exist."""
 
     @property
     def obs(self) -> np.ndarray:
@@ -120,10 +120,10 @@ class Episode:
 
 
 class Episodes(Sequence[Episode]):
-    """The episodes of a history in order, or a part of them.
+    """Sequence of the episodes of a history, or of a part of them, in order.
 
-    `len(episodes)` is their number, `episodes[i]` the i-th `Episode`, `episodes[a:b]` a part; iteration yields them in
-    order. Nothing but the ends of episodes is read before an episode's arrays are used.
+    `episodes[i]` is the i-th `Episode`, `episodes[a:b]` a part of the sequence. Only the episode ends are read before
+    an episode's arrays are accessed.
 
     Args:
         history: the history.
@@ -160,5 +160,5 @@ class Episodes(Sequence[Episode]):
         return (self[position] for position in range(len(self)))
 
     def returns(self) -> np.ndarray:
-        """Return the sum of the rewards of each of these episodes, float64 (E,)."""
+        """Return the return of each episode, float64 (E,): the sum of its rewards."""
         return self._history.returns()[np.array(self.numbers, np.int64)]

@@ -1,4 +1,4 @@
-"""Filters of histories by functions, learners and returns, with the checks of what callers give."""
+"""Checks of the arguments of `Selection.filter`: functions, learners and returns."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from icrl4aht_data.format.schema import ENTRY_HINTS, Entry
 
 
 def passing(predicate: Callable[[Entry], bool], entries: Iterable[Entry]) -> np.ndarray:
-    """Return for each index entry whether a function returns true for it, bool (H,).
+    """Return bool (H,): the result of a function for each index entry.
 
     Raises:
         OptionError: if it is not a function, or does not return a bool.
@@ -41,7 +41,7 @@ def _passes(predicate: Callable[[Entry], bool], entry: Entry) -> bool:
 
 
 def learner_numbers(wanted: int | Sequence[int]) -> np.ndarray:
-    """Return one learner's number or several as integers (N,).
+    """Return the numbers of one or several learners as an integer array (N,).
 
     Raises:
         OptionError: for anything else.
@@ -53,7 +53,7 @@ def learner_numbers(wanted: int | Sequence[int]) -> np.ndarray:
 
 
 def check_return(least: float) -> None:
-    """Check the least return of an episode that `min_expert_return` names.
+    """Check that the option `min_expert_return` is a number.
 
     Raises:
         OptionError: for anything but a number.

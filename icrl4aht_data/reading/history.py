@@ -1,4 +1,4 @@
-"""One learning history, whose fields are NumPy arrays that are read at their first use."""
+"""A learning history, whose fields are NumPy arrays, read on first access."""
 
 from __future__ import annotations
 
@@ -21,31 +21,30 @@ from icrl4aht_data.utils.text import counted_noun, facts_html
 
 Obs = Literal["float32", "uint8", "state"]
 OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
-"""Presentations of observations: float32 (the paper's interface), uint8 (the same integers), or the state records that
-`icrl4aht_data.overcooked.observe` renders, if the release has them."""
+"""Values of the option `obs`: observations as float32 (the paper's dtype) or uint8 (the same integers), or state records,
+which `icrl4aht_data.overcooked.observe` renders as observations."""
 
 Labels = Literal["expert", "oracle"]
 LABELS: tuple[Labels, ...] = ("expert", "oracle")
-"""Kinds of labels, actions that a model learns to predict at any step: "expert", those of the policy that
-`Entry.expert_return` describes, acting greedily, or "oracle", those of the scripted oracle, which knows the full state.
-They are the fields `expert_actions` and `oracle_actions`."""
+"""Kinds of labels, actions that a model learns to predict: "expert" (field `expert_actions`), greedy actions of the
+policy with return `Entry.expert_return`, or "oracle" (field `oracle_actions`), actions of the scripted oracle, which
+knows the full state."""
 
 
 class History:
     """One learning history: an ego that learns with one fixed teammate, T steps in E episodes.
 
-    `history.actions`, `.rewards`, `.obs` and so on are read-only NumPy arrays, read at first use and kept with the
-    history; `history["actions"]` is the same as `history.actions`. `history.read("obs", 0, 100)` reads only some rows,
-    and `history.episodes[-1].actions` are those of the last episode.
+    `history.actions`, `.rewards`, `.obs` and so on are read-only NumPy arrays, read on first access and kept;
+    `history["actions"]` is the same as `history.actions`. `history.read("obs", 0, 100)` reads only some rows; `history.episodes[-1].actions` are the actions of the last episode.
 
     Args:
         entry: the history's entry of the index.
-        open_shard: returns the release's shard of a name, which is called at the first use of a field.
+        open_shard: function from a shard's name to the opened shard, called on first access of a field.
         obs: presentation of observations in `History.obs`; see `OBS`.
         channels: channels of `History.obs`, the layout's own or the canonical ones; see `channels.CHANNELS`.
 
     Attributes:
-        entry: the history's entry of the index: ids, layout, teammate, T, returns and others.
+        entry: the history's index entry: ids, layout, teammate, T, returns and others.
     """
 
     def __init__(self, entry: Entry, open_shard: Callable[[str], Shard], obs: Obs, channels: Channels = "own") -> None:
@@ -71,7 +70,7 @@ class History:
         )
 
     def _repr_html_(self) -> str:
-        """The history's facts and learning curve, for notebooks."""
+        """Return the history's facts and learning curve as HTML, for notebooks."""
         e = self.entry
         facts = {
             "layout": f"{e.layout}, {e.split}",
@@ -93,7 +92,7 @@ class History:
         return self._arrays[name]
 
     __iter__ = None
-    """Disabled: Python would otherwise count through `history[0]`, `history[1]`, which are no fields."""
+    """Disabled, since Python would otherwise iterate over `history[0]`, `history[1]`, which do not exist."""
 
     @property
     def kind(self) -> Kind:
@@ -127,7 +126,7 @@ class History:
         return self._shard.read(self.entry.history_id, field, start, stop)
 
     def rows(self, name: str, start: int, stop: int) -> np.ndarray:
-        """Return rows start..stop of a field as its property has them, which differs from `read` for "obs"."""
+        """Return rows start..stop of a field; like `read`, but "obs" follows the options `obs` and `channels`."""
         if name in self._arrays:
             return self._arrays[name][start:stop]
         if name != "obs":
@@ -140,7 +139,7 @@ class History:
         return (to_canonical(self._shard.layout, rows) if self._canonical else rows).astype(self._obs, copy=False)
 
     def _rendered(self, start: int, stop: int, dtype: DTypeLike, canonical: bool) -> np.ndarray:
-        """Observations (stop - start, 5, 5, C) of a release that stores states only."""
+        """Render observations (stop - start, 5, 5, C) of a release without stored observations."""
         layout = self._shard.layout
         what = f"{self._shard.path}: history {self.entry.history_id}: obs"
         out = new_array((stop - start, *observation_shape(layout, canonical)), dtype, what)
@@ -153,7 +152,7 @@ class History:
         if field.row == "state" and self.kind in field.absent:
             raise NotStoredError(
                 f"{self._shard.path}: no {name}: this release has observations only, which do not determine the state; "
-                f"use a full or lite release for what needs states, such as replay and drawing"
+                f"use a full or lite release for replay, drawing and other uses of states"
             )
         if not self.entry.has(field):
             raise LabelsMissingError(
@@ -197,7 +196,7 @@ class History:
 
     @property
     def expert_actions(self) -> np.ndarray:
-        """(T,) int32: greedy actions of one policy at the same steps, 0..5; what it earns is `entry.expert_return`.
+        """(T,) int32: greedy actions of one policy at the same steps, 0..5; its return is `entry.expert_return`.
 
         The policy is the learner's last checkpoint, as in the paper (App. D.1), or an earlier one that earns more: see
         `entry.expert_step`.
@@ -208,8 +207,8 @@ class History:
     def oracle_actions(self) -> np.ndarray:
         """(T,) int32: actions of the scripted oracle at the same steps, 0..5; it knows the full state.
 
-        In a history of source "noise" these are what the ego meant to do, its actions without the noise, and they equal
-        `expert_actions`, where they are read from if the release does not store them twice.
+        In a history of source "noise" these are the ego's actions without the noise. They equal `expert_actions`, so a
+        release need not store them.
         """
         return self["oracle_actions"]
 
@@ -224,16 +223,16 @@ class History:
 
     @property
     def episodes(self) -> Episodes:
-        """The episodes, a sequence: `history.episodes[-1].actions` are the actions of the last one."""
+        """The episodes as a sequence: `history.episodes[-1].actions` are the actions of the last episode."""
         return Episodes(self)
 
     @cached_property
     def episode_ends(self) -> np.ndarray:
-        """int64 (E,): the step after each episode."""
+        """int64 (E,): the end (exclusive) of each episode."""
         return np.flatnonzero(self.read("dones")) + 1
 
     def plot(self) -> Picture:
-        """Draw the learning curve, each episode's return, as a picture that notebooks show.
+        """Return the learning curve (return by episode) as a picture, which notebooks show.
 
         Raises:
             OptionError: if matplotlib is not installed.
@@ -243,7 +242,7 @@ class History:
         return Picture(f"{title}, return by episode", plot_history(self.returns(), title, e.expert_return))
 
     def animate(self, episode: int = -1, *, cell: int = 32, fps: int = 8) -> Picture:
-        """Draw an episode as an animated GIF, a picture that notebooks play.
+        """Return an episode as an animated GIF, which notebooks play.
 
         Args:
             episode: number of the episode, from 0, or from the end if negative; the last one by default.
@@ -253,7 +252,7 @@ class History:
         Raises:
             OptionError: for an episode that the history does not have, an impossible `cell` or `fps`, or if Pillow is
                 not installed.
-            NotStoredError: for a release without state records, from which nothing can be drawn.
+            NotStoredError: for a release without state records.
         """
         count = self.entry.episodes
         if isinstance(episode, bool) or not isinstance(episode, (int, np.integer)) or not -count <= episode < count:

@@ -1,4 +1,4 @@
-"""A selection of a release's learning histories, and how they are read."""
+"""Selections of a release's learning histories, and the options of reading them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     import pandas
 
 FilterValues = str | Sequence[str] | None
-"""One value of an index field, several, or None for any."""
+"""Filter on an index field: one value, several values, or None for any."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class ReadOptions:
     """Options of reading histories.
 
     Args:
-        obs: presentation of observations; see `history.OBS`.
+        obs: form of observations; see `history.OBS`.
         cache: cache mode of samplers; see `sources.CACHE_MODES`.
         threads: number of threads that decode and render; by default one for each usable core.
         channels: channels of observations; see `channels.CHANNELS`.
@@ -79,23 +79,23 @@ class ReadOptions:
 
 
 class Selection:
-    """Histories of a release in some order. Opening reads only the index; arrays are read when they are used.
+    """An ordered selection of a release's histories. Opening reads only the index; arrays are read on access.
 
-    `len(selection)` counts histories, `selection[i]` is the i-th, `selection[a:b]` a part, iteration yields them in
-    order. Selections of one release share its index and opened shards.
+    `len(selection)` counts histories, `selection[i]` is the i-th, `selection[a:b]` a smaller selection.
+    Selections of one release share its index and opened shards.
 
     Args:
         location: the release.
         index: the release's index.
         shards: the release's opened shards.
-        options: options of reading.
+        options: reading options.
         ids: int (H,), the histories' ids; all of the release by default.
 
     Attributes:
         ids: int (H,), ids of the histories in the release, in the order of the selection.
         index: the release's index.
         origin: the release: its folder on this machine, and its remote if it has one.
-        options: presentation and channels of observations, cache and threads.
+        options: form and channels of observations, cache mode, threads.
 
     Raises:
         OptionError: for obs="state" of a release without state records.
@@ -126,7 +126,7 @@ class Selection:
 
     @property
     def obs(self) -> Obs:
-        """The presentation of observations; see `history.OBS`."""
+        """Form of observations: "float32", "uint8" or "state"; see `history.OBS`."""
         return self.options.obs
 
     @property
@@ -136,10 +136,10 @@ class Selection:
 
     @property
     def obs_shape(self) -> tuple[int, int, int]:
-        """(5, 5, C), the shape of one observation; with obs="state", of what `observe` renders of a state record.
+        """Shape of one observation, (5, 5, C), also with obs="state", where it applies to rendered records.
 
         Raises:
-            OptionError: if the selection's layouts have own channels of unequal number.
+            OptionError: if the selection's layouts have different numbers of own channels.
         """
         shapes = {observation_shape(layout, self.channels == "canonical"): layout for layout in self.layouts}
         if len(shapes) > 1:
@@ -167,12 +167,12 @@ class Selection:
 
     @cached_property
     def provenance(self) -> ProvenanceByTask:
-        """How the histories of each task of the release were made, as in meta/provenance.json: task id -> record."""
+        """Origin of each task's histories, as in meta/provenance.json: task id -> record."""
         return ProvenanceByTask(read_provenance(self.origin.file(PROVENANCE)))
 
     @property
     def has_states(self) -> bool:
-        """Whether the release has state records; a release of observations has none."""
+        """Whether the release has state records, which releases of kind `observations` do not."""
         return self.info.kind in KINDS
 
     def __len__(self) -> int:
@@ -207,14 +207,14 @@ class Selection:
         )
 
     def named_counts(self, name: str) -> str:
-        """Return the values of an index field in words, such as "source ppo" or "sources ppo (120), noise (64)"."""
+        """Return the values of an index field as text, such as "source ppo" or "sources ppo (120), noise (64)"."""
         counts = self.counts(name)
         if len(counts) == 1:
             return f"{name} {next(iter(counts))}"
         return f"{name}s " + ", ".join(f"{value} ({number})" for value, number in counts.items())
 
     def counts(self, name: str) -> dict[str, int]:
-        """Return the number of histories with each value of an index field of names, such as "split" or "source".
+        """Return the number of histories for each value of a text field of the index, such as "split" or "source".
 
         Args:
             name: the field; or "labels", which counts histories with expert and with oracle actions.
@@ -223,7 +223,7 @@ class Selection:
             Value -> number of histories, above 0; values in order of first appearance in the release.
 
         Raises:
-            UnknownNameError: if there is no such field of names.
+            UnknownNameError: if the index has no such text field.
         """
         if name == "labels":
             found = {kind: int(self.has_labels(kind).sum()) for kind in LABELS}
@@ -235,10 +235,10 @@ class Selection:
         return {value: number for value, number in zip(self.index.values(field), numbers, strict=False) if number}
 
     def has_labels(self, labels: Labels) -> np.ndarray:
-        """Return for each history whether it has labels of a kind, bool (H,); see `history.LABELS`.
+        """Return bool (H,), True for histories with labels of a kind; see `history.LABELS`.
 
-        Differs from the index field `has_oracle_actions`, which says what is stored, for noise histories: their expert
-        actions are the oracle's, see `Entry.stored_field`.
+        For noise histories the oracle labels are the expert actions, even if `has_oracle_actions` is False because they
+        are not stored twice; see `Entry.stored_field`.
         """
         has = self.column(f"has_{labels}_actions")
         return has if labels == "expert" else has | ((self.column("source") == "noise") & self.has_labels("expert"))
@@ -265,8 +265,8 @@ class Selection:
             name: the field.
 
         Returns:
-            (H,): names as NumPy strings, numbers as int64 or float64, where None is -1 or NaN, and bool; (H, 3) for
-            `obs_shape`, the shape with the layout's own channels.
+            Array (H,) of strings, int64, float64 or bool, with -1 or NaN for None; (H, 3) for `obs_shape`, the shape
+            with the layout's own channels.
 
         Raises:
             UnknownNameError: if there is no such field; names the nearest one.
@@ -283,13 +283,13 @@ class Selection:
         return self.index.entries.column(name)[self.ids]
 
     def column_codes(self, name: str) -> np.ndarray:
-        """Return one index field of names as numbers, int32 (H,): the name with number n is `index.values(name)[n]`."""
+        """Return a text field of the index as codes, int32 (H,): code n stands for `index.values(name)[n]`."""
         return self.index.entries.column(name)[self.ids]
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return the index entries as a data frame with one row per history and the columns of `Entry`.
 
-        Names are categories, integers that may be unknown `Int64`, unknown floats NaN, observation shapes tuples.
+        Text columns are categories, integer columns with unknown values `Int64`; unknown floats are NaN.
 
         Raises:
             OptionError: if pandas is not installed.
@@ -335,7 +335,7 @@ class Selection:
 
     @cached_property
     def shards(self) -> list[str]:
-        """Paths in the release of the shards that store the selection."""
+        """Paths of the selection's shards in the release."""
         names = self.index.values("shard")
         return [names[code] for code in np.unique(self.column_codes("shard")).tolist()]
 
@@ -351,8 +351,8 @@ class Selection:
 
     @property
     def storage(self) -> HistorySource:
-        """Source of the selection's rows in the mode `cache`; `ram` and `mmap` decode them at the first access."""
-        if self._source is None:  # no lock, which a fork could leave held: two threads at once would both decode
+        """Source of the selection's rows in cache mode `cache`; `ram` and `mmap` decode all rows on first access."""
+        if self._source is None:  # without a lock, which a fork could leave held; concurrent first accesses both decode
             self._source = open_source(self.cache.cache, self.entries, self._shards, self.threads)
         return self._source
 
@@ -390,20 +390,20 @@ class Selection:
 
         Args:
             predicate: only histories for whose index entry this function returns true, such as
-                `lambda entry: entry.return_end > 30`. It reads no arrays; to choose by their content, give `select` one
-                bool for each history: `ds.select([history.returns().max() > 40 for history in ds])`.
+                `lambda entry: entry.return_end > 30`. It reads no arrays; to filter by array content, pass `select` one
+                bool per history: `ds.select([history.returns().max() > 40 for history in ds])`.
             min_expert_return: only histories whose labels come from a policy that earned at least this much, acting
                 greedily: `Entry.expert_return`.
             learner: only histories of these learners, numbered from 0 within each task: `Entry.learner`.
-            wanted: field=value, several values, or None for any: split, layout, track, teammate_family, teammate_kind
-                (or algorithm, which is the same), source or task_id, as in `load_icrl4aht`.
+            wanted: values of split, layout, track, teammate_family, teammate_kind (alias algorithm), source or task_id:
+                one value, several values, or None for any, as in `load_icrl4aht`.
 
         Raises:
-            UnknownNameError: for a field or value that does not exist, also of the entries that `predicate` reads.
+            UnknownNameError: for a field or value that does not exist, also in `predicate`.
             EmptySelectionError: if no history is left.
             OptionError: if `predicate` is not a function that returns a bool, `min_expert_return` not a number, or
                 `learner` not an integer or several.
-            NotStoredError: for `min_expert_return`, if of some history that is left it is not known.
+            NotStoredError: for `min_expert_return`, if the expert return of a remaining history is unknown.
         """
         matching = self.index.query(**wanted)
         ids = self.ids[np.isin(self.ids, matching)]
@@ -417,14 +417,14 @@ class Selection:
         return found if predicate is None else found._passing(predicate)
 
     def _passing(self, predicate: Callable[[Entry], bool]) -> Self:
-        """The histories whose index entries pass; see `filter`."""
+        """Return the histories whose index entries satisfy a function; see `filter`."""
         kept = passing(predicate, map(self.index.entry, self.ids.tolist()))
         if not kept.any():
             raise EmptySelectionError(f"{self.root}: no history of this selection passes the function; it is {self!r}")
         return self.select(kept)
 
     def _of_learners(self, wanted: int | Sequence[int]) -> Self:
-        """The histories of some learners; see `filter`."""
+        """Return the histories of some learners; see `filter`."""
         learners = self.column("learner")
         kept = np.isin(learners, learner_numbers(wanted))
         if not kept.any():
@@ -436,7 +436,7 @@ class Selection:
         return self.select(kept)
 
     def _earning(self, least: float) -> Self:
-        """The histories whose labels come from a policy that earned at least so much; see `filter`."""
+        """Return the histories with an expert return of at least `least`; see `filter`."""
         check_return(least)
         returns = self.column("expert_return")
         absent = np.isnan(returns)
@@ -470,7 +470,7 @@ class Selection:
         """
         try:
             given = np.asarray(ids)
-        except (TypeError, ValueError) as error:  # rows of unequal length
+        except (TypeError, ValueError) as error:  # nested lists of unequal length
             raise OptionError(f"select: expected a list of history ids, found {ids!r:.200}") from error
         if given.dtype == bool and given.ndim == 1:
             if len(given) != len(self):

@@ -1,4 +1,4 @@
-"""Reading of one HDF5 shard by stored offsets, with a hash of every chunk; `writing.shard_writer` writes shards.
+"""Reads an HDF5 shard at the offsets of its chunk table and checks each chunk's hash; see `writing.shard_writer`.
 
 Chunks are plain HDF5 ones (shuffle + deflate), so any HDF5 tool reads a shard. This reader does not use libhdf5: it
 reads a chunk's bytes at the offset in the chunk table, checks their hash and inflates them, without a global lock.
@@ -36,7 +36,7 @@ from icrl4aht_data.utils.system import new_array
 
 
 class Shard:
-    """One shard of a release: reads rows of its histories. May be shared between threads and pickled.
+    """One shard of a release, which reads rows of its histories. Thread-safe; can be pickled.
 
     Args:
         location: the release. If it is remote, opening downloads the shard and its chunk table.
@@ -52,8 +52,8 @@ class Shard:
         format_version: the release's format version.
 
     Raises:
-        ShardMissingError, ChunkTableError, ShardMismatchError, ShardTruncatedError, ShardUnreadableError: if shard and
-            chunk table do not fit the index, or cannot be read.
+        ShardMissingError, ChunkTableError, ShardMismatchError, ShardTruncatedError, ShardUnreadableError: if the
+            shard or its chunk table contradicts the index or cannot be read.
     """
 
     def __init__(
@@ -76,11 +76,11 @@ class Shard:
             location.remote.fetch([chunk_table_name(name), name])
         self.table = read_table(location.file(chunk_table_name(name)))
         self._check_table()
-        self.table = np.array(self.table)  # only now: before the check the file might be far too large for memory
+        self.table = np.array(self.table)  # after the check, since the file could be too large for memory
         self._check_size()
 
     def _check_table(self) -> None:
-        """Check that the chunk table has the chunks and rows that the index implies, in sizes that can be true."""
+        """Check that the chunk table has the chunks and rows implied by the index, with possible sizes."""
         table = self.table
         members = [(entry, field) for entry in self.entries.values() for field in entry.stored_fields(self.kind)]
         chunks = [entry.chunks(field) for entry, field in members]
@@ -110,7 +110,7 @@ class Shard:
             )
 
     def _check_size(self) -> None:
-        """Check that the file is long enough for every chunk."""
+        """Check that the file contains every chunk of the table."""
         try:
             size = self.path.stat().st_size
         except OSError as error:
@@ -133,7 +133,7 @@ class Shard:
         )
 
     def read(self, history_id: int, field: Field, start: int, stop: int) -> np.ndarray:
-        """Rows start..stop of a field, in the field's dtype. The range must be within the history.
+        """Return rows start..stop of a field, in the field's dtype. The range must be within the history.
 
         Raises:
             ShardCorruptError: names the chunk whose hash or size is wrong.
@@ -144,7 +144,7 @@ class Shard:
         return rows
 
     def read_into(self, history_id: int, field: Field, start: int, out: np.ndarray) -> None:
-        """Read the rows from `start` that fill `out`, cast to its dtype; see `read`."""
+        """Fill `out` with rows from `start` on, cast to its dtype; see `read`."""
         first, length = self._first_chunk(history_id, field), self._chunk_rows(history_id, field)
         stop = start + len(out)
         for number in range(start // length, -(-stop // length)):
@@ -176,11 +176,11 @@ class Shard:
                 )
 
     def decode(self, row: int, history_id: int, field: Field) -> np.ndarray:
-        """The rows of one chunk, read from the file and checked; includes the padding rows of a last chunk.
+        """Return the rows of one chunk, read from the file and checked, including padding rows.
 
         Args:
             row: the chunk's row in the chunk table.
-            history_id, field: what the chunk belongs to.
+            history_id, field: history and field of the chunk.
         """
         element, length = self._elements[field.name], self._chunk_rows(history_id, field)
         data = self.checked_bytes(row)
@@ -189,11 +189,11 @@ class Shard:
         except ValueError as error:
             raise ShardCorruptError(f"{self.path}: {self.describe(row)}: {error}") from error
         rows = np.frombuffer(raw, element.base).reshape(length, *element.shape)
-        rows.flags.writeable = False  # the cache hands it to several readers
+        rows.flags.writeable = False  # cached chunks are shared between readers
         return rows
 
     def checked_bytes(self, row: int) -> bytes:
-        """The stored bytes of one row of the chunk table.
+        """Return the stored bytes of the chunk in one row of the chunk table.
 
         Raises:
             ShardCorruptError: if they are damaged; names the chunk.
@@ -214,14 +214,14 @@ class Shard:
         return data
 
     def _first_chunk(self, history_id: int, field: Field) -> int:
-        """Row in the chunk table of the first chunk with a field's values."""
+        """Return the chunk table's row of the first chunk of a field."""
         return self._first[history_id, self.entries[history_id].stored_field(field).name]
 
     def _chunk_rows(self, history_id: int, field: Field) -> int:
         return min(field.chunk, self.entries[history_id].rows(field))
 
     def fingerprint(self, history_id: int) -> bytes:
-        """Names of a history's fields and hashes of its chunks, which differ where its stored content differs."""
+        """Return bytes that identify a history's stored content: names of its fields and hashes of its chunks."""
         entry = self.entries[history_id]
         stored = entry.stored_fields(self.kind)
         first, chunks = self._first[history_id, stored[0].name], sum(map(entry.chunks, stored))
@@ -229,13 +229,13 @@ class Shard:
         return names + self.table["hash"][first : first + chunks].tobytes()
 
     def chunks(self) -> Iterator[tuple[int, int, Field]]:
-        """Every chunk as (row in the chunk table, history id, field)."""
+        """Yield (row in the chunk table, history id, field) for every chunk."""
         for (history_id, name), first in self._first.items():
             for number in range(self.entries[history_id].chunks(FIELDS[name])):
                 yield first + number, history_id, FIELDS[name]
 
     def describe(self, row: int) -> str:
-        """A chunk for messages: its number, field, history and bytes."""
+        """Describe a chunk for messages: its number, field, history and bytes."""
         offset, size = int(self.table["offset"][row]), int(self.table["size"][row])
         if not self.table["rows"][row]:
             return f"bytes {offset}..{offset + size}, between the chunks"
@@ -246,11 +246,11 @@ class Shard:
 
 
 class Shards:
-    """The shards of a release, each opened when it is first read.
+    """The shards of a release, each opened on first use.
 
     Args:
         location: the release.
-        index: its index.
+        index: the release's index.
     """
 
     def __init__(self, location: ReleaseLocation, index: Index) -> None:
@@ -259,7 +259,7 @@ class Shards:
         self.cache = ChunkCache()
 
     def open(self, name: str) -> Shard:
-        """The shard with that path in the release, fetched first if the release is remote."""
+        """Return the shard with a path in the release; it is fetched if the release is remote."""
         if name not in self._open:
             entries = self._index.entries
             members = [entries[row] for row in entries.shard_rows(name).tolist()]
@@ -267,7 +267,7 @@ class Shards:
         return self._open[name]
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Fetch shards of a remote release and their chunk tables, several at once, before they are opened."""
+        """Fetch shards of a remote release and their chunk tables in parallel."""
         closed = [name for name in dict.fromkeys(names) if name not in self._open]
         if self._location.remote is not None and closed:
             self._location.remote.fetch([*map(chunk_table_name, closed), *closed])

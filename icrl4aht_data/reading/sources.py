@@ -1,11 +1,11 @@
-"""Three ways to hold the histories of a selection, `ram`, `mmap` and `stream`, which give the same rows.
+"""Cache modes for the histories of a selection: `ram`, `mmap` and `stream`, which give equal rows.
 
 ram      records and scalars decoded once into flat arrays in memory; reading a window is one copy
 mmap     the same arrays decoded once into the cache folder and memory-mapped, shared by processes
-stream   chunks read by their stored offsets, checked and inflated on threads when a window needs them
+stream   chunks read, checked and inflated on threads when a window needs them
 
-A record is what is held of a step to present the ego's observation: the state record, or in a release without state
-records the observation itself; see `schema.record_field`.
+A record is the state record of a step, or in a release without state records the observation; see
+`schema.record_field`.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 CacheMode = Literal["auto", "ram", "mmap", "stream"]
 CACHE_MODES: tuple[CacheMode, ...] = ("auto", "ram", "mmap", "stream")
-"""Ways of holding data; "auto" takes the first of ram, mmap and stream that the machine has room for."""
+"""Cache modes; "auto" is the first of ram, mmap and stream that the machine has room for."""
 
-_VERSION = 2  # of the memory-mapped arrays
+_VERSION = 2  # version of the memory-mapped arrays' format
 _COPIED = 2**20  # bytes copied at a time, so that NumPy's intermediate copy fits into the processor's cache
-_STEPS = 8192  # for fewer steps another thread costs more than it saves
+_STEPS = 8192  # fewest steps for which another thread saves time
 
 
 class CacheChoice(NamedTuple):
-    """The cache mode of a selection.
+    """The chosen cache mode of a selection.
 
     Attributes:
         cache: "ram", "mmap" or "stream".
@@ -46,7 +46,7 @@ class CacheChoice(NamedTuple):
 
 
 class ReadRequest(NamedTuple):
-    """Rows of one field in several histories, and the array to read them into. `n` denotes the number of histories.
+    """A request to read rows of one field of n histories into an array.
 
     Attributes:
         field: a name in `schema.held_fields`.
@@ -64,10 +64,10 @@ class ReadRequest(NamedTuple):
 
 
 class HistorySource(Protocol):
-    """Reader of rows of the histories of a selection; requests refer to histories by their positions in it."""
+    """Interface of sources, which read rows of a selection's histories, given by their positions in it."""
 
     def read(self, requests: Sequence[ReadRequest]) -> None:
-        """Carry out requests, in parallel. Shards of a remote release that they need are downloaded first.
+        """Carry out requests in parallel, after downloading the shards they need from a remote release.
 
         Raises:
             ShardCorruptError: names the chunk whose checksum is wrong.
@@ -92,19 +92,19 @@ def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
 
 
 def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episodes: int) -> int:
-    """Bytes of the flat arrays of histories of one layout, with so many steps and episodes in total."""
+    """Return the bytes of the flat arrays of one layout's histories, with `steps` and `episodes` in total."""
     rows = {"T": steps + histories + 1, "E": episodes}
     return sum(rows[field.axis] * field.held(layout).itemsize for field in held_fields(kind))
 
 
 def open_source(cache: CacheMode, entries: Sequence[Entry], shards: Shards, threads: int) -> HistorySource:
-    """Open the histories of a selection; `ram` and `mmap` decode them.
+    """Open a source of a selection's histories; `ram` and `mmap` decode all of them.
 
     Args:
         cache: "ram", "mmap" or "stream".
         entries: index entries, (H,), in the selection's order; a history may occur more than once.
         shards: the release's shards.
-        threads: how many decode and copy.
+        threads: number of threads that decode and copy.
     """
     if cache == "stream":
         return StreamedSource(entries, shards, threads)
@@ -123,7 +123,7 @@ def _arrays_in_memory(entries: Sequence[Entry], shards: Sequence[Shard], threads
 
 
 def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> dict[str, np.ndarray]:
-    """Arrays of the cache folder whose key is the histories' content; decoded if they are not there."""
+    """Return memory-mapped arrays from the cache folder, keyed by the histories' content; decode missing ones."""
     layout = shards[0].layout
     digest = hashlib.blake2b(f"{_VERSION} {layout.name} {layout.rows}".encode(), digest_size=16)
     for entry, shard in zip(entries, shards, strict=True):
@@ -144,7 +144,7 @@ def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: i
 def _decode(
     entries: Sequence[Entry], shards: Sequence[Shard], threads: int, make: Callable[..., np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Field -> array (rows, ...) with the histories of one layout; `make(shape, dtype, name)` allocates one, zeroed."""
+    """Return field -> array (rows, ...) with one layout's histories; `make(shape, dtype, name)` allocates zeros."""
     arrays = {}
     for field in held_fields(shards[0].kind):
         if any(entry.has(field) for entry in entries):
@@ -166,21 +166,21 @@ def _decode(
 
 
 def _first_rows(entries: Sequence[Entry], axis: str) -> np.ndarray:
-    """int (H,): the row of each history's first step or episode in flat arrays.
+    """Return int (H,): the row of each history's first step or episode in flat arrays.
 
-    A row of zeros precedes the steps of each history and one follows the last: what came before a history's first step.
+    A row of zeros precedes the steps of each history (its missing previous step), and one follows the last history.
     """
     lengths = np.array([entry.T + 1 if axis == "T" else entry.episodes for entry in entries])
     return np.cumsum(lengths) - lengths + (1 if axis == "T" else 0)
 
 
 class FlatSource:
-    """Histories one after the other in flat arrays, in memory or memory-mapped; one set of arrays a layout."""
+    """Source with concatenated histories in flat arrays, in memory or memory-mapped, one set of arrays per layout."""
 
     def __init__(self, entries: Sequence[Entry], threads: int) -> None:
         self._ids, self._threads = np.array([entry.history_id for entry in entries]), threads
         self._arrays: list[dict[str, np.ndarray]] = []
-        self._layout = np.zeros(len(entries), np.intp)  # which arrays a history is in
+        self._layout = np.zeros(len(entries), np.intp)  # position of each history's arrays in `_arrays`
         self._first = {axis: np.zeros(len(entries), np.intp) for axis in ("T", "E")}
         self._rows = {"T": np.array([e.T for e in entries]), "E": np.array([e.episodes for e in entries])}
 
@@ -189,7 +189,7 @@ class FlatSource:
         return f"{type(self).__name__}({counted_histories(len(self._ids))}, {size} decoded)"
 
     def add(self, members: Sequence[Entry], arrays: dict[str, np.ndarray]) -> None:
-        """Add the arrays with the histories of one layout, which are in order of their ids."""
+        """Add the arrays of one layout's histories, sorted by id."""
         ids = np.array([entry.history_id for entry in members])
         number = np.minimum(np.searchsorted(ids, self._ids), len(ids) - 1)
         here = ids[number] == self._ids
@@ -218,14 +218,14 @@ class FlatSource:
                 out[chosen, ..., part.shape[-1] :] = 0
 
     def _read_layout(self, array: np.ndarray, request: ReadRequest) -> None:
-        """Carry out a request for histories that are all in one array."""
+        """Carry out a request whose histories are all in one array."""
         name, histories, rows, out = request
         first, count, length = self._first[FIELDS[name].axis][histories], self._rows[FIELDS[name].axis], out.shape[1]
         if rows.ndim == 2:
             gather_rows(array, first[:, None] + rows, out)
             return
-        # Windows that end at most one step behind their history, at its row of zeros, are contiguous in the array.
-        # Copied as blocks, 64 windows of 500 state records take 60 microseconds; gathered row by row 120.
+        # Windows that end at most one step after their history, in its row of zeros, are contiguous in the array.
+        # 64 windows of 500 state records take 60 microseconds as blocks, 120 row by row.
         if length <= len(array) and (rows + length - count[histories] <= 1).all():
             _copy_windows(array, first + rows, out)
             return
@@ -235,18 +235,18 @@ class FlatSource:
 
 
 def gather_rows(array: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
-    """Copy array[rows[i, j]] to out[i, j], cast to its dtype; rows beyond the array are replaced by its nearest one."""
+    """Copy array[rows[i, j]] to out[i, j], cast to its dtype; indices are clipped."""
     if out.dtype == array.dtype:
-        np.take(array, rows, axis=0, out=out, mode="clip")  # other modes copy once more
+        np.take(array, rows, axis=0, out=out, mode="clip")  # the other modes make another copy
     else:
         out[...] = np.take(array, rows, axis=0, mode="clip")
 
 
 def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None:
-    """Copy rows first..first + K of array (N, ...) into out (n, K, ...), C-contiguous, as one block a window."""
+    """Copy rows first..first + K of array (N, ...) into out (n, K, ...), C-contiguous, one block per window."""
     size = array[0].size
     flat, width = array.reshape(-1), out.shape[1] * size
-    # A view of all windows, one for each offset. `sliding_window_view` does the same and takes 20 microseconds longer.
+    # A view of the windows at all offsets, as from `sliding_window_view`, which takes 20 microseconds longer.
     blocks = np.ndarray((flat.size - width + 1, width), flat.dtype, flat, strides=flat.strides * 2)
     offset, target = first * size, out.reshape(len(out), -1)
     windows = max(1, _COPIED // (width * flat.itemsize))
@@ -256,7 +256,7 @@ def _copy_windows(array: np.ndarray, first: np.ndarray, out: np.ndarray) -> None
 
 
 class StreamedSource:
-    """Histories in their shards, read a few chunks at a time; a shard is opened when it is first needed."""
+    """Source that reads chunks of histories on demand; shards are opened on first use."""
 
     def __init__(self, entries: Sequence[Entry], shards: Shards, threads: int) -> None:
         self._entries, self._shards, self._threads = entries, shards, threads
@@ -269,7 +269,7 @@ class StreamedSource:
         positions = {position for request in requests for position in request.histories.tolist()}
         names = sorted({self._entries[position].shard for position in positions})
         self._shards.fetch(names)
-        for name in names:  # before the threads start, so that each shard is opened once
+        for name in names:  # before the threads start: concurrent threads would open a shard twice
             self._shards.open(name)
         _on_threads(self._read, requests, self._threads)
 

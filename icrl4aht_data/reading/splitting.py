@@ -1,6 +1,6 @@
-"""Teammates and histories that are held out of training, chosen by names and a seed alone.
+"""Choice of teammates and histories to hold out of training, a function of names and a seed.
 
-The order of a selection, and what else it has, does not change which of two histories is chosen first.
+Each name has a random rank, so the choice between two histories does not depend on the rest of the selection.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from icrl4aht_data.reading.selection import Selection
 
 SplitBy = Literal["teammate", "history"]
 SPLIT_BY: tuple[SplitBy, ...] = ("teammate", "history")
-"""What a split holds out: teammates with all their histories, or histories of every kind of task."""
+"""Units that a split holds out: teammates with all their histories, or single histories."""
 
 
 def choose_teammates(teammates: np.ndarray, share: float, seed: int) -> np.ndarray:
@@ -50,14 +50,16 @@ def choose_histories(selection: Selection, share: float, seed: int) -> np.ndarra
         bool (H,): True for the chosen histories.
 
     Raises:
-        OptionError: if the share is not between 0 and 1, or every task has one history only.
+        OptionError: if the share is not between 0 and 1, or every task has only one history.
     """
     _check_share(share)
     names, of_task = selection.index.values("task_id"), defaultdict(list)
     streams = _stream_names(selection)
     for row, code in enumerate(selection.column_codes("task_id").tolist()):
         of_task[code].append((_rank(seed, names[code], *streams[row]), row))
-    candidates = sorted(one for ranked in of_task.values() for one in sorted(ranked)[:-1])  # the last one stays
+    candidates = sorted(
+        one for ranked in of_task.values() for one in sorted(ranked)[:-1]
+    )  # one history per task stays in training
     if not candidates:
         raise OptionError(
             f"every task of {selection!r} has one history: expected a task with two or more, one to train on and one "
@@ -74,7 +76,7 @@ def _check_share(share: float) -> None:
 
 
 def _stream_names(selection: Selection) -> list[tuple[int, ...]]:
-    """Return what tells each history from the others of its task: its stream, and its learner after the first one."""
+    """Return a key of each history within its task: its stream, and its learner unless that is 0."""
     pairs = zip(selection.column("env_idx").tolist(), selection.column("learner").tolist(), strict=True)
     return [(stream, learner) if learner else (stream,) for stream, learner in pairs]
 

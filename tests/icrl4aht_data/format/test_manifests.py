@@ -96,7 +96,7 @@ def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     ("change", "message"),
     [
         ({"family": "utility"}, r"line 1: unknown heuristic family 'utility'.*Did you mean 'utility_greedy'"),
-        ({"slot": 0}, r"line 1: teammate\.slot: a task's teammate plays slot 1, found 0"),
+        ({"slot": 0}, r"line 1: teammate\.slot: expected 1, the teammate's agent slot, found 0"),
         ({"colour": "red"}, r"line 1: teammate: expected the fields .*found .*'colour'"),
         ({"theta": [1]}, r"line 1: teammate\.theta: expected parameters by name, found \[1\]"),
     ],
