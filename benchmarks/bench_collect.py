@@ -1,10 +1,10 @@
-"""Collection: speed, memory and size on disk: `make bench-collect`.
+"""Speed, memory and size on disk of collection: `make bench-collect`.
 
 One JSON line for each part:
 
-    noise   recorded transitions/s of noise histories, writing and hashing included, and the seconds to compile them
-    speed   recorded transitions/s of the complete path (PPO, recording, writing), and the share of the time that
-            recording and writing take
+    noise   recorded transitions/s of noise histories, with writing and hashing, and the seconds to compile
+    speed   recorded transitions/s of the complete path (PPO, recording, writing), and the share of time for
+            recording and writing
     memory  highest resident memory of a collection with the paper's 1024 environments and of its learner alone, each
             in its own process
     bytes   bytes per transition of the bundled histories, everything included: `lite` and `full` releases compared
@@ -56,15 +56,15 @@ _PAPER_DTYPES = {
 
 
 _NOISE = NoiseConfig(histories=64, episodes=100, finish=(0.5, 1.0))
-"""Noise histories to measure: 640,000 transitions."""
+"""Settings of the noise histories to measure: 640,000 transitions."""
 
 
 class _EnoughError(Exception):
-    """Stops a collection after the updates to measure."""
+    """Raised to stop a collection after the measured updates."""
 
 
 def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
-    """Return the timing of a collection of the profile's last heuristic task after a number of updates."""
+    """Return the timing of a collection of the profile's last heuristic task, stopped after `updates` updates."""
     work = _first_heuristic(profile)
 
     def report(update: int, metrics: dict[str, float]) -> None:
@@ -79,12 +79,12 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
 
 
 def _first_heuristic(profile: Profile) -> Work:
-    """Return the first learner of a task with a teammate that needs no training."""
+    """Return the work of the profile's last task with heuristic teammates."""
     return replace(profile, presets=("default",)).works()[-1]
 
 
 def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:
-    """Return the speed of a collection that saves the learner's state every two seconds, 15 times as often as usual."""
+    """Return the speed of a collection that saves its state every two seconds, 15 times the usual rate."""
     profile = load_profile(profile_name)
     timing = collect_some(profile, updates, save_seconds=2)
     return {
@@ -97,7 +97,7 @@ def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:
 
 
 def noise_speed(layout: str) -> dict[str, Any]:
-    """Return the speed of a task of noise histories with H4 after another one has compiled it."""
+    """Return the speed of a task of noise histories with H4, compiled by an earlier task."""
     profile = replace(load_profile("smoke"), noise=_NOISE, sources=("noise",))
     mate = heuristic_teammate("utility_greedy", "default", 0)
     tasks = [make_task(track_of(layout), "train", layout, mate, seed) for seed in range(2)]
@@ -140,7 +140,7 @@ def peak_of_learning(updates: int, recording: bool) -> float:
 
 
 def transition_bytes(streams: int) -> dict[str, Any]:
-    """Return the bytes per transition of the first streams of every task of the bundled release, in all formats."""
+    """Return bytes per transition in all formats, measured on the first streams of each task of the bundled release."""
     dataset = load_icrl4aht(obs="uint8")
     chosen = [(task, dataset.filter(task_id=task.task_id)[:streams]) for task in read_tasks(dataset.root / TASKS)]
     new = [

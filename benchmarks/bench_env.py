@@ -3,14 +3,14 @@
     steps    environments alone
     ippo     JaxMARL's IPPO on our environment and on JaxMARL's own: `PEER=file`
 
-In `steps` both run the same jitted loop: random actions, auto-reset, both agents' 5 x 5 observations of every step
-written into a donated buffer. One JSON line per layout, number of environments, and content of the buffer:
+In `steps` both run the same jitted loop with random actions and auto-reset, which writes both agents' observations of
+every step into a donated buffer. One JSON line per layout, number of environments, and content of the buffer:
 
     uint8    observations as uint8 (the peer's int32 ones are cast as they are written)
     float32  observations as float32
-    state    state records of ours, from which observations are rendered where used; the peer's observations as uint8
+    state    our state records, for observations rendered on use; the peer's observations as uint8
 
-In `ippo` the learner of a copy of JaxMARL's `ippo_rnn_overcooked_v2.py` does 10 updates, compiled with either
+In `ippo` JaxMARL's learner (a copy of `ippo_rnn_overcooked_v2.py`) does 10 updates, compiled with either
 environment, see `benchmarks.peers`. Its network takes most of the time, so a faster environment gains less.
 """
 
@@ -37,15 +37,15 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 _LAYOUTS = ("coord_simple", "coord_ring", "demo_wide")
 ENVIRONMENTS = (64, 1024)
 WRITTEN = ("uint8", "state", "float32")
-STEPS = 51_200  # in one call, of all environments together
-UPDATES = 10  # of a learner, in one call
+STEPS = 51_200  # per call, summed over environments
+UPDATES = 10  # of the learner, per call
 
 StepEnvironments = Callable[[Any, Any, Any], tuple[Any, Any, Any]]
 """(key, state, actions int32 (N, 2)) -> state, array to write (N, ...), reward float32 (N,)."""
 
 
 def our_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironments]:
-    """Return initial state and step function of n environments of ours."""
+    """Return the initial state and the step function of n of our environments."""
     env = Environment(layout)
 
     def step(key, state, actions):
@@ -59,7 +59,7 @@ def our_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironment
 
 
 def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironments]:
-    """Return initial state and step function of n environments of JaxMARL's."""
+    """Return the initial state and the step function of n of JaxMARL's environments."""
     env = jaxmarl_environment(layout)
     dtype = jnp.float32 if written == "float32" else jnp.uint8
 
@@ -73,7 +73,7 @@ def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironmen
 
 
 def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
-    """Return a compiled call that plays `STEPS` steps with random actions; each call continues from the last."""
+    """Return a compiled call that plays `STEPS` steps with random actions; each call continues from the previous one."""
     state, step = game
     steps = STEPS // n
 

@@ -1,21 +1,21 @@
-"""Speed of learning, training and evaluation on a GPU: `make bench-gpu`; in tiny sizes on a CPU, to try the command.
+"""Speed of learning, training and evaluation on a GPU: `make bench-gpu`. On a CPU, sizes are tiny, for testing.
 
-    device     what the figures were made on
+    device     facts on machine, software and settings
     product    TFLOP/s of one large matrix product; float32 products use TF32 on a GPU by default, see `measure_product`
     learner    steps/s of an ego's PPO with teammate H4: 1,024 environments, the paper's network and minibatches
-    train      training step of AD: B = 1024, L = 500 for the paper's small; seconds waited for the loader
+    train      training step of AD (B = 1024, L = 500 for the paper's small), and seconds waited for the loader
     loader     batches/s alone, from the bundled release to the device
     act        the evaluator's steps/s with cached acting, on the tasks of one layout
     attention  forward and backward pass of attention as in training, compared with JAX's and cuDNN's
 
-One JSON line for each case. Cases run in child processes, in a new one after each failure; when the time is over, the
-running case is stopped and the others are skipped, both with a line. Learners run in a process of their own, with XLA's
+One JSON line for each case. Cases run in a child process, after each failure in a new one. At the time limit the
+running case is stopped and the others are skipped, each with a line. Learners run in a separate process, with XLA's
 deterministic operations, as in `generate`. Models are untrained.
 
 `mfu` is the model FLOP utilisation: the operations of the matrix products in the traced program
-(`benchmarks.harness.product_flops`, backward pass included) by the time of a step, divided by what the large product
-reaches with the same dtype, or by `--peak-tflops`. With `words` in training, the operations are those of a batch whose
-observations all differ; equal ones are computed once.
+(`benchmarks.harness.product_flops`, backward pass included) per second of step time, divided by the speed of the
+large product with the same dtype, or by `--peak-tflops`. With `words` in training, the operations are those of a batch
+whose observations all differ; equal ones are computed once.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ _OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of everything that is measured.
+    """Sizes of all measurements.
 
     Attributes:
         product: rows and columns of the matrices of the large product.
@@ -76,8 +76,8 @@ class Sizes:
         length: L in training and K in acting, at most.
         shrunk: size name -> values that replace those of `SIZES`.
         episode_steps: steps of an episode in acting.
-        tasks: most tasks in acting.
-        seconds: least time of a measurement, after compiling.
+        tasks: largest number of tasks in acting.
+        seconds: minimum time of a measurement, after compiling.
     """
 
     product: int
@@ -125,13 +125,13 @@ class Bench:
     peaks: dict[str, float]
 
     def mfu(self, flops: float, seconds: float, dtype: str) -> float:
-        """Return the share of the peak that `flops` in `seconds` are."""
+        """Return the speed `flops / seconds` as a share of the peak."""
         peak = self.peaks.get(dtype) or product_tflops(self.sizes.product, dtype, None, self.sizes.seconds / 4)
         return round(flops / seconds / peak / 1e12, 4)
 
 
 def device_memory() -> dict[str, float]:
-    """Return GiB of memory in use, the highest so far in this process, and the limit; nothing on a CPU."""
+    """Return GiB of device memory: in use, peak of this process, and limit; empty on a CPU."""
     found = jax.local_devices()[0].memory_stats() or {}
     names = {"bytes_in_use": "in_use_gib", "peak_bytes_in_use": "process_peak_gib", "bytes_limit": "limit_gib"}
     return {name: gib(found[key]) for key, name in names.items() if key in found}
@@ -143,7 +143,7 @@ def gib(count: int) -> float:
 
 
 def seconds_of_calls(call: Callable[[], Any], seconds: float, least: int = 3) -> list[float]:
-    """Return the seconds of each of some calls, which together take `seconds` or more; the first one is left out."""
+    """Return the seconds of repeated calls until `seconds` have passed, without the first call."""
     jax.block_until_ready(call())
     found: list[float] = []
     while len(found) < least or sum(found) < seconds:
@@ -160,7 +160,7 @@ def product_tflops(size: int, dtype: str, precision: str | None, seconds: float)
     multiply = jax.jit(partial(jnp.matmul, precision=precision))
 
     def several() -> Any:
-        return [multiply(one, two) for _ in range(5)]  # so that starting a product does not count
+        return [multiply(one, two) for _ in range(5)]  # makes the overhead of a call negligible
 
     return 5 * 2 * size**3 / min(seconds_of_calls(several, seconds)) / 1e12
 
@@ -186,7 +186,7 @@ def describe_device(bench: Bench) -> dict[str, Any]:
 
 
 def measure_product(bench: Bench) -> dict[str, Any]:
-    """TFLOP/s of the large product: as float32 products are computed by default, exactly, and in bfloat16."""
+    """Return TFLOP/s of the large product in default float32, exact float32 and bfloat16."""
     size, seconds = bench.sizes.product, bench.sizes.seconds / 4
     kinds = {"float32": ("float32", None), "float32_highest": ("float32", "highest"), "bfloat16": ("bfloat16", None)}
     found = {f"tflops_{name}": product_tflops(size, *kind, seconds) for name, kind in kinds.items()}
@@ -194,7 +194,7 @@ def measure_product(bench: Bench) -> dict[str, Any]:
 
 
 def measure_learner(bench: Bench, encoder: EncoderKind) -> dict[str, Any]:
-    """Environment steps/s of complete updates of an ego with teammate H4."""
+    """Measure environment steps/s of an ego's updates with teammate H4."""
     learner = ego_learner(bench.sizes, encoder)
     config = learner.config
     state = jax.jit(learner.init)(jax.random.key(0))
@@ -221,7 +221,7 @@ def measure_learner(bench: Bench, encoder: EncoderKind) -> dict[str, Any]:
 
 
 def measure_training(bench: Bench, size: str, encoder: EncoderKind, dtype: str) -> dict[str, Any]:
-    """Training steps of AD, in as many parts (`accumulate`) as the memory asks for."""
+    """Measure training steps of AD, in as many parts (`accumulate`) as the memory requires."""
     parts, reason = 1, ""
     while bench.sizes.batch % parts == 0:
         try:
@@ -230,7 +230,7 @@ def measure_training(bench: Bench, size: str, encoder: EncoderKind, dtype: str) 
             if not isinstance(error, MemoryError) and _OUT_OF_MEMORY not in str(error):
                 raise
             reason = str(error)
-        parts *= 2  # after the block above, which keeps the arrays of the failed attempt alive
+        parts *= 2  # outside the except block, which keeps the failed attempt's arrays alive
     raise MemoryError(f"no number of parts fits: {reason}")
 
 
@@ -276,7 +276,7 @@ def _training_steps(bench: Bench, size: str, encoder: EncoderKind, dtype: str, p
 
 
 def measure_loader(bench: Bench, size: str) -> dict[str, Any]:
-    """Seconds for a batch of state records, from the bundled release to the device, with no work between."""
+    """Measure seconds per batch of state records from the bundled release to the device."""
     sizes, device = bench.sizes, jax.devices()[0]
     sampler = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state").ad(
         batch_size=sizes.batch, length=context_length(sizes, size), seed=0
@@ -292,7 +292,7 @@ def measure_loader(bench: Bench, size: str) -> dict[str, Any]:
 
 
 def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) -> dict[str, Any]:
-    """The evaluator's steps/s with full windows, over all streams (tasks times seeds), and per stream."""
+    """Measure the evaluator's steps/s with full windows: over all streams (tasks times seeds), and per stream."""
     sizes, context = bench.sizes, context_length(bench.sizes, size)
     layout = get_layout(_LAYOUT)
     tasks = h4_tasks()[: sizes.tasks]
@@ -304,7 +304,7 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
     compile_seconds = time.perf_counter() - started
     episodes = play_episodes(prepared)
     filling, shortest = -(-context // sizes.episode_steps), 2 * -(-context // 5 // sizes.episode_steps)
-    for _ in islice(episodes, filling):  # from here on the oldest fifth is dropped again and again
+    for _ in islice(episodes, filling):  # from here on the oldest fifth is dropped regularly
         pass
     seconds = seconds_of_calls(partial(next, episodes), sizes.seconds, least=max(3, shortest))
     streams, episode_seconds = len(tasks) * seeds, statistics.mean(seconds)
@@ -319,7 +319,7 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
 
 
 def measure_attention(bench: Bench) -> dict[str, Any]:
-    """Milliseconds of attention, forward and backward in bfloat16: as the models compute it, by JAX, and by cuDNN."""
+    """Measure milliseconds of attention (forward and backward, bfloat16): our implementation, JAX's and cuDNN's."""
     small = SIZES["small"]
     shape = (bench.sizes.batch, bench.sizes.length, small.heads, small.width // small.heads)
     q, k, v = jax.random.normal(jax.random.key(0), (3, *shape), jnp.bfloat16)
@@ -343,19 +343,19 @@ def measure_attention(bench: Bench) -> dict[str, Any]:
 
 
 def h4_tasks() -> list[Task]:
-    """Return the test tasks with teammates of family H4 on the layout of the benchmark."""
+    """Return the test tasks with H4 teammates on the measured layout."""
     tasks = published_tasks("teammate")
     return [task for task in tasks if task.layout.name == _LAYOUT and task.teammate_family == "H4"]
 
 
 def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
-    """Return the learner of an ego with teammate H4, with the paper's network except for the kind of encoder."""
+    """Return the learner of an ego with teammate H4 and the paper's network, except for its encoder."""
     config = replace(PPOConfig(), widths=Widths(encoder=encoder), **sizes.ppo)
     return heuristic_learner(get_layout(_LAYOUT), config)
 
 
 def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
-    """Return the architecture of a size of AD."""
+    """Return AD's architecture for a size name."""
     changes = {**sizes.shrunk.get(size, {}), "encoder": encoder, "bfloat16": dtype == "bfloat16"}
     return size_options(size, **changes)
 
@@ -371,7 +371,7 @@ def context_length(sizes: Sizes, size: str) -> int:
 
 
 def short_message(error: BaseException) -> str:
-    """Return class and start of the message of an error."""
+    """Return an error's class and the start of its message."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]
 
 
@@ -394,13 +394,13 @@ CASES: dict[str, Callable[[Bench], dict[str, Any]]] = {
     "act/tiny/16": partial(measure_acting, size="tiny", encoder="mlp", seeds=16),
     "attention": measure_attention,
 }
-"""Cases by name, "part" or "part/..", in the order in which they run: what a time limit cuts off is needed least."""
+"""Return the cases by name ("part" or "part/..") in running order, least important last."""
 
 PARTS = tuple(dict.fromkeys(name.split("/")[0] for name in CASES))
 
 
 def run_here(names: Sequence[str], bench: Callable[[], Bench]) -> bool:
-    """Run cases in this process up to the first that fails, and print their lines; returns whether all succeeded."""
+    """Run cases in this process until one fails, print their lines, and return whether all succeeded."""
     for name in names:
         try:
             facts = CASES[name](bench())
@@ -441,7 +441,7 @@ def main(
     learning = [name for name in names if name.startswith("learner/")]
     if here:
         if learning == names:
-            request_determinism()  # as `generate` does
+            request_determinism()  # the same flag as in `generate`
         sys.exit(0 if run_here(names, partial(make_bench, **settings)) else 1)
     failures = 0
     for _, group in groupby(names, key=lambda name: name in learning):
@@ -457,24 +457,24 @@ def main(
 
 
 def child_environment() -> dict[str, str]:
-    """Return the environment of child processes, in which JAX may use most of a GPU's memory, not three quarters."""
-    names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX refuses both together
+    """Return environment variables of child processes, which let JAX use more than three quarters of GPU memory."""
+    names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX refuses the two variables together
     return {**os.environ, **({} if any(name in os.environ for name in names) else {names[0]: "0.92"})}
 
 
 def make_bench(small: bool, seconds: float | None, peaks: Sequence[tuple[str, float]]) -> Bench:
-    """Return the settings of this process, in which JAX is used from here on."""
+    """Return the settings of this process; initialises JAX."""
     sizes = FULL_SIZES
     if small or jax.default_backend() == "cpu":
         sizes = SMALL_SIZES
-        jax.config.update("jax_disable_most_optimizations", True)  # compiling would be nearly all of the time
+        jax.config.update("jax_disable_most_optimizations", True)  # otherwise nearly all of the time is compilation
     return Bench(replace(sizes, seconds=sizes.seconds if seconds is None else seconds), dict(peaks))
 
 
 def child_options(
     names: Sequence[str], small: bool, seconds: float | None, peaks: Sequence[tuple[str, float]]
 ) -> list[str]:
-    """Return the options by which a child process measures some cases under the same settings."""
+    """Return the command-line options of a child process that measures cases under the same settings."""
     options = [word for name in names for word in ("--case", name)]
     options += [word for dtype, peak in peaks for word in ("--peak-tflops", dtype, str(peak))]
     options += ["--seconds", str(seconds)] if seconds is not None else []

@@ -1,13 +1,13 @@
 """Speed of learning: `make bench-learn`.
 
-    ego      steps/s of an ego that learns with teammate H4, by profile, compared with the first profile
+    ego      steps/s of an ego with teammate H4 by profile, compared with the first profile
     jaxmarl  self-play with the paper's network compared with JaxMARL's recurrent IPPO: `PEER=file`, see `peers`
-    ad       AD's training steps on state records by encoder, compared with the paper's encoder on float32 observations
-             that a reader of the published format makes
+    ad       AD's training on state records by encoder, compared with the paper's encoder on float32 observations from
+             a reader of the published format
     act      the evaluator's steps/s with `cached` acting, compared with `exact` acting
     tasks    minutes of all 160 test tasks with `cached` acting, compiling included
 
-One JSON line each. Models are untrained: speed does not depend on what they know.
+One JSON line each. Models are untrained, since speed does not depend on their weights.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.sampling.ad import ADBatch, ADSampler
 from icrl4aht_data.writing.published import FROM_PUBLISHED, to_published
 
-_UPDATES, _PEER_UPDATES = 3, 2  # in one measured call
+_UPDATES, _PEER_UPDATES = 3, 2  # per measured call
 _print = partial(print_line, "learn")
 
 
@@ -66,7 +66,7 @@ def heuristic_learner(layout: Layout, config: PPOConfig) -> Learner:
 
 
 def ego_updates(layout: Layout, config: PPOConfig) -> Callable[[], None]:
-    """Return a compiled call that does `_UPDATES` updates of an ego and waits for them."""
+    """Return a compiled call of `_UPDATES` updates of an ego, which waits for the result."""
     learner = heuristic_learner(layout, config)
     update, state = compiled_update(learner), jax.jit(learner.init)(jax.random.key(0))
 
@@ -81,7 +81,7 @@ def ego_updates(layout: Layout, config: PPOConfig) -> Callable[[], None]:
 
 
 def compare_egos(layout: Layout, configs: dict[str, PPOConfig], rounds: int) -> None:
-    """Print steps/s of every profile's ego, and the ratio to the first one."""
+    """Print steps/s of every profile's ego, and the ratio to the first profile."""
     ways = {name: ego_updates(layout, config) for name, config in configs.items()}
     steps = {name: _UPDATES * config.steps_per_update for name, config in configs.items()}
     rates, first = rates_in_turn(ways, steps, rounds), next(iter(configs))
@@ -92,7 +92,7 @@ def compare_egos(layout: Layout, configs: dict[str, PPOConfig], rounds: int) -> 
 
 
 def compare_jaxmarl(script: Path, layout: Layout, environments: int, rounds: int) -> None:
-    """Print steps/s of self-play with the paper's network, ours with encoder `words`, and the ratio to JaxMARL's."""
+    """Print steps/s of our self-play (the paper's network, encoder `words`), and the ratio to JaxMARL's."""
     from benchmarks.peers import jaxmarl_environment, jaxmarl_training  # only this part needs JaxMARL
 
     config = PPOConfig(environments=environments, rollout=64, minibatches=min(environments, 8), warmup=0.05)
@@ -113,9 +113,9 @@ def compare_jaxmarl(script: Path, layout: Layout, environments: int, rounds: int
 
 
 def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
-    """Yield the windows that a sampler draws, read like the published code.
+    """Yield a sampler's windows as batches, read as in the published code.
 
-    The values of the step before a window are left at 0, since speed does not depend on them.
+    Values of the step before a window stay 0, since speed does not depend on them.
     """
     number = {int(history): k for k, history in enumerate(sampler.dataset.ids)}
     read, i = published_reader(folder, sampler.length), 0
@@ -136,12 +136,12 @@ def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
 
 
 def size_options(size: str, **changes: Any) -> ModelOptions:
-    """Return the architecture of a size of AD."""
+    """Return AD's architecture for a size name."""
     return ModelOptions(**SIZES[size].model | changes)
 
 
 def training_steps(trainer: Trainer, batches: Iterator[Any], steps: int) -> Callable[[], None]:
-    """Return a compiled call that does some training steps and waits for each."""
+    """Return a compiled call of several training steps, which waits for each step."""
     state = trainer.init()
 
     def run(count: int = steps) -> None:
@@ -156,7 +156,7 @@ def training_steps(trainer: Trainer, batches: Iterator[Any], steps: int) -> Call
 def compare_training(
     dataset: Dataset, size: str, encoders: Sequence[EncoderKind], options: TrainOptions, steps: int, rounds: int
 ) -> None:
-    """Print transitions/s of AD of a size by encoder, and the ratio to the paper's encoder and the published format."""
+    """Print transitions/s of AD by encoder, and the ratio to the paper's encoder on the published format."""
     sampler = dataset.ad(batch_size=options.batch_size, length=options.context, seed=1)
     ways: dict[str, Callable[[], None]] = {}
     loaders = {}
@@ -179,7 +179,7 @@ def compare_training(
 
 
 def untrained_ad(layout: Layout, size: str, acting: Acting) -> Policy:
-    """Return an ego of untrained AD of a size."""
+    """Return an ego that acts by an untrained AD model."""
     model = size_options(size)
     method = get_method("ad")(model, overcooked_world([layout], model.encoder))
     return learned(method, method.init(jax.random.key(0)), SIZES[size].context, PlayMode(acting))
@@ -190,7 +190,7 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
     protocol = replace(PROTOCOLS["seeded"], steps=steps, episodes=sys.maxsize)
     policy = untrained_ad(tasks[0].layout, size, acting)
     episodes = play_episodes(prepare_rollout(lambda layout: policy, tasks, protocol))
-    # Exact acting computes all K positions from the first step on, cached acting only those in the window.
+    # Exact acting always computes all K positions, cached acting only the positions in the window.
     for _ in range(-(-SIZES[size].context // steps) if acting == "cached" else 1):
         next(episodes)
     return lambda: jax.block_until_ready(next(episodes))
@@ -199,7 +199,7 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
 def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int) -> None:
     """Print steps/s of cached acting on some tasks of a layout, and the ratio to exact acting."""
     tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
-    dropped = dropped_steps(SIZES[size].context)  # a full window is computed again after so many steps
+    dropped = dropped_steps(SIZES[size].context)  # steps between two computations of a full window
     lengths: dict[Acting, int] = {"cached": dropped * -(-10 * steps // dropped), "exact": steps}
     ways = {acting: acting_steps(tasks, size, acting, n) for acting, n in lengths.items()}
     rates = rates_in_turn(ways, {acting: n * len(tasks) for acting, n in lengths.items()}, rounds)
@@ -207,7 +207,7 @@ def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int
 
 
 def evaluate_all_tasks(size: str, protocol: Protocol) -> None:
-    """Print the minutes of all test tasks with an untrained AD for each layout, compiling included."""
+    """Print the minutes for all test tasks with one untrained AD per layout, including compilation."""
     tasks = [task for track in TRACKS for task in published_tasks(track)]
     seconds = elapsed(lambda: evaluate("AD", lambda layout: untrained_ad(layout, size, "cached"), tasks, protocol))
     _print(part="tasks", size=size, tasks=len(tasks), episodes=protocol.episodes, minutes=round(seconds / 60, 2))

@@ -6,8 +6,8 @@ All read the same histories (bundled ones, rotated by complete episodes) and mak
     fair        the same data in chunks of 500, read_direct into a preallocated batch
     ours        ram, mmap, stream (with and without decoded chunks kept); states, uint8, float32; batch buffers reused
 
-Readers take turns, round by round. One JSON line for each of ours, with the ratio to both peers and the least ratio
-that we aim at. Part `index` measures opening an index of a million histories, in processes of their own.
+Readers take turns, round by round. One JSON line for each of our readers, with the ratio to both peers and our target
+ratio. Part `index` measures opening an index of a million histories, in separate processes.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from icrl4aht_data.writing.published import to_published
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 _AIMS = {("ram", "state"): 8000, ("ram", "uint8"): 400, ("ram", "float32"): 200}
-"""(cache, observations) -> least ratio to the published reader."""
+"""(cache, observations) -> target ratio to the published reader."""
 
 CACHES = ("ram", "mmap", "stream", "stream, nothing kept")
 REPEATS = {"state": 10, "uint8": 3, "float32": 3}
-"""Presentation of observations -> batches made in a round, whose median counts."""
+"""Form of observations -> batches per round, of which the median is reported."""
 
 _print = partial(print_line, "loader")
 
 
 def make_data(folder: Path, layout: str, histories: int) -> None:
-    """Write the same histories as lite, published and fair, unless they exist."""
+    """Write the histories as lite, published and fair files, unless they exist."""
     if (folder / "done").exists():
         return
     shutil.rmtree(folder, ignore_errors=True)
@@ -64,7 +64,7 @@ def make_data(folder: Path, layout: str, histories: int) -> None:
 
 
 def rotated_histories(source: Dataset, count: int) -> Iterator[NewHistory]:
-    """Yield histories of a selection again and again, each time rotated by one more episode."""
+    """Yield a selection's histories endlessly, rotated by one more episode in each round."""
     kept = source.info.environment.kept_steps
     for number in range(count):
         history, episodes = source[number % len(source)], number // len(source)
@@ -77,8 +77,8 @@ def rotated_histories(source: Dataset, count: int) -> Iterator[NewHistory]:
 
 
 def batch_seconds(sampler: ADSampler, buffer: ADBatch | None, cache: str, first: int) -> float:
-    """Return the median time of a few batches, from number `first` on."""
-    sampler.batch(10**6, buffer)  # decodes chunks, and maps the buffer's pages
+    """Return the median seconds per batch, from batch `first` on."""
+    sampler.batch(10**6, buffer)  # warm-up: decodes chunks, and maps the buffer's pages
     taken = []
     for i in range(first, first + REPEATS[sampler.dataset.obs]):
         if cache == "stream, nothing kept":
@@ -88,7 +88,7 @@ def batch_seconds(sampler: ADSampler, buffer: ADBatch | None, cache: str, first:
 
 
 def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads: int, peer_windows: int) -> None:
-    """Measure our samplers with every cache and presentation of observations, and both peers."""
+    """Measure our samplers with every cache mode and form of observations, and both peers."""
     dataset: Any = load_icrl4aht(folder / "lite", threads=threads)
     windows_of = dataset.ad(batch_size=batch, length=length, seed=1).windows
     peers = {
@@ -133,7 +133,7 @@ print(json.dumps(seconds | {"peak_megabytes": resource.getrusage(resource.RUSAGE
 
 
 def index_times(folder: Path, lines: int) -> None:
-    """Print the times of opening a long index, each in its own process, the first with an empty cache folder."""
+    """Print the times to open a long index in separate processes, first with an empty cache folder."""
     root = folder / f"index-{lines}"
     if not (root / "meta" / "info.json").exists():
         write_long_index(root, lines)

@@ -1,6 +1,6 @@
-"""Shared by the benchmarks: JSON lines, turns with a peer, ratios within a round, and counts of arithmetic.
+"""Helpers of the benchmarks: JSON lines, comparison with a peer in rounds, and FLOP counts.
 
-Ways to do the same work take turns, round by round, so that all meet the same load of the machine. A ratio is the
+Implementations take turns, round by round, so the load of the machine is similar for all. A ratio is the
 median over rounds of the ratio within a round.
 """
 
@@ -33,12 +33,12 @@ def elapsed(work: Callable[[], Any]) -> float:
 def rates_in_turn(
     ways: Mapping[str, Callable[[], Any]], steps: float | Mapping[str, float], rounds: int
 ) -> dict[str, list[float]]:
-    """Return steps/s of every way in every round.
+    """Return steps/s of every implementation in every round.
 
     Args:
-        ways: name -> call that does the work and waits for the result; compiled.
-        steps: steps of one call, of all ways or of each.
-        rounds: measured calls of each.
+        ways: name -> compiled call of an implementation, which waits for its result.
+        steps: steps per call, one number or one for each name.
+        rounds: measured calls per implementation.
     """
     rates: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(rounds):
@@ -48,7 +48,7 @@ def rates_in_turn(
 
 
 def compared(rates: Mapping[Any, list[float]], way: Any, peer: str) -> dict[str, float]:
-    """Return median steps/s of a way and of its peer, and the median, least and greatest ratio within a round."""
+    """Return the median steps/s of an implementation and its peer, and median, least and greatest ratio by round."""
     ratios = [ours / theirs for ours, theirs in zip(rates[way], rates[peer], strict=True)]
     facts = {
         "steps_per_second": statistics.median(rates[way]),
@@ -62,14 +62,14 @@ def compared(rates: Mapping[Any, list[float]], way: Any, peer: str) -> dict[str,
 
 def compiled_call(function: Callable[[Any], Any], key: Any) -> Callable[[], Any]:
     """Return a compiled call of a JAX function with a key, which waits for the result."""
-    import jax  # readers are measured without it
+    import jax  # not at the top: readers are measured without JAX
 
     compiled = jax.jit(function).lower(key).compile()
     return lambda: jax.block_until_ready(compiled(key))
 
 
 class MeasuredProgram(NamedTuple):
-    """A compiled function.
+    """A compiled function with its cost.
 
     Attributes:
         call: the compiled function.

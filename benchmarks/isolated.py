@@ -1,4 +1,4 @@
-"""Benchmarks of many cases in processes that may fail: what one case does to its process ends with it."""
+"""Runs benchmark cases in child processes, so that a crash or full memory affects one case only."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def run_isolated(
     """Run cases in a child process, and in a new one after each failure, and return the number of failures.
 
     A child runs its cases in order and prints one JSON object for each to stdout, with the name as "case"; it ends
-    after one with "error". A case whose child ended without its line, was stopped or was never started has a line, too.
+    after one with "error". A case without a result (child crashed, stopped or never started) gets a line, too.
 
     Args:
         cases: names of the cases.
@@ -33,7 +33,7 @@ def run_isolated(
         print_facts: prints one line.
         until: `time.monotonic()` at which the running child is killed and no other is started.
         case_seconds: limit of a single case, the start of its process included.
-        environment: of the children; this process's by default.
+        environment: environment variables of the children; inherited by default.
     """
     pending, failures = list(cases), 0
     while pending and time.monotonic() < until:
@@ -52,10 +52,10 @@ def run_isolated(
 
 
 class _Child:
-    """A process that is killed when a line takes too long.
+    """A child process, killed when its next line takes too long.
 
     Attributes:
-        end: how the process ended, once all its lines are read.
+        end: reason why the process ended, set after its last line.
     """
 
     def __init__(self, command: list[str], environment: Mapping[str, str] | None) -> None:
@@ -63,7 +63,7 @@ class _Child:
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
 
     def lines(self, until: float, case_seconds: float) -> Iterator[dict[str, Any]]:
-        """Yield the lines of cases; other output is dropped."""
+        """Yield the parsed lines of cases; other output is dropped."""
         with self._process as process:
             assert process.stdout is not None
             timer = self._timer(until, case_seconds)

@@ -1,7 +1,7 @@
 """Peers of benchmarks and differential tests: JaxMARL's environment on our layouts, and its recurrent IPPO.
 
-The learner is JaxMARL's `baselines/IPPO/ippo_rnn_overcooked_v2.py`, which its package does not contain: it is run from
-the path of a copy. Modules that it imports only for logging and configuration (hydra, omegaconf, wandb) are replaced by
+The learner is JaxMARL's `baselines/IPPO/ippo_rnn_overcooked_v2.py`, which is not in JaxMARL's package: it is loaded
+from a copy. Modules that it imports only for logging and configuration (hydra, omegaconf, wandb) are replaced by
 stubs; it also needs distrax, from the extra `peers`.
 """
 
@@ -23,7 +23,7 @@ from benchmarks.harness import compiled_call
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked.layouts import Layout
 
-with redirect_stdout(sys.stderr):  # it prints on import
+with redirect_stdout(sys.stderr):  # JaxMARL prints on import
     from jaxmarl.environments.multi_agent_env import MultiAgentEnv
     from jaxmarl.environments.overcooked_v2.layouts import Layout as PeerLayout
     from jaxmarl.environments.overcooked_v2.overcooked import OvercookedV2
@@ -43,13 +43,13 @@ def jaxmarl_environment(layout: Layout, max_steps: int = EPISODE_STEPS) -> Overc
 
 
 def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, updates: int) -> Callable[[], Any]:
-    """Return a compiled call of JaxMARL's IPPO on an environment, which initialises and waits for its updates.
+    """Return a compiled call of JaxMARL's IPPO on an environment, which initialises, updates and waits.
 
     The call returns what the script's function `train` returns.
 
     Args:
         script: a copy of JaxMARL's file.
-        env: the environment that the script gets instead of the one that it asks for.
+        env: the environment to use instead of the script's.
         config: hyper-parameters.
         updates: number of updates.
 

@@ -1,4 +1,4 @@
-"""Two readers of the published format, the peers of our loader."""
+"""Two readers of the published format, with which our loader is compared."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ReadWindows = Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]]
 
 
 def published_reader(folder: Path, length: int) -> ReadWindows:
-    """Return a reader like the published code: one slice per history for windows that overlap, cut and stacked."""
+    """Return a reader as in the published code: one slice for overlapping windows, cut and stacked."""
     file = h5py.File(folder / HISTORIES_H5, "r", rdcc_nbytes=512 * 2**20)
 
     def read(ids: np.ndarray, starts: np.ndarray) -> dict[str, np.ndarray]:
@@ -44,7 +44,7 @@ def published_reader(folder: Path, length: int) -> ReadWindows:
 
 
 def fair_reader(folder: Path, length: int, batch: int) -> ReadWindows:
-    """Return a reader of chunks that fit the windows, directly into one batch buffer."""
+    """Return a reader into one batch buffer, for files whose chunks have the windows' length."""
     file = h5py.File(folder / HISTORIES_H5, "r")
     first: Any = {name: file[f"/0/{name}"] for name in _READ}
     out = {name: np.ones((batch, length, *data.shape[1:]), data.dtype) for name, data in first.items()}

@@ -3,7 +3,7 @@
 ds = load_icrl4aht(split="train", layout="coord_simple")
 batch = ds.ad(batch_size=64, length=500, seed=0)[0]
 
-Public names are imported at their first use, so that command lines start quickly.
+Public names are imported on first use, which keeps the start of commands fast.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from icrl4aht_data.sampling.draws import Curriculum
 
 __version__ = "0.1.0"
-"""Version of this package, which pyproject.toml reads from here."""
+"""Version of this package; pyproject.toml reads it from here."""
 
 __all__ = [
     "ACTIONS",
@@ -82,11 +82,11 @@ _MODULES = {
     "DPTSampler": "sampling.dpt",
     "Curriculum": "sampling.draws",
 }
-"""Public name -> the module that defines it."""
+"""Public name -> module that defines it."""
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name or a module of this package, imported at its first use."""
+    """Return a public name or a module of this package, imported on first use."""
     if name in _MODULES:
         globals()[name] = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
         return globals()[name]

@@ -1,4 +1,4 @@
-"""Clients of remote releases: the Hub's own for hf://, fsspec for others; retries, time limits, credentials."""
+"""Clients for remote releases (Hugging Face Hub, fsspec) with retries, timeouts and hidden credentials."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from icrl4aht_data.utils.install_hints import install_command
 T = TypeVar("T")
 
 Advance = Callable[[int], None]
-"""Progress callback: called with the number of bytes that have arrived since the last call."""
+"""Progress callback: called with the number of bytes received since the last call."""
 
 THREADS = 8
-"""Files fetched at once."""
+"""Number of files fetched in parallel."""
 
-_TIMEOUT = 15.0  # seconds until a connection, and between two bytes of an answer
+_TIMEOUT = 15.0  # seconds to connect, and between two bytes of a response
 _WAITS = (1.0, 2.0, 4.0)  # seconds before a request is repeated after a transient error
 _TRANSIENT_STATUS = {408, 425, 429, 500, 502, 503, 504}
 _PERMANENT = (FileNotFoundError, PermissionError, ImportError, NotImplementedError, TypeError, ValueError)
@@ -33,27 +33,27 @@ _ADDRESS = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*://)(?:[^/\s'\"<>]*@)?
 
 
 def offline_switches() -> list[str]:
-    """Return the names of the environment variables that are set and switch network access off."""
+    """Return the names of the environment variables that currently disable network access."""
     names = ("HF_HUB_OFFLINE", "ICRL4AHT_OFFLINE")
     return [name for name in names if os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE")]
 
 
 def without_credentials(text: str) -> str:
-    """Return a text without the user names, passwords, queries and fragments of the addresses in it."""
+    """Remove user names, passwords, queries and fragments from all addresses in a text."""
     return _ADDRESS.sub(r"\g<scheme>\g<rest>", text)
 
 
 def check_credentials(address: str) -> None:
-    """Check that a password in an address has no "/", after which the rest would be taken for the path and shown.
+    """Check that the password in an address has no unencoded "/": the rest would be parsed as the path and shown.
 
     Raises:
-        OptionError: if it may have one; the message does not have the address.
+        OptionError: if it may have one; the message does not contain the address.
     """
     try:
         parts = urlsplit(address)
-        # A host with a port, or what seems to be one, and an "@" behind it: the host's name then has a dot.
+        # With a port and a later "@", the part before may be USER:PASSWORD, unless it looks like a host with a dot.
         is_clear = parts.port is None or "@" in parts.netloc or "@" not in parts.path or "." in parts.netloc
-    except ValueError:  # what should be the port is no number
+    except ValueError:  # the port is not a number
         is_clear = False
     if not is_clear:
         raise OptionError(
@@ -63,7 +63,7 @@ def check_credentials(address: str) -> None:
 
 
 class HubClient:
-    """Files of a dataset repository of the Hugging Face Hub, by the Hub's own client, which retries and has the token.
+    """Client for a dataset repository of the Hugging Face Hub; huggingface_hub handles retries and the token.
 
     Args:
         repo: <org>/<repo>.
@@ -75,9 +75,9 @@ class HubClient:
 
     @contextmanager
     def connect(self) -> Iterator[None]:
-        """Open a context for requests, in which an address is given up after `_TIMEOUT` seconds without an answer.
+        """Open a context for requests that fail after `_TIMEOUT` seconds without a response.
 
-        Without the two hooks the client waits for some answers without a limit, and five times 60 s for others.
+        Without the two hooks, huggingface_hub waits for some responses without a limit and for others five times 60 s.
         """
         from huggingface_hub import get_session
 
@@ -102,12 +102,12 @@ class HubClient:
             hooks["response"].remove(after)
 
     def get(self, name: str, scratch: Path | None, count: Advance) -> Path:
-        """Fetch a file into a folder, or by default into the Hub's cache; return its path."""
+        """Fetch a file into a folder, or into the Hub's cache for None, and return its path."""
         from huggingface_hub import hf_hub_download
         from huggingface_hub.utils import tqdm
 
         class Bar(tqdm):
-            """Invisible progress bar that counts the bytes which arrive."""
+            """Hidden progress bar that reports received bytes to `count`."""
 
             def __init__(self, *args: Any, **options: Any) -> None:
                 super().__init__(*args, **options | {"disable": True})
@@ -130,10 +130,10 @@ class HubClient:
 
 
 class FsspecClient:
-    """Files below an https://, s3:// or any other address that fsspec opens.
+    """Client for files below an https://, s3:// or other address that fsspec opens.
 
     Args:
-        address: the folder. It may have a user name and a password, or a query that is sent with every request.
+        address: the folder's address, perhaps with user name and password, or a query sent with every request.
     """
 
     def __init__(self, address: str) -> None:
@@ -144,18 +144,18 @@ class FsspecClient:
 
     @contextmanager
     def connect(self) -> Iterator[None]:
-        """Open a context for requests; each time a new file system, since connections do not survive a fork."""
+        """Open a context for requests with a new file system, since connections do not survive a fork."""
         self._files = _open_filesystem(self._address)
         yield
 
     def get(self, name: str, scratch: Path | None, count: Advance) -> Path:
-        """Fetch a file into a folder; return its path."""
+        """Fetch a file into a folder and return its path."""
         from fsspec.callbacks import Callback
 
         assert self._files is not None and scratch is not None
 
         class Counter(Callback):
-            """Passes on the bytes which arrive."""
+            """fsspec callback that reports received bytes to `count`."""
 
             def relative_update(self, inc: int = 1) -> None:
                 count(inc)
@@ -186,26 +186,26 @@ def _open_filesystem(address: str) -> Any:
 
         options["client_kwargs"] = {"timeout": ClientTimeout(total=None, sock_connect=_TIMEOUT, sock_read=_TIMEOUT)}
     elif scheme == "s3":
-        once = {"total_max_attempts": 1}  # `with_retries` repeats the requests of every protocol alike
+        once = {"total_max_attempts": 1}  # `with_retries` retries requests for every protocol
         options["config_kwargs"] = {"connect_timeout": _TIMEOUT, "read_timeout": _TIMEOUT, "retries": once}
     try:
         files = fsspec.url_to_fs(address, **options)[0]
     except ImportError as error:
-        remedy = f"`{install_command('s3')}`" if scheme == "s3" else "install what fsspec needs for it"
+        remedy = f"`{install_command('s3')}`" if scheme == "s3" else "install the package that fsspec names"
         raise OptionError(f"{shown}: {error}; {remedy}") from error
     except ValueError as error:
         problem = f"{shown}: not an address that fsspec opens: {without_credentials(str(error))}"
         raise OptionError(f"{problem}; expected hf://datasets/<org>/<repo>, https://... or s3://...") from None
     if scheme == "s3":
-        files.retries = 1  # s3fs repeats requests on its own, besides botocore
+        files.retries = 1  # s3fs has retries in addition to those of botocore
     return files
 
 
 def with_retries(address: str, request: Callable[[], T]) -> T:
-    """Return the result of a request, repeated after transient errors.
+    """Return the result of a request, which is retried after transient errors.
 
     Raises:
-        RemoteError: names the address; instead of the client's error.
+        RemoteError: if the request fails; replaces the client's error and names the address.
         OSError: unchanged, if the local disk is full or not writable.
     """
     for wait in (*_WAITS, None):
@@ -213,7 +213,7 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
             return request()
         except Icrl4ahtError:
             raise
-        except Exception as error:  # every client has its own error classes
+        except Exception as error:  # each client raises different classes
             if isinstance(error, OSError) and error.errno in (*NO_ROOM, errno.EROFS):
                 raise
             if wait is None or not _is_transient(error):
@@ -223,18 +223,18 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
 
 
 def _is_transient(error: Exception) -> bool:
-    """Return whether the same request may succeed a moment later."""
-    if type(error).__name__ == "LocalEntryNotFoundError":  # the Hub's client has repeated the request
+    """Return whether an error is transient, so that a retry may succeed."""
+    if type(error).__name__ == "LocalEntryNotFoundError":  # huggingface_hub has already retried
         return False
     status, cause = _http_status(error), _root_cause(error)
     if status is not None:
         return status in _TRANSIENT_STATUS
-    # A server that did not answer in time is not asked again: the user waits for the first word.
+    # Timeouts are not retried: the user is still waiting for the first output.
     return not isinstance(cause, _PERMANENT) and "Timeout" not in type(cause).__name__
 
 
 def _remote_error(address: str, error: Exception) -> RemoteError:
-    """Return the error to raise instead of a client's, whose messages may have a password."""
+    """Return an error without credentials to raise instead of a client's error."""
     cause = _root_cause(error)
     text = without_credentials(" ".join(f"{type(cause).__name__}: {cause}".split()))[:400]
     if isinstance(cause, FileNotFoundError) or _http_status(error) == 404:
@@ -243,14 +243,14 @@ def _remote_error(address: str, error: Exception) -> RemoteError:
 
 
 def _root_cause(error: BaseException) -> BaseException:
-    """Return the error behind a FileNotFoundError: clients turn any failure to learn a file's size into one."""
+    """Return the cause of a FileNotFoundError, which clients raise for any failed request for a file's size."""
     while isinstance(error, FileNotFoundError) and error.__cause__ is not None:
         error = error.__cause__
     return error
 
 
 def _http_status(error: BaseException | None) -> int | None:
-    """Return the HTTP status behind an error of aiohttp, httpx or botocore; None without an answer."""
+    """Return the HTTP status of an aiohttp, httpx or botocore error; None without a response."""
     while error is not None:
         answer = getattr(error, "response", None)
         if isinstance(answer, dict):  # botocore

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MINI = Path(__file__).parent / "mini"
 """Path of the bundled mini release."""
 
-_CURVES_SHOWN, _CURVE_POINTS = 12, 25  # histories of a source that a notebook's curve is the mean of, and its points
+_CURVES_SHOWN, _CURVE_POINTS = 12, 25  # per source: histories averaged for a notebook's curve, and points of the curve
 
 
 def load_icrl4aht(
@@ -69,19 +69,19 @@ def load_icrl4aht(
 
     Args:
         root: a release folder, or an address: `hf://datasets/<org>/<repo>[@<revision>]`, `s3://...`, `https://...`, or
-            any other that fsspec opens; the bundled mini release by default. Opening a remote release downloads its
-            index, everything else is downloaded when it is read.
-        split: "train", "validation", "test" or "heldout". This and each of the following filters is one value, a
-            sequence of values, or None for any: train models on "train" only, as samplers warn of a mixture.
+            another address that fsspec opens; the bundled mini release by default. Opening a remote release downloads
+            only its index; data is downloaded when it is read.
+        split: "train", "validation", "test" or "heldout". Each filter is one value, a sequence of values, or None
+            for any. Train models on "train" only; samplers warn about a mixture.
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple).
-        track: what the test tasks vary: "teammate" or "layout".
+        track: "teammate" or "layout", the part that is new in test tasks.
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
-        algorithm: the same as `teammate_kind`: the algorithm that trained the teammate, such as "fcp" or "comedi".
-        source: how the histories were made: "ppo" (an ego learned by PPO), "noise" (the scripted oracle acted, and
-            random actions replaced its own ever less often) or "student" (a trained agent played); see docs/format.md.
+        algorithm: alias of `teammate_kind` for learned teammates, such as "fcp" or "comedi".
+        source: how the histories were made: "ppo" (an ego learned by PPO), "noise" (the scripted oracle, with
+            random actions that become rarer) or "student" (a trained agent); see docs/format.md.
         task_id: id of a task; a task is a layout, a teammate and a seed.
-        learner: number of the learner, from 0, where a task has several independent ones; or several numbers.
+        learner: number of the learner within its task, from 0, or several numbers.
         min_expert_return: only histories whose expert actions come from a policy that earned at least this much per
             episode, acting greedily with the history's teammate: `entry.expert_return`.
         obs: dtype of observations: "float32", "uint8" (the same integers), or "state" for state records instead of
@@ -91,12 +91,12 @@ def load_icrl4aht(
             `sources.CACHE_MODES`.
         threads: number of threads that decode and render; by default one for each usable core.
         channels: channels of observations: "own", which differ between layouts, or "canonical", the union of all
-            layouts' channels, so that a selection of any layouts can be sampled; see `overcooked.channels`. State
-            records (obs="state") are rendered so by `observe` with canonical=True.
+            layouts' channels, so any mixture of layouts can be sampled; see `overcooked.channels`. State
+            records (obs="state") are rendered by `observe` with canonical=True.
 
     Raises:
         UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.
-        EmptySelectionError: if nothing matches; says what exists.
+        EmptySelectionError: if nothing matches; lists existing values.
         OptionError: for impossible options, such as obs="state" for a release of observations.
         NotStoredError: for `min_expert_return`, if the release does not have the returns.
         ReleaseError: if the release cannot be read.
@@ -122,7 +122,7 @@ def load_icrl4aht(
 
 
 def open_dataset(location: ReleaseLocation, options: ReadOptions) -> Dataset:
-    """Return all histories of a release; see `load_icrl4aht` for the errors."""
+    """Return a dataset of all histories of a release; see `load_icrl4aht` for the errors."""
     if os.path.isfile(location.folder / INFO):  # noqa: PTH113 - never raises; without it `read_index` explains more
         check_meta(location.folder)
     index = read_index(location.folder)
@@ -133,25 +133,25 @@ class Dataset(Selection):
     """A selection of learning histories that can be sampled; `load_icrl4aht` opens one.
 
     `len(dataset)` is the number of histories, `dataset[i]` the i-th `History`, `dataset[a:b]` a smaller selection;
-    iteration yields the histories in order. `filter`, `select` and `split` narrow a selection, `sort` orders it, `ad`
-    and `dpt` sample batches, `sample_episodes` episodes.
+    iteration yields histories in order. `filter`, `select` and `split` narrow a selection, `sort` orders it, `ad` and
+    `dpt` sample batches, `sample_episodes` samples episodes.
     """
 
     @property
     def knows_tasks(self) -> bool:
-        """Whether the release has its tasks; a release of observations may have been made without them."""
+        """Whether the release contains its tasks; a release of observations may not."""
         return self.has_states or bool(self._tasks)
 
     def sort(self, *names: str, reverse: bool = False) -> Self:
-        """Return this selection ordered by index fields; histories that are equal in all of them keep their order.
+        """Return this selection sorted by index fields; the sort is stable.
 
         Args:
-            names: fields of `Entry`, such as "return_end"; the first one matters most. Names are ordered
+            names: fields of `Entry`, such as "return_end"; the first one is the main key. Text is sorted
                 alphabetically.
             reverse: from the largest value to the smallest. Histories without a value are last in either order.
 
         Raises:
-            OptionError: if no field is given, or anything but names.
+            OptionError: if no field is given, or an argument is not a string.
             UnknownNameError: for a field that does not exist; names the nearest one.
         """
         if not names:
@@ -159,38 +159,37 @@ class Dataset(Selection):
         for name in names:
             if not isinstance(name, str):
                 raise OptionError(
-                    f"sort: expected names of index fields, one after the other, such as "
+                    f"sort: expected names of index fields, such as "
                     f'ds.sort("layout", "return_end"), found {name!r}; for another order give its ids to ds.select'
                 )
         keys = []
         for name in names:
             values = self.column(name)
             rank = np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)
-            absent = values == -1 if ENTRY_HINTS.get(name) == int | None else values != values  # NaN differs from NaN
+            absent = values == -1 if ENTRY_HINTS.get(name) == int | None else values != values  # True only for NaN
             rank = np.where(absent, len(self), -rank if reverse else rank) if values.ndim == 1 else rank
             keys.append(rank)
         return self.select(self.ids[np.lexsort(keys[::-1])])
 
     def split(self, validation: float = 0.1, seed: int = 0, by: SplitBy = "teammate") -> tuple[Self, Self]:
-        """Divide this selection into histories to train on and histories to validate with.
+        """Split this selection into training and validation histories.
 
-        The choice depends on names and the seed alone, not on the order of the selection, and is the one that
-        `icrl4aht-data train` makes where a release has no histories of split validation.
+        The choice is a function of names and the seed, not of the selection's order. `icrl4aht-data train` makes the
+        same choice for releases without a validation split.
 
         Args:
-            validation: share of the teammates, or of the histories, that is held out; at least one is.
+            validation: share of the teammates, or of the histories, to hold out; at least one is held out.
             seed: seed of the choice.
-            by: "teammate" holds out teammates with all their histories, on the layouts of the selection one by one, so
-                that no validation teammate was seen in training; "history" holds out histories and keeps at least one
-                of every task in training.
+            by: "teammate" holds out teammates with all their histories, separately on each layout, so no validation
+                teammate is in training; "history" holds out histories, and keeps at least one per task in training.
 
         Returns:
-            The histories to train on, and those to validate with; together they are the selection.
+            The training histories and the validation histories; together they are the selection.
 
         Raises:
-            UnknownNameError: if `by` is neither of both.
-            OptionError: if `validation` is not between 0 and 1, or there is only one teammate, or every task has one
-                history only.
+            UnknownNameError: if `by` is neither "teammate" nor "history".
+            OptionError: if `validation` is not between 0 and 1, there is only one teammate, or every task has only
+                one history.
         """
         if by not in SPLIT_BY:
             raise unknown("split by", by, SPLIT_BY)
@@ -213,11 +212,11 @@ class Dataset(Selection):
         return self.select(~held), self.select(held)
 
     def sample_episodes(self, n: int, seed: int = 0) -> list[Episode]:
-        """Draw different episodes uniformly from all episodes of the selected histories.
+        """Draw episodes uniformly without replacement from the selected histories.
 
         Args:
             n: number of episodes.
-            seed: seed of the draw: the same seed, selection and number give the same episodes.
+            seed: seed of the draw; equal seed, selection and `n` give equal episodes.
 
         Returns:
             The episodes, in the order of the selection and of their histories.
@@ -240,9 +239,9 @@ class Dataset(Selection):
         return chosen
 
     def plot(self) -> Picture:
-        """Draw the returns over the course of the histories, by layout and source, as a picture that notebooks show.
+        """Return learning curves by layout and source as a picture, which notebooks show.
 
-        Reads the rewards of all selected histories. `plotting.plot_learning_curves` draws tasks.
+        Reads the rewards of all selected histories. For curves by task see `plotting.plot_learning_curves`.
 
         Raises:
             OptionError: if matplotlib is not installed.
@@ -250,7 +249,7 @@ class Dataset(Selection):
         return Picture(f"Returns of {counted_histories(len(self))} by layout and source", plot_layout_curves(self))
 
     def _repr_html_(self) -> str:
-        """The selection's counts and learning curve, for notebooks."""
+        """Return the selection's counts and learning curve as HTML, for notebooks."""
         named = ("split", "source", "layout", "teammate_family", "teammate_kind", "labels")
         counts = {name: ", ".join(f"{value} ({n})" for value, n in self.counts(name).items()) for name in named}
         tasks = len(self.counts("task_id"))
@@ -265,7 +264,7 @@ class Dataset(Selection):
         return facts_html(f"{counted_histories(len(self))} of {counted_noun(tasks, 'task')}", facts, self._curves_svg())
 
     def _curves_svg(self) -> str:
-        """Mean returns of a few histories of each source that are on this machine, as SVG; or nothing."""
+        """Return an SVG of mean returns by source, of a few histories stored on this machine; empty if none are."""
         curves, sources = {}, self.column("source")
         here = {shard for shard in self.shards if self.origin.is_here(shard)}
         for source in self.counts("source"):
@@ -285,13 +284,12 @@ class Dataset(Selection):
     def recover_environment(self, history_id: int, **options: Any) -> gymnasium.Env:
         """Return the Gymnasium environment of a history: the ego's side of its task, with the teammate inside.
 
-        Episodes have as many steps as when the history was made, of which the release keeps the first ones: 400 and 100
-        in the benchmark. `reset(options=dataset.reset_options(history_id, episode))` starts it as a recorded episode.
+        Episodes have the length used to make the history, 400 steps in the benchmark; the release keeps the first 100. `reset(options=dataset.reset_options(history_id, episode))` starts it as a recorded episode.
 
         Args:
             history_id: a history of the release, whether selected or not.
             options: options of `gymnasium.make`, such as `max_episode_steps` or `render_mode`, and of
-                `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`. Channels are those of the dataset by default.
+                `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`. The channels of the dataset are the default.
 
         Raises:
             NotStoredError: if the release was made without its tasks.
@@ -320,9 +318,8 @@ class Dataset(Selection):
         """Return the options of `reset` that start a recovered environment as a recorded episode.
 
         The environment then starts at the recorded state, its teammate repeats the recorded actions and a delivery is
-        followed by the recorded recipe. So the ego's recorded actions lead to the recorded states, observations and
-        rewards, also where the keys that the episode was drawn from are not known. After the recorded steps, the
-        teammate's policy acts.
+        followed by the recorded recipe. With the ego's recorded actions, states, observations and rewards are
+        the recorded ones; no random keys are needed. After the recorded steps, the teammate's policy acts.
 
         Args:
             history_id: a history of the release, whether selected or not.
@@ -446,21 +443,20 @@ class Dataset(Selection):
 
 
 def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:
-    """Return the sorted ids of the teammates of some histories, or None if the release does not describe them all.
+    """Return the sorted teammate ids of some histories, or None if the release does not describe all teammates.
 
     See `tasks.teammate_id`.
     """
     try:
         return sorted({teammate_id(dataset.recover_teammate(history_id)) for history_id in history_ids})
-    except (NotStoredError, UnknownNameError):  # a release of observations may have been made without its tasks
+    except (NotStoredError, UnknownNameError):  # a release of observations may not contain its tasks
         return None
 
 
 def teammate_names(dataset: Dataset) -> np.ndarray:
-    """Return a name for each history's teammate, strings (H,): histories with one policy on one layout share it.
+    """Return a name of each history's teammate, strings (H,), equal for the same policy on the same layout.
 
-    The name consists of the layout and the teammate's id; it is the task's id where the release does not describe the
-    teammate.
+    The name consists of layout and teammate id; if the release does not describe the teammate, it is the task id.
     """
     codes, first, number = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
     values, names = dataset.index.values("task_id"), []

@@ -1,4 +1,4 @@
-"""`download` of a remote release or a part of it, and `repair` of damaged files from the address they came from."""
+"""Downloads of remote releases, complete or in part, and repair of damaged files from their address."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from icrl4aht_data.utils.system import data_folder
 
 @dataclass(frozen=True)
 class DownloadPlan:
-    """Files that a download fetches.
+    """Plan of a download: the files to fetch.
 
     Args:
         root: the remote release.
         files: name -> bytes of all files requested.
-        absent: names of those that are not downloaded yet.
-        changed: names of those that were downloaded and are not what the manifest lists any more.
+        absent: names of files not downloaded yet.
+        changed: names of downloaded files that differ from the manifest.
     """
 
     root: ReleaseLocation
@@ -42,7 +42,7 @@ class DownloadPlan:
 
     @property
     def size(self) -> int:
-        """Bytes of the absent and the changed files."""
+        """Bytes to fetch: the sizes of absent and changed files."""
         return sum(self.files[name] for name in (*self.absent, *self.changed))
 
     def to_json(self) -> dict[str, Any]:
@@ -63,18 +63,18 @@ def plan_download(
     advance: Callable[[str, int, int], None] = lambda what, done, total: None,
     **wanted: str | Iterable[str] | None,
 ) -> DownloadPlan:
-    """Plan a download; fetches the index of the release only, and compares the files that are here with the manifest.
+    """Plan a download: fetch only the index, and compare existing files with the manifest.
 
     Args:
         url: address of the release.
-        to: folder for the files, which must not exist, be empty, or have this release; by default the Hub's cache, or a
+        to: folder for the files, which must be absent, empty or contain this release; by default the Hub's cache, or a
             folder in `system.data_folder`.
         advance: called with the name of a stage, and the bytes compared so far and in total.
         wanted: filters as in `load_icrl4aht`: only the shards with matching histories are fetched, with their chunk
             tables and all files that belong to no shard, except the Parquet copy of the episodes.
 
     Raises:
-        OptionError: if `url` is no address, or `to` has files of something else.
+        OptionError: if `url` is not an address, or `to` contains other files.
         RemoteError, OfflineError: if the index cannot be fetched.
         EmptySelectionError, UnknownNameError: if no history matches the filters, or a filter has no such value.
     """
@@ -103,10 +103,10 @@ def _remote(root: ReleaseLocation) -> Remote:
 
 
 def fetch_planned(plan: DownloadPlan, advance: Advance | None = None) -> int:
-    """Download the files of a plan; changed files are replaced. Return the bytes of the fetched files.
+    """Download the files of a plan, replace changed files, and return the number of bytes fetched.
 
     Raises:
-        RemoteError: if a file cannot be fetched; a second call resumes.
+        RemoteError: if a file cannot be fetched; calling again resumes.
         OSError: if the disk is full or not writable.
     """
     remote = _remote(plan.root)
@@ -118,14 +118,14 @@ def fetch_planned(plan: DownloadPlan, advance: Advance | None = None) -> int:
 
 
 def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) -> set[str]:
-    """Return the files of a selection: its shards, their chunk tables, and all files that belong to no shard.
+    """Return the names of a selection's files: shards, their chunk tables, and all files without a shard.
 
-    With filters, the Parquet copy of the episodes is left out: it repeats the shards, of all histories.
+    With filters, the Parquet copy of the episodes is left out: it contains all histories.
 
     Args:
         root: an opened release.
-        wanted: filters as in `load_icrl4aht`. Without any, all files; of a folder that `download` filled those that
-            the downloads requested, see `DownloadNote`.
+        wanted: filters as in `load_icrl4aht`. Without filters, all files, or for a folder filled by `download` the
+            requested files, see `DownloadNote`.
     """
     index = read_index(root.folder)
     listed = root.remote.manifest if root.remote is not None else read_manifest(root.folder)
@@ -144,7 +144,7 @@ def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) ->
 
 
 class DownloadNote(msgspec.Struct):
-    """Note of a download into a folder, kept in the data folder: one in the release could name any address.
+    """Record of a download into a folder. It is in the data folder, since a release could contain a forged one.
 
     Args:
         url: address of the release, without credentials.
@@ -158,14 +158,14 @@ class DownloadNote(msgspec.Struct):
 
 
 def read_note(folder: Path) -> DownloadNote | None:
-    """Return the note on a folder; None if nothing was downloaded into it, or the note cannot be read."""
+    """Return the note of a folder; None if there is none or it cannot be read."""
     with suppress(OSError, msgspec.MsgspecError):
         return msgspec.json.decode(_note_path(folder).read_bytes(), type=DownloadNote)
     return None
 
 
 def _write_note(remote: Remote, files: Iterable[str]) -> None:
-    """Note the files of a download; nothing is noted where the data folder cannot be written."""
+    """Write the note of a download; skipped if the data folder is not writable."""
     before, release = read_note(remote.folder), json_hash(remote.manifest)
     requested = {*files, *(before.files if before is not None and before.release == release else ())}
     path = _note_path(remote.folder)
@@ -184,15 +184,15 @@ def repair(root: str | Path, damaged: Iterable[str], *, source: str | None = Non
 
     Args:
         root: the release, a folder or an address.
-        damaged: names of files; other files are not touched, unless the manifest itself is damaged.
-        source: address to repair from; by default the root itself, the address that `download` noted, or
+        damaged: names of files; other files are replaced only if the manifest itself is damaged.
+        source: address to repair from; by default the root if it is an address, the noted address, or
             $ICRL4AHT_REMOTE.
 
     Returns:
-        name -> None, or why the file could not be repaired; and the bytes fetched.
+        name -> None or the reason why the file could not be repaired; and the number of bytes fetched.
 
     Raises:
-        OptionError: if no source is known, or it has another release.
+        OptionError: if no source is known, or the source has another release.
         RemoteError, OfflineError: if the source cannot be reached.
     """
     remote = _remote(open_root(_repair_source(root, source)))
@@ -203,7 +203,7 @@ def repair(root: str | Path, damaged: Iterable[str], *, source: str | None = Non
         if not has_content(remote.folder / MANIFEST, manifest):
             names |= _replace_manifest(remote, manifest)
     before, outcome = remote.fetched, dict.fromkeys(sorted(names, key=lambda name: name.startswith("data/")))
-    for name in outcome:  # shards last, whose sizes are in meta/info.json
+    for name in outcome:  # shards last: their sizes are in meta/info.json, which may need repair
         try:
             remote.fetch([name], again=True)
         except (Icrl4ahtError, OSError) as error:
@@ -212,10 +212,10 @@ def repair(root: str | Path, damaged: Iterable[str], *, source: str | None = Non
 
 
 def _replace_manifest(remote: Remote, manifest: bytes) -> set[str]:
-    """Replace a folder's damaged manifest; return the names of the files that are not as the new one lists them.
+    """Replace a folder's damaged manifest; return the names of files that differ from the new one.
 
     Raises:
-        OptionError: if most files are other ones, so that the remote has another release.
+        OptionError: if most files differ, which means that the remote has another release.
     """
     listed = {remote.folder / name: (name, digest) for name, digest in remote.manifest.items()}
     wrong = {name for path, (name, digest) in listed.items() if not path.is_file() or file_hash(path) != digest}
@@ -230,13 +230,13 @@ def _replace_manifest(remote: Remote, manifest: bytes) -> set[str]:
 
 
 def _repair_source(root: str | Path, source: str | None) -> str:
-    """Return the address to repair from: the given one, the release's own, the noted one, or the default."""
+    """Return the address to repair from: the argument, the release's address, the noted one, or the default."""
     if source is None and is_address(root):
         return str(root)
     note, default = read_note(Path(root)), default_remote()
     noted = None if note is None else note.url
     if default is not None and noted == without_credentials(default).rstrip("/"):
-        noted = default  # the address with its credentials
+        noted = default  # unlike the note, this address contains credentials
     url = source or noted or default
     if url is None or not is_address(url):
         found = url and without_credentials(url)

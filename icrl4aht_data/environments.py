@@ -1,8 +1,8 @@
 """Gymnasium ids of the benchmark's tasks.
 
-`gymnasium.make("icrl4aht/demo_wide-H4-t0-v0")` makes the environment of a published test task, and
-`gymnasium.make("icrl4aht/task-v0", task=...)` that of any other task. `import icrl4aht_data` registers the ids, since
-Gymnasium loads no plugins since version 1.0; `gymnasium.make("icrl4aht_data:icrl4aht/demo_wide-H4-t0-v0")` imports it.
+`gymnasium.make("icrl4aht/demo_wide-H4-t0-v0")` makes the environment of a published test task,
+`gymnasium.make("icrl4aht/task-v0", task=...)` of any task. `import icrl4aht_data` registers the ids, because
+Gymnasium 1.0 and later load no plugins; `gymnasium.make("icrl4aht_data:icrl4aht/demo_wide-H4-t0-v0")` imports it.
 The environment itself is `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`, which needs JAX.
 """
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
 TASK_ENVIRONMENT = "icrl4aht/task-v0"
-"""Gymnasium id of the environment of any task, which is its argument `task`."""
+"""Gymnasium id of the environment of the task given as argument `task`."""
 
 _MODULE = "icrl4aht_generation.adapters.gymnasium_env"
 _TRACKS = ("teammate", "layout")
@@ -31,8 +31,8 @@ def register_environments() -> None:
     """Register the Gymnasium ids: `TASK_ENVIRONMENT`, and one for each of the 160 published test tasks.
 
     The id of a test task is `icrl4aht/<layout>-<family>-t<number>-v0`, such as icrl4aht/demo_wide-H4-t0-v0. Episodes
-    have 100 steps, as in the evaluation, unless `gymnasium.make` is given another `max_episode_steps`. Ids that are
-    registered stay as they are; without Gymnasium nothing is done.
+    have 100 steps, as in the evaluation, unless `gymnasium.make` is given another `max_episode_steps`. Existing
+    ids are kept. Does nothing if Gymnasium is not installed.
     """
     try:
         from gymnasium.envs.registration import register, registry
@@ -50,7 +50,7 @@ def register_environments() -> None:
 
 
 def environment_spec(max_steps: int, arguments: dict[str, Any]) -> EnvSpec:
-    """Return what Gymnasium and Minari need to make the environment of a task, without making it.
+    """Return the Gymnasium `EnvSpec` of a task, without making the environment.
 
     Args:
         max_steps: steps of an episode.

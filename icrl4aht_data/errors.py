@@ -1,4 +1,4 @@
-"""Errors that this package raises on bad input, with one base class, and its warnings.
+"""Exceptions of this package, with one base class, and warnings.
 
 Messages name the file or value, what was expected, what was found, and what to do next.
 """
@@ -18,7 +18,7 @@ class UnknownNameError(Icrl4ahtError, ValueError):
 
 
 class EmptySelectionError(Icrl4ahtError, ValueError):
-    """The filter is valid but no history matches it."""
+    """The filters are valid but no history matches them."""
 
 
 class OptionError(Icrl4ahtError, ValueError):
@@ -42,7 +42,11 @@ class NotStoredError(Icrl4ahtError):
 
 
 class ReleaseError(Icrl4ahtError):
+<<<<<<< HEAD
     """Base class of errors about a release that cannot be read."""
+=======
+    """A release cannot be read; base class of specific errors."""
+>>>>>>> 447828e (Language (wip))
 
 
 class RootNotFoundError(ReleaseError, FileNotFoundError):
@@ -78,7 +82,7 @@ class ShardMismatchError(ReleaseError):
 
 
 class PublishedFormatError(ReleaseError):
-    """Files in the published format are missing or malformed, or do not contain what a release needs."""
+    """Files in the published format are missing or malformed, or have missing fields."""
 
 
 class FormatTooNewError(ReleaseError):
@@ -93,9 +97,15 @@ class RemoteError(ReleaseError, OSError):
     """A remote failed after all retries, or returned content that differs from its manifest.
 
     Args:
+<<<<<<< HEAD
         message: the error message, with the address.
         missing: whether the file does not exist on the remote.
         is_content: whether the remote answered, but with a missing file or unexpected content.
+=======
+        message: names the address.
+        missing: whether the remote has no such file.
+        is_content: whether the remote responded, but without the file or with different content.
+>>>>>>> 447828e (Language (wip))
     """
 
     def __init__(self, message: str, missing: bool = False, is_content: bool = False) -> None:
@@ -104,7 +114,11 @@ class RemoteError(ReleaseError, OSError):
 
 
 class OfflineError(ReleaseError):
+<<<<<<< HEAD
     """A file is not on this machine, and HF_HUB_OFFLINE or ICRL4AHT_OFFLINE forbids fetching it."""
+=======
+    """A file is not on this machine and cannot be fetched: HF_HUB_OFFLINE or ICRL4AHT_OFFLINE is set."""
+>>>>>>> 447828e (Language (wip))
 
 
 class UnsafePathError(ReleaseError):
@@ -116,11 +130,19 @@ class CacheError(Icrl4ahtError):
 
 
 class DiskFullError(Icrl4ahtError, OSError):
+<<<<<<< HEAD
     """The disk is full. The message names the file or folder, the disk, and its free space."""
 
 
 class UploadError(Icrl4ahtError):
     """Uploading a release failed, or the repository differs from the release after the upload."""
+=======
+    """The disk is full; names the file or folder, the disk, and its free space."""
+
+
+class UploadError(Icrl4ahtError):
+    """An upload failed, or the repository differs from the release; names the repository."""
+>>>>>>> 447828e (Language (wip))
 
 
 class PluginError(Icrl4ahtError):
@@ -132,6 +154,7 @@ class TaskFormatError(Icrl4ahtError, ValueError):
 
 
 class WeakLabelsWarning(UserWarning):
+<<<<<<< HEAD
     """The expert of some tasks earns far less than the ego does at the end of its histories."""
 
 
@@ -140,6 +163,16 @@ class MixedSplitsWarning(UserWarning):
 
 
 _LISTED, _COMPARED = 50, 1000  # numbers of valid names that an error lists, and that are searched for the nearest
+=======
+    """Labels of some tasks come from a policy with a much lower return than the end of the histories."""
+
+
+class MixedSplitsWarning(UserWarning):
+    """A sampler draws from split `train` together with validation or test splits."""
+
+
+_LISTED, _COMPARED = 50, 1000  # most names in a message, and most names compared to find the nearest
+>>>>>>> 447828e (Language (wip))
 
 
 def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:

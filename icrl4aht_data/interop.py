@@ -7,16 +7,16 @@ A sampler is a sequence of batches, each a pure function of its number, so most 
     PyTorch        torch_loader(sampler, workers=4); needs the extra `torch`
     Hugging Face   hf_index(dataset), hf_episodes(dataset), hf_windows(sampler); need the extra `hf`
 
-`len(sampler)` batches make one pass: together they have as many steps as the selection. A sequence gives the same
-batches each time it is read, so for training over several passes take loaders that continue: `sampler.batches()` never
-ends, each pass over a `torch_loader` continues where the one before ended, and so does Grain with
-`grain.MapDataset.range(passes * len(sampler)).map(sampler.batch)`, whose `repeat` would give the same batches again.
+`len(sampler)` batches make one pass: together they have as many steps as the selection. Reading a sampler again gives
+equal batches, so for several passes take loaders that continue: `sampler.batches()` never ends, each pass over a
+`torch_loader` continues after the previous one, and for Grain there is
+`grain.MapDataset.range(passes * len(sampler)).map(sampler.batch)` (`repeat` would repeat batches).
 
-PyTorch's own `DataLoader(sampler, batch_size=None)` gives integers as int32, which its losses refuse as targets;
-`torch_loader` gives int64.
+`torch_loader` gives integers as int64. PyTorch's `DataLoader(sampler, batch_size=None)` gives int32, which PyTorch's
+losses refuse as targets.
 
-Rows of episodes have state records, also those that `datasets.load_dataset(release, "episodes", streaming=True)` gives
-for a published release; `render_observations(rows)` makes observations of them.
+Rows of episodes have state records, also rows from `datasets.load_dataset(release, "episodes", streaming=True)`;
+`render_observations(rows)` renders them as observations.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ if TYPE_CHECKING:
 
 Rendered = Literal["float32", "uint8"]
 RENDERED: tuple[Rendered, ...] = ("float32", "uint8")
-"""Dtypes of observations that `render_observations` makes of state records."""
+"""Dtypes that `render_observations` can return."""
 
 IGNORED = -100
-"""The target of padding in `torch_loader` and `hf_windows`: the number that PyTorch's cross entropy ignores."""
+"""Target of padding in `torch_loader` and `hf_windows`; PyTorch's cross entropy ignores it."""
 
 
 @overload
@@ -88,11 +88,11 @@ def torch_loader(
 ) -> DataLoader[Any]:
     """Return a DataLoader over a sampler's batches as named tuples of tensors, in order for any number of workers.
 
-    The tensors are what PyTorch's losses and embeddings take: integers are int64 (observations keep their dtype), and
+    Tensors fit PyTorch's losses and embeddings: integers are int64 (observations keep their dtype), and
     `target_actions` are -100 on padding, which `F.cross_entropy` ignores. So `F.cross_entropy(logits, targets)` is
-    right as it is for logits (B, 6, L), or (B, 6) for `query_target`. Fields that a batch does not have are None.
+    correct for logits (B, 6, L), or (B, 6) for `query_target`. Absent fields are None.
 
-    Each pass over the loader, `for batch in loader`, continues where the pass before ended, or would have ended if that
+    Each pass over the loader, `for batch in loader`, continues after the last batch of the previous pass, even if that
     was left early. `len(loader)` is the number of batches of the next pass. Passes end at multiples of `len(sampler)`;
     with `stop`, the first one has the batches start..stop - 1 and each further one as many.
 
@@ -118,7 +118,7 @@ def torch_loader(
     if stop is None:
         numbers = range(numbers.start, (numbers.start // per_pass + 1) * per_pass)
     if workers and sampler.dataset.cache.cache != "stream":
-        _ = sampler.dataset.storage  # decoded here once: mapped by the workers, or inherited by forked ones
+        _ = sampler.dataset.storage  # decode once in this process; workers map the files or inherit the arrays
     processes = {"multiprocessing_context": context, "persistent_workers": True} if workers else {}
     return DataLoader(
         _TorchBatches(sampler),  # type: ignore[arg-type]
@@ -131,7 +131,7 @@ def torch_loader(
 
 
 def _numbers(sampler: Sampler, start: int, stop: int | None) -> range:
-    """Return the numbers of the batches start..stop, by default those up to `len(sampler)`.
+    """Return the range of batch numbers start..stop; `stop` is `len(sampler)` by default.
 
     Raises:
         OptionError: for anything but a sampler, or for impossible numbers.
@@ -143,7 +143,7 @@ def _numbers(sampler: Sampler, start: int, stop: int | None) -> range:
 
 
 class _Passes:
-    """Numbers of batches for a DataLoader, which iterates over them once for each pass; each pass continues the last.
+    """Sampler of batch numbers for a DataLoader; each iteration continues after the previous one.
 
     Args:
         numbers: batches of the first pass.
@@ -157,14 +157,14 @@ class _Passes:
         return len(self._numbers)
 
     def __iter__(self) -> Iterator[int]:
-        # A generator: DataLoader makes two iterators for its first pass with workers, and takes numbers from one.
+        # A generator: with workers, DataLoader makes two iterators in its first pass but uses only one.
         numbers = self._numbers
         self._numbers = range(numbers.stop, numbers.stop + self._size)
         yield from numbers
 
 
 class _TorchBatches:
-    """The batches of a sampler, in PyTorch's dtypes. DataLoader makes tensors of the arrays."""
+    """Dataset of a sampler's batches in PyTorch's dtypes; DataLoader converts the arrays to tensors."""
 
     def __init__(self, sampler: Sampler) -> None:
         self._sampler = sampler
@@ -177,7 +177,7 @@ class _TorchBatches:
 
 
 def _for_losses(batch: Any) -> Any:
-    """Return a batch with int64 for int32, and targets that losses ignore on padding."""
+    """Return a batch with int64 instead of int32, and `IGNORED` targets on padding."""
     present = {name: array for name, array in batch._asdict().items() if array is not None}
     arrays = {name: array.astype(np.int64) if array.dtype == np.int32 else array for name, array in present.items()}
     if isinstance(batch, ADBatch):
@@ -186,7 +186,7 @@ def _for_losses(batch: Any) -> Any:
 
 
 def hf_index(dataset: Selection) -> datasets.Dataset:
-    """Return the selection's index entries as a `datasets.Dataset`: one row a history, with the columns of `Entry`.
+    """Return the selection's index entries as a `datasets.Dataset`: one row per history, with the columns of `Entry`.
 
     Raises:
         OptionError: if `datasets` is not installed.
@@ -234,8 +234,8 @@ def render_observations(
     Args:
         rows: one row; several rows; or a batch as `datasets` gives it, a mapping of columns. Of their columns only
             `layout` and `state` are read, lists or arrays.
-        channels: channels of the observations; see `channels.CHANNELS`. With the layouts' own channels all rows must be
-            of layouts with equally many, such as one layout.
+        channels: channels of the observations; see `channels.CHANNELS`. With own channels, all rows must have
+            layouts with equally many channels.
         obs: the dtype.
 
     Returns:
@@ -243,9 +243,9 @@ def render_observations(
 
     Raises:
         UnknownNameError: for channels, a dtype or a layout that does not exist.
-        OptionError: for no rows, rows of layouts with unequal channels, records that are too short for the layout, or
-            anything but rows.
-        NotStoredError: for rows without state records, as those of a release of observations are.
+        OptionError: for no rows, layouts with different numbers of channels, records too short for their layout, or
+            an argument that is not rows.
+        NotStoredError: for rows without state records, as in a release of observations.
     """
     if channels not in CHANNELS:
         raise unknown("channels", channels, CHANNELS)

@@ -39,18 +39,20 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".svg", ".pdf")
 """Accepted suffixes of a figure's file name."""
 
-_CURVE_PARTS = 25  # of a history, as points of a curve
+_CURVE_PARTS = 25  # most points of a history's curve
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _MARGIN = 420, 130, 44, 18, 8  # pixels of an SVG
-_MOST_POINTS = 60  # in its curves; each is the mean of several episodes, which scatter too much to show a trend
+_MOST_POINTS = (
+    60  # points of an SVG curve, each the mean of several episodes, whose returns scatter too much to show a trend
+)
 _COLOURS = ("#1f77b4", "#d9730d", "#2ca02c", "#9467bd")  # readable on white and on black
 
 MOST_PANELS = 12
-"""Most panels of a picture with a panel for each task or cell."""
+"""Most panels of a figure with one panel per task or cell."""
 
 
 class RecordedCurve(Protocol):
-    """A history as the figures need it: its entry of the index, and the returns of its episodes."""
+    """Interface of a history in figures: its index entry and its episode returns."""
 
     entry: Entry
 
@@ -60,17 +62,17 @@ class RecordedCurve(Protocol):
 
 
 class RecordedCurves(Protocol):
-    """Histories in order, such as a `Dataset`, as the figures need them."""
+    """Interface of a sequence of histories in figures, such as a `Dataset`."""
 
     def __iter__(self) -> Iterator[RecordedCurve]: ...
 
     def counts(self, name: str) -> dict[str, int]:
-        """Return the number of histories with each value of an index field."""
+        """Return the number of histories for each value of an index field."""
         ...
 
 
 class Picture:
-    """A figure or an animation. Notebooks show it, `save` writes it to a file.
+    """A figure or an animation, shown by notebooks; `save` writes it to a file.
 
     Args:
         title: what the picture shows, in words.
@@ -95,7 +97,7 @@ class Picture:
         return f"Picture({self.title}; notebooks show it, .save(path) writes it: {suffixes})"
 
     def _repr_html_(self) -> str:
-        """The picture as an HTML element that contains it."""
+        """Return the picture as an HTML element, for notebooks."""
         content, kind = self._content, "gif"
         if not isinstance(content, bytes):
             content, kind = _small_png(content), "png"
@@ -103,10 +105,10 @@ class Picture:
         return f'<img alt="{escape(self.title)}" style="max-width:100%" src="data:image/{kind};base64,{data}">'
 
     def save(self, path: str | Path) -> None:
-        """Write the picture to a file; an existing file is replaced at once.
+        """Write the picture to a file atomically.
 
         Raises:
-            OptionError: unless the path ends in .gif for an animation, in .png, .svg or .pdf for a figure.
+            OptionError: if the path does not end in .gif (animation), or in .png, .svg or .pdf (figure).
         """
         target = Path(path)
         if not isinstance(self._content, bytes):
@@ -119,7 +121,7 @@ class Picture:
 
 
 def _small_png(figure: Figure) -> bytes:
-    """Return a figure as a PNG of 256 colours, a third of the size: notebooks store every picture as text."""
+    """Return a figure as a PNG of 256 colours, a third of the usual size, since notebooks store pictures as text."""
     from PIL import Image
 
     drawn, small = BytesIO(), BytesIO()
@@ -129,7 +131,7 @@ def _small_png(figure: Figure) -> bytes:
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
-    """Return the mean over up to `window` values around each one, fewer at the ends; float64 (E,) of real (E,)."""
+    """Return the running mean over `window` values, fewer at the ends: float64 (E,) from real (E,)."""
     width = max(1, window)
     sums = np.concatenate([[0.0], np.cumsum(values)])
     numbers = np.arange(len(values))
@@ -138,9 +140,9 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def return_limits(values: Iterable[float]) -> tuple[float, float]:
-    """Return the ends of an axis of returns: 0 and all values are on it, and at least one delivery's reward.
+    """Return the limits of an axis of returns, which includes 0, all values, and the reward of one delivery.
 
-    A constant return is therefore a line at its height above 0, not a magnified one.
+    Small variations of a constant return are therefore not magnified.
     """
     found = [0.0, *values]
     low, high = min(found), max(found)
@@ -152,7 +154,7 @@ def return_limits(values: Iterable[float]) -> tuple[float, float]:
 def curve_svg(curves: Mapping[str, np.ndarray], axis: str = "episode") -> str:
     """Return curves of returns in one pair of axes as an SVG element that uses the page's text colour.
 
-    The axis of returns is that of `return_limits`, with its ends as labels. Needs no optional library.
+    The vertical axis has the limits of `return_limits` as labels. Needs no optional library.
 
     Args:
         curves: label -> values at equal distances, (N,) of at least one.
@@ -191,7 +193,7 @@ def plot_history(returns: np.ndarray, title: str, expert_return: float | None = 
     Args:
         returns: real (E,), each episode's return.
         title: title of the figure.
-        expert_return: what the policy behind the expert actions earns per episode, drawn as a line; None to omit it.
+        expert_return: return per episode of the expert policy, drawn as a line; None to omit it.
 
     Raises:
         OptionError: if matplotlib is not installed.
@@ -231,9 +233,9 @@ def animate_episode(
 
 
 def plot_learning_curves(dataset: RecordedCurves, path: Path | None = None) -> Figure:
-    """Plot the return per episode of every task in a selection, a panel each, see `plot_curves`.
+    """Plot the return by episode of every task in a selection, one panel each, see `plot_curves`.
 
-    More than 12 tasks are drawn as `plot_layout_curves` does, by layout and source.
+    More than 12 tasks are drawn by layout and source, see `plot_layout_curves`.
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
@@ -284,10 +286,9 @@ def add_curve(curves: SourceCurves, layout: str, source: str, split: str, return
 
 
 def plot_source_curves(curves: SourceCurves, path: Path | None = None) -> Figure:
-    """Plot small panels, one per layout, of returns over the course of a history: mean over histories, band from 10th
-    to 90th percentile.
+    """Plot mean returns over the course of a history, one panel per layout, with bands from 10th to 90th percentile.
 
-    The course of a history is divided into at most 25 equal parts, in which returns are averaged.
+    Each history is divided into at most 25 equal parts, and returns are averaged in each part.
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
@@ -318,10 +319,10 @@ def plot_source_curves(curves: SourceCurves, path: Path | None = None) -> Figure
 
 
 def plot_curves(path: Path | None, panels: Sequence[tuple[str, dict[str, np.ndarray]]]) -> Figure:
-    """Plot panels of learning curves on one axis of returns, with one legend.
+    """Plot panels of learning curves with equal limits and one legend.
 
-    A line is the running mean over a twentieth of the episodes of the mean over streams, the band from the 10th to the
-    90th percentile of the streams' returns without smoothing.
+    A line is the mean over streams, smoothed by a running mean over a twentieth of the episodes. A band spans the 10th
+    to 90th percentile of the streams, without smoothing.
 
     Args:
         path: the file to write; None to write none.
@@ -372,7 +373,7 @@ def plot_layouts(layouts: Sequence[Layout], path: Path | None = None) -> Figure:
 def plot_headroom(
     cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str], path: Path | None = None
 ) -> Figure:
-    """Plot the oracle's mean return minus that of an ego that stays, for each test layout and teammate family.
+    """Plot the oracle's mean return minus that of `stay`, for each test layout and teammate family.
 
     Args:
         cells: the reference returns, see `reference_returns.read_headroom`.
@@ -415,12 +416,12 @@ def _panels(
 
 
 def can_draw() -> bool:
-    """Return whether the libraries of figures are installed: matplotlib and Pillow."""
+    """Return whether matplotlib and Pillow are installed."""
     return all(find_spec(name) for name in ("matplotlib", "PIL"))
 
 
 def check_can_draw() -> None:
-    """Check, before work whose results will be drawn, that figures can be drawn.
+    """Check that matplotlib and Pillow are installed, before long work whose results are drawn.
 
     Raises:
         OptionError: if matplotlib or Pillow is not installed.
@@ -430,7 +431,7 @@ def check_can_draw() -> None:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of this size in inches, whose parts are arranged so that none overlap.
+    """Return an empty figure of a size in inches, with matplotlib's constrained layout.
 
     Raises:
         OptionError: if matplotlib is not installed.
@@ -466,7 +467,7 @@ def _saved(figure: Figure, path: Path | None, dpi: int) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
-    """Write a figure in the format that the path's suffix names; an existing file is replaced at once."""
+    """Write a figure atomically, in the format of the path's suffix."""
     kind = path.suffix.removeprefix(".")
     with atomic_write(path) as partial:
         figure.savefig(partial, dpi=dpi, format=kind)
