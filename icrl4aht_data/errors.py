@@ -42,11 +42,7 @@ class NotStoredError(Icrl4ahtError):
 
 
 class ReleaseError(Icrl4ahtError):
-<<<<<<< HEAD
     """Base class of errors about a release that cannot be read."""
-=======
-    """A release cannot be read; base class of specific errors."""
->>>>>>> 447828e (Language (wip))
 
 
 class RootNotFoundError(ReleaseError, FileNotFoundError):
@@ -97,15 +93,9 @@ class RemoteError(ReleaseError, OSError):
     """A remote failed after all retries, or returned content that differs from its manifest.
 
     Args:
-<<<<<<< HEAD
         message: the error message, with the address.
         missing: whether the file does not exist on the remote.
         is_content: whether the remote answered, but with a missing file or unexpected content.
-=======
-        message: names the address.
-        missing: whether the remote has no such file.
-        is_content: whether the remote responded, but without the file or with different content.
->>>>>>> 447828e (Language (wip))
     """
 
     def __init__(self, message: str, missing: bool = False, is_content: bool = False) -> None:
@@ -114,11 +104,7 @@ class RemoteError(ReleaseError, OSError):
 
 
 class OfflineError(ReleaseError):
-<<<<<<< HEAD
     """A file is not on this machine, and HF_HUB_OFFLINE or ICRL4AHT_OFFLINE forbids fetching it."""
-=======
-    """A file is not on this machine and cannot be fetched: HF_HUB_OFFLINE or ICRL4AHT_OFFLINE is set."""
->>>>>>> 447828e (Language (wip))
 
 
 class UnsafePathError(ReleaseError):
@@ -130,19 +116,11 @@ class CacheError(Icrl4ahtError):
 
 
 class DiskFullError(Icrl4ahtError, OSError):
-<<<<<<< HEAD
     """The disk is full. The message names the file or folder, the disk, and its free space."""
 
 
 class UploadError(Icrl4ahtError):
     """Uploading a release failed, or the repository differs from the release after the upload."""
-=======
-    """The disk is full; names the file or folder, the disk, and its free space."""
-
-
-class UploadError(Icrl4ahtError):
-    """An upload failed, or the repository differs from the release; names the repository."""
->>>>>>> 447828e (Language (wip))
 
 
 class PluginError(Icrl4ahtError):
@@ -154,7 +132,6 @@ class TaskFormatError(Icrl4ahtError, ValueError):
 
 
 class WeakLabelsWarning(UserWarning):
-<<<<<<< HEAD
     """The expert of some tasks earns far less than the ego does at the end of its histories."""
 
 
@@ -163,16 +140,6 @@ class MixedSplitsWarning(UserWarning):
 
 
 _LISTED, _COMPARED = 50, 1000  # numbers of valid names that an error lists, and that are searched for the nearest
-=======
-    """Labels of some tasks come from a policy with a much lower return than the end of the histories."""
-
-
-class MixedSplitsWarning(UserWarning):
-    """A sampler draws from split `train` together with validation or test splits."""
-
-
-_LISTED, _COMPARED = 50, 1000  # most names in a message, and most names compared to find the nearest
->>>>>>> 447828e (Language (wip))
 
 
 def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:
