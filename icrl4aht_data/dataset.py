@@ -284,7 +284,8 @@ class Dataset(Selection):
     def recover_environment(self, history_id: int, **options: Any) -> gymnasium.Env:
         """Return the Gymnasium environment of a history: the ego's side of its task, with the teammate inside.
 
-        Episodes have the length used to make the history, 400 steps in the benchmark; the release keeps the first 100. `reset(options=dataset.reset_options(history_id, episode))` starts it as a recorded episode.
+        Episodes have the length used to make the history, 400 steps in the benchmark; the release keeps the first 100.
+        `reset(options=dataset.reset_options(history_id, episode))` starts it as a recorded episode.
 
         Args:
             history_id: a history of the release, whether selected or not.

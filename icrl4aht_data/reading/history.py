@@ -21,8 +21,8 @@ from icrl4aht_data.utils.text import counted_noun, facts_html
 
 Obs = Literal["float32", "uint8", "state"]
 OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
-"""Values of the option `obs`: observations as float32 (the paper's dtype) or uint8 (the same integers), or state records,
-which `icrl4aht_data.overcooked.observe` renders as observations."""
+"""Values of the option `obs`: observations as float32 (the paper's dtype) or uint8 (the same integers), or
+state records, which `icrl4aht_data.overcooked.observe` renders as observations."""
 
 Labels = Literal["expert", "oracle"]
 LABELS: tuple[Labels, ...] = ("expert", "oracle")
@@ -35,7 +35,8 @@ class History:
     """One learning history: an ego that learns with one fixed teammate, T steps in E episodes.
 
     `history.actions`, `.rewards`, `.obs` and so on are read-only NumPy arrays, read on first access and kept;
-    `history["actions"]` is the same as `history.actions`. `history.read("obs", 0, 100)` reads only some rows; `history.episodes[-1].actions` are the actions of the last episode.
+    `history["actions"]` is the same as `history.actions`. `history.read("obs", 0, 100)` reads only some rows;
+    `history.episodes[-1].actions` are the actions of the last episode.
 
     Args:
         entry: the history's entry of the index.
