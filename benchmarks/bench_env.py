@@ -73,7 +73,7 @@ def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironmen
 
 
 def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
-    """Return a compiled call that plays `STEPS` steps with random actions; each call continues from the previous one."""
+    """Return a compiled call that plays `STEPS` steps with random actions; each call continues the previous one."""
     state, step = game
     steps = STEPS // n
 

@@ -326,7 +326,7 @@ def test_episodes_one_step_shorter_by_a_flipped_bit(small, tmp_path):
         load_icrl4aht(root)
     write_manifest(root)
     dataset = load_icrl4aht(root, layout="demo_wide")
-    with pytest.raises(OptionError, match="some history's episodes do not have 14 steps each; run `icrl4aht-data verify`"):
+    with pytest.raises(OptionError, match="some history's episodes do not have 14 steps each; run"):
         dataset.ad(batch_size=4, length=5, episodes=(1, 4))
 
 
