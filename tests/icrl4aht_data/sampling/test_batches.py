@@ -105,7 +105,7 @@ def test_resuming_continues_exactly(lite, sampler):
         resumed.load_state_dict(state)
         assert_equal(next(resumed), sampler[4])
     dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8")
-    with pytest.raises(OptionError, match="of other batches: it has seed = 3, not 4"):
+    with pytest.raises(OptionError, match="belongs to other batches: it has seed = 3, not 4"):
         dataset.ad(batch_size=3, length=9, seed=4).batches().load_state_dict(state)
     with pytest.raises(OptionError, match="selection"):
         dataset[1:].ad(batch_size=3, length=9, seed=3).batches().load_state_dict(state)
