@@ -202,7 +202,7 @@ class TestOrder:
         with pytest.raises(OptionError, match="expected the name of an index field"):
             two_sourced.sort()
         for wrong in (["layout", "return_end"], lambda entry: entry.T):
-            with pytest.raises(OptionError, match=r'expected names of index fields, such as ds.sort\("layout", "return_end"\)'):
+            with pytest.raises(OptionError, match=r'index fields, such as ds.sort\("layout", "return_end"\)'):
                 two_sourced.sort(wrong)  # type: ignore[arg-type]
 
 
