@@ -109,7 +109,7 @@ def test_actions_are_the_oracles_except_for_noise(arrays):
     expected = 1 - arrays["noise"].reshape(40, 1) * 5 / 6
     assert clean[expected[:, 0] == 1].all()
     assert abs(clean.mean() - expected.mean()) < 4 * np.sqrt((expected * (1 - expected)).sum() / 40 / 4000)
-    noisy = arrays["actions"].reshape(40, 100)[~clean]  # the action differs from the oracle's at some step
+    noisy = arrays["actions"].reshape(40, 100)[~clean]  # only random actions differ
     assert (np.bincount(noisy, minlength=6) > 0.1 * len(noisy)).all()
 
 

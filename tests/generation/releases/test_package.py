@@ -136,7 +136,7 @@ def test_streams_are_kept_as_before_where_no_teammate_leaves_headroom(two_learne
     assert "No headroom: on demo_wide" in (root / "README.md").read_text()
 
 
-def test_tasks_without_headroom_are_left_out(built, two_learners, profile, tmp_path):
+def test_tasks_without_rising_streams_or_headroom_are_left_out(built, two_learners, profile, tmp_path):
     flat = make_tasks(profile, 2)[1]
     works = [*two_learners, *(Work(flat, "ppo", learner) for learner in range(2))]
     for work in works[2:]:
