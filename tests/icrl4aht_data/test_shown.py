@@ -15,14 +15,10 @@ import numpy as np
 import pytest
 
 import icrl4aht_data
-from icrl4aht_data import ADBatch, ADSampler, Curriculum, Dataset, DPTSampler, Report, get_layout, load_icrl4aht
+from icrl4aht_data import ADBatch, Curriculum, Dataset, Report, get_layout, load_icrl4aht
 from icrl4aht_data.checking.report import Finding
-from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.interop import torch_loader
 from icrl4aht_data.plotting import curve_svg, return_limits
-from icrl4aht_data.reading.episodes import Episode
-from icrl4aht_data.reading.history import History
-from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.utils.text import facts_html
 from tests.helpers.paths import ROOT
 
@@ -132,34 +128,6 @@ def test_points_of_a_curve_are_where_their_values_are():
     assert len(x) == 60
     slopes = np.diff(y) / np.diff(x)
     np.testing.assert_allclose(slopes, slopes.mean(), rtol=0.1)
-
-
-@pytest.mark.parametrize("function", [Dataset.ad, Dataset.dpt, ADSampler, DPTSampler], ids=lambda f: f.__qualname__)
-def test_help_lists_the_options_with_their_types(function):
-    signature = inspect.signature(function)
-    for name, annotation, default in (("seed", int, 0), ("teammate_actions", bool, False), ("process_count", int, 1)):
-        assert (signature.parameters[name].annotation, signature.parameters[name].default) == (annotation, default)
-    assert "options" not in signature.parameters
-    assert not any(isinstance(one.annotation, str) for one in signature.parameters.values())
-    assert ("length" in signature.parameters) != ("context" in signature.parameters)
-    assert "weights" in signature.parameters and "Unpack" not in str(signature)
-
-
-def test_help_of_loading_and_verifying_shows_types():
-    assert inspect.signature(load_icrl4aht).return_annotation is Dataset
-    assert inspect.signature(verify_release).return_annotation is Report
-
-
-@pytest.mark.parametrize("shown", [Dataset, History, Episode, Batches], ids=lambda shown: shown.__name__)
-def test_help_of_methods_shows_types(shown):
-    """Types of libraries imported only for type checks are shown as text."""
-    for name, method in inspect.getmembers(shown, inspect.isfunction):
-        if name.startswith("_") and name != "__init__":
-            continue
-        signature = inspect.signature(method)
-        found = [one.annotation for one in signature.parameters.values()] + [signature.return_annotation]
-        texts = {annotation for annotation in found if isinstance(annotation, str)}
-        assert texts <= {"gymnasium.Env", "pandas.DataFrame"}, name
 
 
 def test_provenance_is_a_read_only_mapping_with_a_short_repr(bundled):

@@ -25,7 +25,7 @@ from icrl4aht_data.utils.system import usable_cores
 
 _PROGRESS = "episodes of the report"
 
-MakeEgo = Callable[[Layout], Policy]
+JaxEgoMaker = Callable[[Layout], Policy]
 
 
 class ShownEpisode(NamedTuple):
@@ -61,7 +61,7 @@ class EpisodePair(NamedTuple):
 def save_episodes(
     paths: Mapping[int, Path],
     task: Task,
-    make_ego: MakeEgo,
+    make_ego: JaxEgoMaker,
     protocol: Protocol,
     *,
     seed: int = 0,
@@ -112,7 +112,7 @@ def family_gifs(
             cells = [cell for cell in run.cells if cell[1:] == group]
             chosen.append((run, next((cell for cell in cells if scores[cell].has_headroom), cells[0])))
     sources = {source.folder: source for source in (run.source(cell) for run, cell in chosen)}
-    egos: dict[str, MakeEgo | Icrl4ahtError] = {}
+    egos: dict[str, JaxEgoMaker | Icrl4ahtError] = {}
     for name, source in sources.items():
         try:
             egos[name] = restore_ego(source)
@@ -133,7 +133,7 @@ def family_gifs(
 
 
 def _draw_result(
-    run: EvaluationRun, cell: ResultCell, ego: MakeEgo | Icrl4ahtError, prefix: Path, suite: Path | None
+    run: EvaluationRun, cell: ResultCell, ego: JaxEgoMaker | Icrl4ahtError, prefix: Path, suite: Path | None
 ) -> EpisodePair:
     source, task = run.source(cell), run.tasks(cell)[0]
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
@@ -151,7 +151,7 @@ def _draw_result(
         return EpisodePair(cell, title, f"No picture: {error}. {origin}")
 
 
-def restore_ego(source: ResultSource) -> MakeEgo:
+def restore_ego(source: ResultSource) -> JaxEgoMaker:
     """Return the function that makes the ego of some results, layout -> policy.
 
     Raises:
