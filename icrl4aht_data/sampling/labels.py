@@ -70,8 +70,8 @@ def warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
     more = f" and {len(weak) - _NAMED} more" if len(weak) > _NAMED else ""
     player = "a policy that earns, acting greedily," if labels == "expert" else "the oracle, which earns"
     warnings.warn(
-        f"the {labels} actions of {len(weak)} of {len(codes)} tasks come from {player} "
-        f"less than half of what their histories earn at the end: {named}{more}. A model would learn to play worse than its contexts: {advice}",
+        f"the {labels} actions of {len(weak)} of {len(codes)} tasks come from {player} less than half of what their "
+        f"histories earn at the end: {named}{more}. A model would learn to play worse than its contexts: {advice}",
         WeakLabelsWarning,
         stacklevel=4,  # the line that called Dataset.ad or Dataset.dpt
     )

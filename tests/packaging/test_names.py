@@ -30,7 +30,8 @@ def public_names(tree: ast.Module) -> Iterator[str]:
             names = [] if ".command(" in decorators or ".group(" in decorators else [node.name]
         elif isinstance(node, ast.Assign | ast.AnnAssign) and "TypeVar(" not in ast.unparse(node):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names = [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+            found = [name for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+            names = [name.id for name in found if isinstance(name.ctx, ast.Store)]  # no names that are only read
         else:
             names = []
         yield from (name for name in names if not name.startswith("_"))
