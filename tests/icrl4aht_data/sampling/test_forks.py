@@ -48,7 +48,7 @@ for cache in sys.argv[2:]:
         try:
             next(batches)
         except OptionError as error:
-            assert f"process {parent}" in str(error) and "make another" in str(error)
+            assert f"belongs to process {parent}" in str(error)
             os._exit(0 if (first.obs == sampler.batches(stop=1).__next__().obs).all() else 3)
         os._exit(4)
     forked.set()
