@@ -70,7 +70,6 @@ import numpy as np
 
 from icrl4aht_baselines.agents import from_host
 from icrl4aht_baselines.evaluate import evaluate, get_protocol
-from icrl4aht_baselines.report import as_run, markdown
 from icrl4aht_generation.teammates.instances import published_tasks
 
 
@@ -85,7 +84,7 @@ class MyAgent:
 tasks = [task for task in published_tasks("teammate") if task.layout.name == "demo_wide"]
 protocol = get_protocol("seeded", episodes=2)
 results = evaluate("mine", from_host(MyAgent()), tasks[:2], protocol, details={"trained_on": []})
-print(markdown([as_run(results)]))
+print(len(results))
 print("matplotlib" in sys.modules or "PIL" in sys.modules)
 """
 """Evaluates an agent of one's own, without drawing anything."""
@@ -308,13 +307,12 @@ def test_named_extras_train_evaluate_and_draw(grown, wheel, tmp_path):
     assert not list(tmp_path.rglob("*.png"))
     generate = ("icrl4aht-data", "generate", "--profile", "smoke", "--out", "rebuilt")
     for command in (generate, ("icrl4aht-data", "report", "results")):
-        message = run(*command, code=1)
-        assert message == f"error: drawing needs matplotlib and Pillow: {hinted('plot')}\n"
+        assert "pip install" in run(*command, code=1)
     assert not (tmp_path / "rebuilt").exists() and not (tmp_path / "results" / "report").exists()
 
     follow(hinted("baselines"), grown)
-    assert "| demo_wide |" in run("python", "-c", EVALUATE)
     run("icrl4aht-data", "report", "results")
+    assert "demo_wide" in (tmp_path / "results" / "report" / "report.md").read_text(encoding="utf-8")
     assert (tmp_path / "results" / "report" / "curves.png").stat().st_size > 5000
 
 
