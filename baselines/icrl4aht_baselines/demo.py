@@ -17,7 +17,7 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
 from icrl4aht_baselines.plotting import plot_family_curves
-from icrl4aht_baselines.report.page import check_can_render, write_page_with_episodes
+from icrl4aht_baselines.report.page import write_page_with_episodes
 from icrl4aht_baselines.report.results import EvaluationRun, bundled_by_id, note_results, read_run
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.histories import prepare
@@ -110,10 +110,9 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
 
     Raises:
         ReleaseError: if the release is damaged.
-        OptionError: if matplotlib or Jinja2 is not installed.
+        OptionError: if matplotlib is not installed.
     """
     check_can_draw()
-    check_can_render()
     started = time.perf_counter()
     settings = settings or DemoSettings()
     paths = [out / name for name in ("learning_curves.png", "episode.gif", "adaptation.png", "report.html")]

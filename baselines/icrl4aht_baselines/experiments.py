@@ -25,7 +25,7 @@ from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, l
 from icrl4aht_baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
 from icrl4aht_baselines.report.cards import write_model_cards
-from icrl4aht_baselines.report.page import check_can_render, report_files, write_page_with_episodes, write_report
+from icrl4aht_baselines.report.page import report_files, write_page_with_episodes, write_report
 from icrl4aht_baselines.report.results import merge, note_results, read_run
 from icrl4aht_baselines.training.histories import TrainingTask, filter_histories, prepare
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
@@ -211,7 +211,6 @@ def run_experiment(
         TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
     """
     check_can_draw()  # before the long work, not after it
-    check_can_render()
     if name not in EXPERIMENTS:
         raise unknown("experiment", name, EXPERIMENTS)
     experiment = EXPERIMENTS[name]

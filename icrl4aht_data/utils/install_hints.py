@@ -6,7 +6,7 @@ PACKAGE = "icrl4aht-data"
 """Name of the distribution that contains icrl4aht_data, icrl4aht_generation and icrl4aht_baselines."""
 
 EXTRAS = {
-    **dict.fromkeys(("jax", "flax", "optax", "jaxtyping", "safetensors", "jinja2"), "baselines"),
+    **dict.fromkeys(("jax", "flax", "optax", "jaxtyping", "safetensors"), "baselines"),
     **dict.fromkeys(("matplotlib", "pillow"), "plot"),
     **dict.fromkeys(("datasets", "pyarrow", "mlcroissant"), "hf"),
     **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari")},

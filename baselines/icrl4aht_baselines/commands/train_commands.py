@@ -146,7 +146,6 @@ def report_command(
     loaded, folder = merge([read_run(run) for run in runs]), out or runs[0] / "report"
     check_output(folder, overwrite, [*page.report_files(loaded), *map(card_name, loaded)])
     if html:
-        page.check_can_render()
         check_output(html, overwrite)
     paths = page.write_report(loaded, folder)
     if html:

@@ -13,9 +13,10 @@ from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from icrl4aht_baselines.plotting import SMOOTHING, plot_return_curves
 from icrl4aht_baselines.report.figures import (
@@ -43,11 +44,7 @@ from icrl4aht_baselines.training.seen import describe_training, overlap_legend, 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import MOST_PANELS, check_can_draw
 from icrl4aht_data.utils.files import atomic_write, json_hash
-from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.templates import markdown_table
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
 _REFERENCE_RANK = {"oracle": 1, "random": 2, "stay": 3}
@@ -152,7 +149,7 @@ def write_page(
         notes: facts about these runs for the reader, such as layouts that were left out.
 
     Raises:
-        OptionError: if the path does not end in .html, there is no run, or Jinja2 is not installed.
+        OptionError: if the path does not end in .html, or there is no run.
     """
     if path.suffix not in (".html", ".htm"):
         raise OptionError(f"{path}: expected a name that ends in .html")
@@ -193,21 +190,8 @@ def write_page_with_episodes(
         return write_page(runs, path, family_gifs(shown, Path(folder), suite, progress), notes)
 
 
-def check_can_render() -> None:
-    """Check, before work that ends in a page, that pages can be made.
-
-    Raises:
-        OptionError: if Jinja2 is not installed.
-    """
-    _environment()
-
-
 @cache
 def _environment() -> Environment:
-    try:
-        from jinja2 import Environment, PackageLoader, StrictUndefined
-    except ImportError as error:
-        raise OptionError(f"a page of results needs jinja2: {install_command('baselines')}") from error
     loader = PackageLoader("icrl4aht_baselines.report")
     blocks: Any = {"trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, **blocks)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import sys
 from html import unescape
 from html.parser import HTMLParser
 
@@ -14,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines import report
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
-from icrl4aht_baselines.report import gifs, merge, page, write_report
+from icrl4aht_baselines.report import gifs, merge, write_report
 from icrl4aht_baselines.report.cards import model_card, write_headroom_cards, write_model_cards
 from icrl4aht_baselines.report.figures import curve_figure, return_bars, score_bars
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
@@ -25,7 +24,6 @@ from icrl4aht_baselines.report.scores import cell_headroom
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
 GIF = b"GIF89a"  # the page does not decode the image
@@ -259,14 +257,6 @@ def test_commands_with_a_custom_manifest(tmp_path, monkeypatch):
     (tmp_path / "run" / "tasks.jsonl").unlink()
     with pytest.raises(OptionError, match=r"is neither a published test task, .* nor in the results' tasks\.jsonl"):
         CliRunner().invoke(cli, ["report", str(tmp_path / "run")], catch_exceptions=False)
-
-
-def test_a_page_needs_jinja2(monkeypatch):
-    page.check_can_render()
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    page._environment.cache_clear()
-    with pytest.raises(OptionError, match=f"a page of results needs jinja2: {re.escape(install_command('baselines'))}"):
-        page.check_can_render()
 
 
 def test_a_report_is_written_with_all_its_pictures(tmp_path):
