@@ -6,7 +6,6 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from types import MappingProxyType
@@ -27,8 +26,7 @@ from icrl4aht_baselines.report.results import (
     instances_range,
     published_cells,
 )
-from icrl4aht_baselines.report.scores import PAPER_METHODS, cell_scores
-from icrl4aht_baselines.training.options import FILTERS, HistoryOptions
+from icrl4aht_baselines.report.scores import PAPER_METHODS
 from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
@@ -39,7 +37,7 @@ from icrl4aht_data.utils.templates import fill_template, markdown_table
 HEADROOM_FILES = ("headroom.json", "headroom.md")
 
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
-_NOT_LISTED = ("layouts", "root", "split", "labels", "held_out", "obs", "channels", "hide_recipe", *FILTERS)
+_NOT_LISTED = ("layouts", "root", "groups", "selections", "sizes", "manifest_sha256", "data_version", "obs_shape")
 
 HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
 """Layout -> family -> reference ego -> mean return."""
@@ -64,32 +62,36 @@ def model_card(
         pictures: path of a picture with curves, relative to the card -> what it shows.
     """
     models: dict[str, list[ResultSource]] = defaultdict(list)
-    settings: dict[str, list[ResultSource]] = defaultdict(list)
+    settings: dict[str, list[str]] = defaultdict(list)
     for source in run.sources:
         if source.trained:
             models[source.trained["run_hash"]].append(source)
-            settings[_settings(source.trained["config"])].append(source)
-    config = next(iter(models.values()))[0].trained["config"]  # type: ignore[index]
-    histories, on_hub = config["histories"], _HUB.match(config["histories"]["root"])
-    seeds = dict.fromkeys(str(sources[0].trained["config"]["train"]["seed"]) for sources in models.values())  # type: ignore[index]
-    single = "It is one run" if len(models) == 1 else "Each model is one run"
+            settings[_settings(source.trained["config"])] += source.layouts
+    configs: list[dict[str, Any]] = [(sources[0].trained or {})["config"] for sources in models.values()]
+    config, root = configs[0], configs[0]["histories"]["root"]
+    dataset = on_hub[1] if (on_hub := _HUB.match(root)) else "icrl4aht"
+    seeds = ", ".join(dict.fromkeys(str(config["train"]["seed"]) for config in configs))
+    overlaps = {name for one in (run, *validation) for name in one.overlaps(one.cells)}
     limits = [
-        f"{single}, of seed {', '.join(seeds)}: the variation between seeds is not known.",
+        f"{'It' if len(models) == 1 else 'Each model'} is one run, of seed {seeds}: the variation between seeds is not "
+        "known.",
         "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
-        *overlap_legend(dict.fromkeys(name for one in (run, *validation) for name in one.overlaps(one.cells))),
+        *overlap_legend(overlaps),
     ]
     name = escape(title or run.agent, quote=False)
     method = config["method"] if title else name
-    dataset = on_hub[1] if on_hub else "icrl4aht"
     properties = {
         "method": method,
-        "data": f"{dataset}, data version {histories['data_version']}",
+        "data": f"{dataset}, data version {config['histories']['data_version']}",
         "created with": f"icrl4aht-data {config['package_version']}",
         "made by": command and f"`{command}`",
     }
     sections = [section for one in (run, *validation) for section in markdown_sections([one], one.protocol)]
     shown = [f"{text}:\n\n![{Path(at).stem}]({at})" for at, text in pictures.items()]
-    listed = [f"Tested on {_layouts(of)}:\n\n{text}" if len(settings) > 1 else text for text, of in settings.items()]
+    listed = [
+        f"Tested on {', '.join(dict.fromkeys(layouts))}:\n\n{text}" if len(settings) > 1 else text
+        for text, layouts in settings.items()
+    ]
     return fill_template(
         "baseline.md",
         title=name,
@@ -105,10 +107,6 @@ def model_card(
     )
 
 
-def _layouts(sources: Sequence[ResultSource]) -> str:
-    return ", ".join(dict.fromkeys(layout for source in sources for layout in source.layouts))
-
-
 def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
     """Return a row of the table of models: training data and seed of one model, and its evaluation."""
     trained: dict[str, Any] = sources[0].trained or {}
@@ -117,13 +115,12 @@ def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
     if "groups" in histories:  # trained by playing
         others = sum(cell["tasks"] for cell in config.get(TRAINED_ON, ()) if cell.get("source") == TASKS_SOURCE)
         selection = f"none: {sum(histories['groups'].values())} tasks at a time, played with the teammates of the "
-        selection += f"release's histories of {layouts}"
-        selection += f", and with those of {others} other tasks" if others else ""
+        selection += f"release's histories of {layouts}" + f", and with those of {others} other tasks" * bool(others)
     else:
         selection = f"{histories['sizes']['train']} of {layouts}"
     instances = instances_range(len(run.cells[cell]) for source in sources for cell in source.tasks)
     values = [
-        _layouts(sources),
+        ", ".join(dict.fromkeys(layout for source in sources for layout in source.layouts)),
         f"{selection}; the release's manifest has SHA-256 `{trained['manifest_sha256']}`",
         describe_training(sources[0].seen),
         str(config["train"]["seed"]),
@@ -134,34 +131,19 @@ def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
 
 def _settings(config: Mapping[str, Any]) -> str:
     """Return the settings of a model as a list."""
-    histories, unused = config["histories"], UNUSED_OPTIONS.get(config.get("method", ""), ())
-    settings = {name: value for name, value in (config["model"] | config["train"]).items() if name not in unused}
-    # Models of earlier versions have a layout's own channels.
-    settings |= {**config.get("play", {}), "channels": histories.get("channels", "own")}
-    init = config.get("init")
-    made_by = {cell["source"] for cell in config.get(TRAINED_ON, ()) if "source" in cell}
-    given = {
-        "sources of histories": ", ".join(sorted(made_by)),
-        "labels": histories.get("labels"),
-        **{
-            name: histories[name]
-            for name, default in asdict(HistoryOptions(())).items()
-            if name not in _NOT_LISTED and histories.get(name, default) != default
-        },
-        "hidden recipe indicators": ", ".join(histories.get("hide_recipe", ())),
-        "started from run": init.get("run") if isinstance(init, dict) else None,
-    }
-    settings |= {name: value for name, value in given.items() if value}
-    return "\n".join(f"* {name.replace('_', ' ')}: {value}" for name, value in settings.items())
+    unused = {*UNUSED_OPTIONS.get(config.get("method", ""), ()), *_NOT_LISTED}
+    parts = [config["model"], config["train"], config.get("play", {}), config["histories"]]
+    parts.append({"started from run": (config.get("init") or {}).get("run")})
+    shown = {name: value for part in parts for name, value in part.items() if name not in unused}
+    return "\n".join(f"* {name.replace('_', ' ')}: {value}" for name, value in shown.items() if value not in (None, []))
 
 
 def write_model_cards(runs: Iterable[EvaluationRun], folder: Path) -> list[Path]:
     """Write the card of every model that was trained here into a folder. Return their paths, NAME.md by run's name."""
-    trained = [run for run in runs if any(source.trained for source in run.sources)]
-    paths = [folder / card_name(run) for run in trained]
-    for path, run in zip(paths, trained, strict=True):
+    trained = {folder / card_name(run): run for run in runs if any(source.trained for source in run.sources)}
+    for path, run in trained.items():
         path.write_text(model_card(run), encoding="utf-8")
-    return paths
+    return [*trained]
 
 
 def card_name(run: EvaluationRun) -> str:
@@ -194,9 +176,9 @@ def write_headroom_cards(runs: Sequence[EvaluationRun], folder: Path) -> list[Pa
     """
     content: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     for run in runs:
-        for cell, score in cell_scores(run).items():
+        for cell, returns in run.returns.items():
             egos = content.setdefault(run.protocol, {}).setdefault(cell.layout, {}).setdefault(cell.family, {})
-            egos[run.agent] = round(float(score.means.mean()), 3)
+            egos[run.agent] = round(float(returns.mean.mean()), 3)
     paths = [folder / name for name in HEADROOM_FILES]
     paths[0].write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     paths[1].write_text(headroom_markdown(content), encoding="utf-8")

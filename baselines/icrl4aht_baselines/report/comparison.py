@@ -5,13 +5,12 @@ Shapes: U tasks, S seeds with which each was played.
 
 from __future__ import annotations
 
-import json
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pandas as pd
 
@@ -21,29 +20,32 @@ from icrl4aht_baselines.report.results import (
     BLOCKS,
     CELL_COLUMNS,
     ENDS,
+    CellReturns,
     ResultCell,
     cell_rows,
     episode_blocks,
+    in_order,
     published_cells,
     published_instances,
     read_run,
     results_table,
+    returns_by_cell,
 )
-from icrl4aht_baselines.report.scores import AVERAGE, PAPER_METHODS, cell_headroom, normalise, open_cells
+from icrl4aht_baselines.report.scores import PAPER_METHODS, cell_headroom, mean_of, normalise, open_cells
 from icrl4aht_baselines.report.statistics import mean_interval
 from icrl4aht_baselines.training.seen import OVERLAPS, overlap_marks
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, REFERENCES
-from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.benchmark.reference_returns import REFERENCES
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import new_figure, save_figure
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text
+from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.utils.text import counted_noun
 
 RESULTS_FILES = ("results.md", "results.png")
 
-AgentCells = dict[ResultCell, dict[str, Any]]
-"""Cell -> "overlaps", block or "gain" (last minus first) -> names of overlaps, or returns, float64 (U, S)."""
+AgentReturns = Mapping[ResultCell, CellReturns]
+"""Returns of an agent under one protocol."""
 
 UNSEEN = "unseen"
 """Protocol name of results on rearranged layouts, see `icrl4aht_baselines.online.unseen`; a task for each version."""
@@ -54,8 +56,8 @@ class StoredResults:
     """Results of several agents, `cards/results.json`.
 
     Attributes:
-        table: the results, see the module's docstring. Entries of ablations are stored like agents, with the
-            experiment's name instead of a protocol; results on unseen layouts with `UNSEEN`.
+        table: the results, see `results`. Entries of ablations are stored like agents, with the experiment's name
+            instead of a protocol; results on unseen layouts with `UNSEEN`.
         about: agent -> one sentence on how it was made; agents are shown in this order.
         ablations: ablation -> entry -> what differs.
         commits: agent or ablation -> commit of this repository whose code made it, if later code cannot.
@@ -66,24 +68,32 @@ class StoredResults:
     ablations: dict[str, dict[str, str]] = field(default_factory=dict)
     commits: dict[str, str] = field(default_factory=dict)
 
-    def protocol(self, name: str) -> dict[str, AgentCells]:
+    def protocol(self, name: str) -> dict[str, AgentReturns]:
         """Return the results under a protocol by agent, in the order of `about`."""
-        of_protocol = self.table[self.table["protocol"] == name]
-        order = [*self.about, *(agent for agent in of_protocol["agent"].unique() if agent not in self.about)]
-        agents = dict(iter(of_protocol.groupby("agent", sort=False)))
-        return {agent: agent_cells(agents[agent]) for agent in order if agent in agents}
+        agents = dict(iter(self.table[self.table["protocol"] == name].groupby("agent", sort=False)))
+        return {str(agent): returns_by_cell(agents[agent]) for agent in [*self.about, *agents] if agent in agents}
 
 
-def agent_cells(table: pd.DataFrame) -> AgentCells:
-    """Return one agent's results under one protocol, cells in order."""
-    found: AgentCells = defaultdict(dict)
-    for (*key, block), rows in table.groupby([*CELL_COLUMNS, "block"], sort=False):
-        blocks = found[ResultCell(*map(str, key))]
-        blocks[str(block)] = rows["return"].to_numpy().reshape(rows["task"].nunique(), -1)
-        blocks["overlaps"] = tuple(rows["overlap"].iloc[0].split())
-    for blocks in found.values():
-        blocks["gain"] = blocks["last"] - blocks["first"]
-    return {cell: found[cell] for cell in sorted(found, key=lambda cell: cell.order)}
+class _StoredCell(msgspec.Struct):
+    """The returns of an agent in a cell; the returns of a block are a list for each task."""
+
+    agent: str
+    protocol: str
+    layout: str
+    family: str
+    kind: str
+    overlaps: list[str]
+    mean: list[list[float]]
+    first: list[list[float]]
+    last: list[list[float]]
+    opening: list[list[float]]
+
+
+class _StoredFile(msgspec.Struct):
+    about: dict[str, str]
+    ablations: dict[str, dict[str, str]]
+    commits: dict[str, str]
+    cells: list[_StoredCell]
 
 
 def results_file() -> Path:
@@ -99,38 +109,27 @@ def read_stored(path: Path) -> StoredResults:
     """
     if not path.is_file():
         return StoredResults()
-    rows = []
     try:
-        content = parse_json(read_text(path))
-        for agent, protocols in content["agents"].items():
-            for protocol, layouts in protocols.items():
-                for layout, groups in layouts.items():
-                    for group, stored in groups.items():
-                        family, _, kind = group.removesuffix(")").partition(" (")
-                        cell = ResultCell(layout, family, kind or "test")
-                        blocks = {name: np.array(stored[name], np.float64) for name in BLOCKS}
-                        if any(values.ndim != 2 for values in blocks.values()):
-                            raise ValueError(f"{agent}, {group} on {layout}: expected a list for each task")
-                        rows += cell_rows((agent, protocol), cell, blocks, stored["overlaps"])
-        texts = [dict(content.get(name, {})) for name in ("ablations", "commits")]
-        return StoredResults(results_table(rows), dict(content["about"]), *texts)
-    except (IndexFormatError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise OptionError(f"{path}: not stored results: {error!r}; restore the file") from error
+        content = msgspec.json.decode(path.read_bytes(), type=_StoredFile)
+    except msgspec.DecodeError as error:
+        raise OptionError(f"{path}: not stored results: {error}; restore the file") from error
+    rows = []
+    for one in content.cells:
+        cell, blocks = ResultCell(one.layout, one.family, one.kind), {name: getattr(one, name) for name in BLOCKS}
+        rows += cell_rows((one.agent, one.protocol), cell, blocks, one.overlaps)
+    return StoredResults(results_table(rows), content.about, content.ablations, content.commits)
 
 
 def write_stored(path: Path, stored: StoredResults) -> None:
-    """Write stored results, rounded to three digits."""
-    agents: dict[str, Any] = defaultdict(dict)
+    """Write stored results, rounded to three digits; a line for each cell of an agent."""
+    cells = []
     for (agent, protocol), table in stored.table.groupby(AGENT_COLUMNS, sort=False):
-        layouts: dict[str, Any] = defaultdict(dict)
-        for cell, blocks in agent_cells(table).items():
-            numbers = {name: np.round(blocks[name], 3).tolist() for name in BLOCKS}
-            layouts[cell.layout][cell.group] = numbers | {"overlaps": blocks["overlaps"]}
-        agents[str(agent)][protocol] = layouts
-    content = {"about": stored.about, "ablations": stored.ablations, "commits": stored.commits, "agents": agents}
+        for cell, returns in returns_by_cell(table).items():
+            blocks = {name: np.round(getattr(returns, name), 3).tolist() for name in BLOCKS}
+            cells.append(_StoredCell(str(agent), str(protocol), *cell, list(returns.overlaps), **blocks))
+    text = msgspec.json.encode(_StoredFile(stored.about, stored.ablations, stored.commits, cells))
     with atomic_write(path) as partial:
-        text = json.dumps(content, separators=(",", ":"))
-        partial.write_text(text.replace('"mean"', '\n"mean"') + "\n", encoding="utf-8")
+        partial.write_bytes(text.replace(b'{"agent"', b'\n{"agent"') + b"\n")
 
 
 def add_results(stored: StoredResults, folder: Path, about: str) -> StoredResults:
@@ -194,23 +193,24 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
 def render_comparison(stored: StoredResults) -> str:
     """Return docs/results.md. Tables of single cells leave out agents that the present code does not make."""
     seeded, published = (stored.protocol(name) for name in ("seeded", "published"))
-    shown = [agent for agent in stored.about if agent not in stored.commits and not agent.endswith(FORGETS)]
-    texts = {
-        agent: f"{about} (made by commit {stored.commits[agent]})" if agent in stored.commits else about
-        for agent, about in stored.about.items()
+    current = [agent for agent in stored.about if agent not in stored.commits]
+    shown = [agent for agent in current if not agent.endswith(FORGETS)]
+    made = {agent: f" (made by commit {commit})" for agent, commit in stored.commits.items()}
+    played = in_order(cell for own in seeded.values() for cell in own)
+    validation = {kind: [cell for cell in played if cell.kind == kind] for kind in ("validation", "diverse")}
+    tracks = {
+        f"{prefix}{track}": cells_table(results, track_cells(protocol, track), shown, protocol=protocol)
+        for prefix, protocol, results in (("", "seeded", seeded), ("published_", "published", published))
+        for track in TRACKS
     }
     return fill_template(
         "results.md",
-        about="\n".join(f"* `{agent}`: {text}" for agent, text in texts.items()),
+        about="\n".join(f"* `{agent}`: {about}{made.get(agent, '')}" for agent, about in stored.about.items()),
         summary=summary_table(seeded, "seeded"),
-        teammate=cells_table(seeded, "seeded", "teammate", shown),
-        layout=cells_table(seeded, "seeded", "layout", shown),
-        published_teammate=cells_table(published, "published", "teammate", shown),
-        published_layout=cells_table(published, "published", "layout", shown),
         published_summary=summary_table(published, "published"),
-        gains=gains_table(seeded, "seeded", [agent for agent in stored.about if agent not in stored.commits]),
-        validation=validation_table(seeded, shown, "validation"),
-        diverse=validation_table(seeded, shown, "diverse"),
+        **tracks,
+        gains=cells_table(seeded, open_cells("seeded"), current, _gain_text),
+        **{kind: cells_table(seeded, cells, shown) for kind, cells in validation.items()},
         windows=ablation_table(stored, "ablate windows"),
         contexts=ablation_table(stored, "ablate contexts"),
         unseen=unseen_table(stored),
@@ -221,93 +221,80 @@ def render_comparison(stored: StoredResults) -> str:
     )
 
 
-def summary_table(results: Mapping[str, AgentCells], protocol: str) -> str:
+def track_cells(protocol: str, track: str) -> list[ResultCell]:
+    """Return the test cells of a track with headroom under a protocol."""
+    return [cell for cell in open_cells(protocol) if cell.layout in TRACKS[track]["test"]]
+
+
+def summary_table(results: Mapping[str, AgentReturns], protocol: str) -> str:
     """Return a table with a row for each agent: normalised return by track, cells that rise, seeds of a task.
 
     A normalised return is left out if the agent has not played all cells of the track that have headroom.
     """
-    headroom, chosen = cell_headroom(protocol), open_cells(protocol)
-    groups = {track: [cell for cell in chosen if cell.layout in TRACKS[track]["test"]] for track in TRACKS}
-    groups["both"] = chosen
+    headroom = cell_headroom(protocol)
+    groups = {**{track: track_cells(protocol, track) for track in TRACKS}, "both": open_cells(protocol)}
     body = []
     for agent, cells in results.items():
-        played = [cell for cell in chosen if cell in cells]
-        scores = {cell: normalise(cells[cell]["mean"], headroom[cell]) for cell in played}
-        rising = [cell for cell in played if mean_interval(cells[cell]["gain"]).low > 0]
+        played = {cell: cells[cell] for cell in groups["both"] if cell in cells}
+        scores = {cell: normalise(returns.mean, headroom[cell]) for cell, returns in played.items()}
+        rising = [returns for returns in played.values() if mean_interval(returns.gain).low > 0]
         rise = ""
         if played:
-            ends = [np.mean([cells[cell][block].mean() for cell in played]) for block in ("opening", "last")]
-            rise = _with_interval(*(cells[cell]["last"] - cells[cell]["opening"] for cell in played), sign="+")
-            rise = f"{ends[0]:z.1f} to {ends[1]:z.1f}, {rise}"
-        body.append(
-            [
-                f"`{agent}`" + _marks(*cells.values()),
-                *(
-                    _with_interval(*map(scores.__getitem__, of), digits=2) if set(of) <= scores.keys() else ""
-                    for of in groups.values()
-                ),
-                f"{len(rising)} of {len(played)}",
-                rise,
-                ", ".join(layouts_above_paper(cells)) or "none",
-                " or ".join(map(str, sorted({cells[cell]["mean"].shape[1] for cell in played}))),
-            ]
-        )
+            opening, last = (mean_of(getattr(of, name) for of in played.values()) for name in ("opening", "last"))
+            gain = mean_interval(*(returns.last - returns.opening for returns in played.values()))
+            rise = f"{opening:z.1f} to {last:z.1f}, {gain.text(sign='+')}"
+        texts = [
+            mean_interval(*map(scores.__getitem__, of)).text(2) if set(of) <= scores.keys() else ""
+            for of in groups.values()
+        ]
+        seeds = " or ".join(map(str, sorted({returns.mean.shape[1] for returns in played.values()})))
+        marks = overlap_marks({name for returns in cells.values() for name in returns.overlaps}).strip()
+        body.append([f"`{agent}`{marks}", *texts, f"{len(rising)} of {len(played)}", rise, seeds])
     scored = [f"{track} ({counted_noun(len(of), 'cell')})" for track, of in groups.items()]
-    header = ["agent", *scored, "rising", "first episode to last 20", "layouts above the paper's AD and DPT", "seeds"]
-    return markdown_table(header, body)
+    return markdown_table(["agent", *scored, "rising", "first episode to last 20", "seeds"], body)
 
 
-def layouts_above_paper(cells: AgentCells) -> list[str]:
-    """Return the layouts with headroom where an agent's mean over the families exceeds both published methods."""
-    above = []
-    for layout in dict.fromkeys(cell.layout for cell in open_cells("published")):
-        own = [cells[cell]["mean"].mean() for cell in cells if cell in [ResultCell(layout, one) for one in HEURISTICS]]
-        paper = [published_cells(name)[layout][AVERAGE][0] for name in PAPER_METHODS]
-        above += [layout] if len(own) == len(HEURISTICS) and np.mean(own) > max(paper) else []
-    return above
+def _mean_text(returns: CellReturns) -> str:
+    return f"{returns.mean.mean():z.1f}{overlap_marks(returns.overlaps).strip()}"
 
 
-def cells_table(results: Mapping[str, AgentCells], protocol: str, track: str, agents: Sequence[str]) -> str:
-    """Return a table with a row for each cell of a track with headroom, and a column for each agent that played one.
-
-    The columns of the paper's methods have its numbers, which are of protocol `published`.
-    """
-    chosen = [cell for cell in open_cells(protocol) if cell.layout in TRACKS[track]["test"]]
-    agents = [agent for agent in agents if any(cell in results.get(agent, {}) for cell in chosen)]
-    body = []
-    for cell, (layout, family, *own) in zip(chosen, _cell_rows(chosen, results, agents), strict=True):
-        stay, random, oracle = (f"{cell_headroom(protocol)[cell][name]:z.1f}" for name in ("stay", "random", "oracle"))
-        published = [f"{published_cells(name)[cell.layout][cell.family][0]:z.1f}" for name in PAPER_METHODS]
-        body.append([layout, family, stay, random, *published, *own, oracle])
-    paper = [f"{name} (paper)" for name in PAPER_METHODS]
-    header = ["layout", "family", "stay", "random", *paper, *(f"`{agent}`" for agent in agents), "oracle"]
-    return markdown_table(header, body, right=len(header) - 2)
+def _gain_text(returns: CellReturns) -> str:
+    gain = mean_interval(returns.gain)
+    text = f"{returns.first.mean():z.1f} to {returns.last.mean():z.1f}, {gain.text(sign='+')}"
+    text += overlap_marks(returns.overlaps).strip()
+    return f"**{text}**" if gain.low > 0 else text
 
 
-def validation_table(results: Mapping[str, AgentCells], agents: Sequence[str], kind: str) -> str:
-    """Return a table of mean returns with validation teammates, by which models are chosen.
+def cells_table(
+    results: Mapping[str, AgentReturns],
+    cells: Sequence[ResultCell],
+    agents: Sequence[str],
+    text: Callable[[CellReturns], str] = _mean_text,
+    protocol: str = "",
+) -> str:
+    """Return a table with a row for each cell, and a column for each agent that played one.
 
     Args:
         results: agent -> its results.
-        agents: the agents of the columns.
-        kind: "validation" for teammates of the published training ranges, or "diverse".
+        cells: the cells.
+        agents: the agents.
+        text: returns the text on an agent's results in a cell, by default their mean.
+        protocol: if given, there are also columns of the reference egos' returns under it, and of the paper's numbers,
+            which are of protocol `published`.
     """
-    found = {cell for agent in agents for cell in results.get(agent, {}) if cell.kind == kind}
-    body = _cell_rows(sorted(found, key=lambda cell: cell.order), results, agents)
-    return markdown_table(["layout", "family", *(f"`{agent}`" for agent in agents)], body, right=len(agents))
-
-
-def gains_table(results: Mapping[str, AgentCells], protocol: str, agents: Sequence[str]) -> str:
-    """Return a table of the first and the last episodes of each cell with headroom, and the interval of the gain."""
-
-    def text(found: Mapping[str, Any]) -> str:
-        gain, low, high = mean_interval(found["gain"])
-        ends = f"{found['first'].mean():z.1f} to {found['last'].mean():z.1f}"
-        shown = f"{ends}, {gain:+.1f} ({low:+.1f}, {high:+.1f}){_marks(found)}"
-        return f"**{shown}**" if low > 0 else shown
-
-    body = _cell_rows(open_cells(protocol), results, agents, text)
-    return markdown_table(["layout", "family", *(f"`{agent}`" for agent in agents)], body)
+    headroom = cell_headroom(protocol)
+    body = []
+    for cell in cells:
+        row = {"layout": cell.layout, "family": cell.family}
+        if protocol:
+            paper = {f"{name} (paper)": published_cells(name)[cell.layout][cell.family][0] for name in PAPER_METHODS}
+            egos = {name: headroom[cell][name] for name in ("stay", "random")}
+            row |= {name: f"{value:z.1f}" for name, value in (egos | paper).items()}
+        for agent in (agent for agent in agents if not results.get(agent, {}).keys().isdisjoint(cells)):
+            row[f"`{agent}`"] = text(results[agent][cell]) if cell in results[agent] else ""
+        body.append(row | ({"oracle": f"{headroom[cell]['oracle']:z.1f}"} if protocol else {}))
+    header = [*body[0]] if body else ["layout", "family"]
+    return markdown_table(header, [[*row.values()] for row in body], right=len(header) - 2)
 
 
 def ablation_table(stored: StoredResults, name: str) -> str:
@@ -320,10 +307,11 @@ def ablation_table(stored: StoredResults, name: str) -> str:
     first: np.ndarray | None = None
     for entry, about in stored.ablations.get(name, {}).items():
         cells = results[entry].values()
-        mean, gain = (np.concatenate([blocks[name] for blocks in cells]) for name in ("mean", "gain"))
-        difference = "" if first is None or mean.shape != first.shape else _with_interval(mean - first, sign="+")
+        mean, gain = np.concatenate([of.mean for of in cells]), np.concatenate([of.gain for of in cells])
+        known = first is not None and mean.shape == first.shape
+        difference = mean_interval(mean - first).text(sign="+") if known else ""
         first = mean if first is None else first
-        body.append([f"`{entry}`", about, _with_interval(mean), difference, _with_interval(gain, sign="+")])
+        body.append([f"`{entry}`", about, mean_interval(mean).text(), difference, mean_interval(gain).text(sign="+")])
     return markdown_table(["entry", "difference", "mean return", "to the first", "last 20 - first 20"], body)
 
 
@@ -333,21 +321,17 @@ def unseen_table(stored: StoredResults) -> str:
     Returns are means over versions and families; normalised ones (return - `stay`) / (`oracle` - `stay`), mean over
     layouts. Intervals are over the versions. Without `stay` and `oracle` there are no normalised ones.
     """
-    versions: dict[str, dict[str, np.ndarray]] = {}  # agent -> layout -> mean over families (versions,)
-    for agent, cells in stored.protocol(UNSEEN).items():
-        for layout in dict.fromkeys(cell.layout for cell in cells):
-            of_layout = [blocks["mean"].mean(axis=1) for cell, blocks in cells.items() if cell.layout == layout]
-            versions.setdefault(agent, {})[layout] = np.mean(of_layout, axis=0)
-    layouts = sorted({layout for own in versions.values() for layout in own})
-    stay, oracle = (versions.get(name, {}) for name in ("stay", "oracle"))
-    body = []
-    for agent, own in versions.items():
-        score = ""
-        if agent not in REFERENCES and all(layout in ego for ego in (stay, own, oracle) for layout in layouts):
-            scaled = [(own[one] - stay[one]) / (oracle[one].mean() - stay[one].mean()) for one in layouts]
-            score = _with_interval(*scaled, digits=2)
-        texts = [_with_interval(own[one][:, None]) if one in own else "" for one in layouts]
-        body.append([f"`{agent}`", *texts, score])
+    rows = stored.table[(stored.table["protocol"] == UNSEEN) & (stored.table["block"] == "mean")]
+    families = rows.groupby(["agent", "layout", "task"], sort=False)["return"].mean()
+    versions: Any = {key: of.to_numpy() for key, of in families.groupby(level=["agent", "layout"], sort=False)}
+    layouts, body = sorted(rows["layout"].unique()), []
+    for agent in rows["agent"].unique():
+        own, stay, oracle = ([versions.get((name, one)) for one in layouts] for name in (agent, "stay", "oracle"))
+        scored = agent not in REFERENCES and all(values is not None for values in (*own, *stay, *oracle))
+        texts = ["" if of is None else mean_interval(of).text() for of in own]
+        ends = zip(own, stay, oracle, strict=True) if scored else ()
+        scaled = [(values - low) / (high.mean() - low.mean()) for values, low, high in ends]
+        body.append([f"`{agent}`", *texts, mean_interval(*scaled).text(2) if scored else ""])
     return markdown_table(["agent", *layouts, "normalised"], body)
 
 
@@ -362,7 +346,7 @@ def plot_comparison(stored: StoredResults, protocol: str, path: Path) -> None:
     figure = new_figure(11, 4.2)
     axes, numbers, width = figure.subplots(), np.arange(len(chosen)), 0.8 / max(1, len(results))
     for number, (agent, cells) in enumerate(results.items()):
-        heights = [cells[cell]["mean"].mean() if cell in cells else np.nan for cell in chosen]
+        heights = [cells[cell].mean.mean() if cell in cells else np.nan for cell in chosen]
         axes.bar(numbers - 0.4 + (number + 0.5) * width, heights, width, label=agent)
     for name, style in (("oracle", "k_"), ("stay", "rx"), ("random", "g+")):
         axes.plot(numbers, [headroom[cell][name] for cell in chosen], style, markersize=9, label=name)
@@ -375,27 +359,3 @@ def plot_comparison(stored: StoredResults, protocol: str, path: Path) -> None:
     figure.legend(ncols=5, fontsize=8, loc="outside lower center", frameon=False)
     axes.set_title(f"Test tasks with headroom, protocol {protocol}; the paper's numbers are of published", fontsize=10)
     save_figure(figure, path)
-
-
-def _with_interval(*cells: np.ndarray, digits: int = 1, sign: str = "") -> str:
-    mean, low, high = (f"{value:{sign}z.{digits}f}" for value in mean_interval(*cells))
-    return f"{mean} ({low} to {high})"
-
-
-def _mean_text(found: Mapping[str, Any]) -> str:
-    return f"{found['mean'].mean():z.1f}{_marks(found)}"
-
-
-def _cell_rows(
-    cells: Iterable[ResultCell],
-    results: Mapping[str, AgentCells],
-    agents: Sequence[str],
-    text: Callable[[Mapping[str, Any]], str] = _mean_text,
-) -> list[list[str]]:
-    """Return rows with layout, family, and the text on each agent's results, empty if it has not played the cell."""
-    played = [results.get(agent, {}) for agent in agents]
-    return [[*cell[:2], *(text(own[cell]) if cell in own else "" for own in played)] for cell in cells]
-
-
-def _marks(*cells: Mapping[str, Any]) -> str:
-    return overlap_marks(name for blocks in cells for name in blocks["overlaps"]).strip()

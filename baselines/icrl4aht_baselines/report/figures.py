@@ -1,4 +1,4 @@
-"""Charts of the report's page as plain numbers, which the templates draw: bars of cells, and panels of curves.
+"""Charts of the report's page as plain numbers, which the template draws: bars of cells, and panels of curves.
 
 Positions are per cent of a chart's width and height, from its top left corner.
 """
@@ -6,17 +6,27 @@ Positions are per cent of a chart's width and height, from its top left corner.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from icrl4aht_baselines.plotting import smooth_returns
-from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, family_title
-from icrl4aht_baselines.report.scores import CellScore, cell_headroom, cell_scores, paper_scores
+from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, in_order
+from icrl4aht_baselines.report.scores import (
+    cell_headroom,
+    describe_conditions,
+    mean_of,
+    normalised_returns,
+    paper_scores,
+)
 from icrl4aht_baselines.report.statistics import mean_interval
+from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom
-from icrl4aht_data.plotting import return_limits
+from icrl4aht_data.plotting import MOST_PANELS, return_limits
 
 _SCORE_LIMITS = (-0.5, 1.5)  # a cell with little headroom can have a score far outside, which is clipped
 _TICKS = 5
@@ -24,6 +34,9 @@ _DRAWING = 1000  # units of a panel's width and height
 
 NumberedRuns = Mapping[int, EvaluationRun]
 """Number of a series, which has one colour on the whole page -> its run."""
+
+_CellValues = Mapping[int, Mapping[ResultCell, np.ndarray]]
+"""Number of a series -> cell -> values (U, S) of U instances and S seeds."""
 
 
 class Tick(NamedTuple):
@@ -42,40 +55,23 @@ class Bar(NamedTuple):
     interval: tuple[float, float] | None
     text: str
     tooltip: str
-    clipped: bool
 
 
 class Mark(NamedTuple):
-    """A marked position, such as the paper's number."""
+    """The normalised score of one of the paper's methods, and its position."""
 
     name: str
     left: float
-    tooltip: str
+    value: float
 
 
 class BarRow(NamedTuple):
     """The bars of all runs in one cell; `scale` has the returns at the ends of the scale, as text."""
 
     label: str
-    scale: str
     bars: list[Bar]
-    marks: list[Mark]
-
-
-class BarChart(NamedTuple):
-    """Bars of several cells on one scale.
-
-    Attributes:
-        ticks: labelled positions of the scale.
-        layouts: layout -> rows.
-        marks: names of what is marked, in order.
-        left_out: sentences on cells that are not drawn.
-    """
-
-    ticks: list[Tick]
-    layouts: dict[str, list[BarRow]]
-    marks: list[str]
-    left_out: list[str]
+    scale: str = ""
+    marks: Sequence[Mark] = ()
 
 
 class Curve(NamedTuple):
@@ -90,19 +86,26 @@ class Curve(NamedTuple):
     band: str = ""
 
 
-class Panel(NamedTuple):
-    """One panel of a figure."""
+class Chart(NamedTuple):
+    """A figure of the page: bars of cells, or panels of curves, on shared axes.
+
+    Attributes:
+        title, caption: texts above and below the figure.
+        series: number and label of each run in it, with marks for overlap of its training data with these tasks.
+        x_ticks, y_ticks: labelled positions of the axes; bars have no vertical axis.
+        bars: layout -> rows of bars.
+        panels: title of a panel -> curves.
+        marks: names of what is marked, in order.
+    """
 
     title: str
-    curves: list[Curve]
-
-
-class PanelFigure(NamedTuple):
-    """Panels with shared axes, which have labelled positions."""
-
-    panels: list[Panel]
+    caption: str
+    series: list[tuple[int, str]]
     x_ticks: list[Tick]
-    y_ticks: list[Tick]
+    y_ticks: Sequence[Tick] = ()
+    bars: Mapping[str, list[BarRow]] = MappingProxyType({})
+    panels: Mapping[str, list[Curve]] = MappingProxyType({})
+    marks: Sequence[str] = ()
 
 
 class _Scale(NamedTuple):
@@ -115,116 +118,166 @@ class _Scale(NamedTuple):
         """Return the position of a value, in per cent of the axis from its low end; ends for values beyond them."""
         return round(100 * (min(max(value, self.low), self.high) - self.low) / (self.high - self.low), 2)
 
-    def ticks(self, vertical: bool = False) -> list[Tick]:
-        """Return labelled positions at round numbers; from the top of a vertical axis."""
+    def ticks(self) -> list[Tick]:
+        """Return labelled positions at round numbers."""
         step = 10 ** math.floor(math.log10((self.high - self.low) / _TICKS))
         step = next(step * factor for factor in (1, 2, 5, 10) if (self.high - self.low) / (step * factor) <= _TICKS)
         numbers = range(math.ceil(self.low / step), math.floor(self.high / step) + 1)
-        found = [Tick(self.position(number * step), f"{number * step:g}") for number in numbers]
-        return [Tick(round(100 - position, 2), label) for position, label in found] if vertical else found
+        return [Tick(self.position(number * step), f"{number * step:g}") for number in numbers]
 
 
-def reported_series(runs: NumberedRuns) -> dict[int, EvaluationRun]:
-    """Return the runs whose scores are worth a bar: no reference egos unless there are no others."""
-    return {number: run for number, run in runs.items() if run.agent not in REFERENCES} or dict(runs)
+def bar_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
+    """Return bars of the normalised scores, and of the returns with tasks that have none.
 
-
-def score_bars(runs: NumberedRuns, protocol: str) -> BarChart | None:
-    """Return bars from `stay` to the agents' normalised scores, with the paper's where the protocol matches.
-
-    Returns:
-        Rows of the cells with headroom that a run played completely; None if there is none.
+    Reference egos have no bars with test tasks unless there are no other agents.
     """
-    scores = {
-        number: {cell: score for cell, score in cell_scores(run).items() if score.normalised is not None}
-        for number, run in runs.items()
-    }
-    played, cells = (dict.fromkeys(_in_order(found)) for found in (map(cell_scores, runs.values()), scores.values()))
+    agents = {number: run for number, run in runs.items() if run.agent not in REFERENCES} or runs
+    charts = _score_charts(agents, protocol)
+    for kind, about in TASK_KINDS.items():
+        shown = agents if kind == "test" else runs
+        values = {
+            number: {cell: found.mean for cell, found in run.returns.items() if cell.kind == kind}
+            for number, run in shown.items()
+        }
+        if any(values.values()) and not (kind == "test" and charts):
+            scale = _Scale(*return_limits(found.mean() for of_run in values.values() for found in of_run.values()))
+            charts.append(_bar_chart(f"Return in each cell, {kind} tasks", shown, values, scale, about))
+    return charts
+
+
+def _score_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
+    """Return a chart of bars from `stay` to the agents' normalised scores, with the paper's where they have any.
+
+    The bars are of the cells with headroom that a run played completely; there is no chart if there is none.
+    """
+    values, headroom = {number: normalised_returns(run) for number, run in runs.items()}, cell_headroom(protocol)
+    cells = in_order(cell for of_run in values.values() for cell in of_run)
     if not cells:
-        return None
+        return []
     stated = {
         cell: {name: at for run in runs.values() if cell in run.cells for name, at in paper_scores(run, cell).items()}
         for cell in cells
     }
-    drawn = [score.normalised for of_run in scores.values() for score in of_run.values()]
-    values = [float(found.mean()) for found in drawn if found is not None]
-    values += [value for of_cell in stated.values() for value in of_cell.values()]
-    scale = _Scale(max(_SCORE_LIMITS[0], min(-0.05, *values)), min(_SCORE_LIMITS[1], max(1.05, *values)))
-    headroom = cell_headroom(protocol)
-    layouts: dict[str, list[BarRow]] = {}
-    for cell in cells:
-        tips = {name: f"the paper's {name}: {value:z.2f}" for name, value in stated[cell].items()}
-        marks = [Mark(name, scale.position(value), tips[name]) for name, value in stated[cell].items()]
-        ends = f"{headroom[cell]['stay']:z.1f} to {headroom[cell]['oracle']:z.1f}"
-        row = BarRow(cell.family, ends, _bars(runs, scores, cell, scale), marks)
-        layouts.setdefault(cell.layout, []).append(row)
-    flat = [cell for cell in played if cell in headroom and not has_headroom(headroom[cell])]
-    partial = [cell for cell in played if cell in headroom and cell not in (*flat, *cells)]
-    reasons = {"The oracle earns no more than an ego that stays": flat, "Not all tasks were played": partial}
-    left_out = [f"{why}: {', '.join(f'{c.layout} {c.family}' for c in of)}." for why, of in reasons.items() if of]
-    names = dict.fromkeys(name for of_cell in stated.values() for name in of_cell)
-    ticks = [Tick(scale.position(0), "stay"), Tick(scale.position(1), "oracle")]
-    return BarChart(ticks, layouts, list(names), left_out)
-
-
-def return_bars(runs: NumberedRuns, kind: str) -> BarChart | None:
-    """Return bars from 0 to the mean returns, for the cells of one kind of tasks; None if there is none."""
-    scores = {
-        number: {cell: score._replace(normalised=None) for cell, score in cell_scores(run).items() if cell.kind == kind}
-        for number, run in runs.items()
+    ends = [float(found.mean()) for of_run in values.values() for found in of_run.values()]
+    ends += [value for of_cell in stated.values() for value in of_cell.values()]
+    scale = _Scale(max(_SCORE_LIMITS[0], min(-0.05, *ends)), min(_SCORE_LIMITS[1], max(1.05, *ends)))
+    played = in_order(cell for run in runs.values() for cell in run.cells)
+    others = [cell for cell in played if cell in headroom and cell not in cells]
+    flat = [cell for cell in others if not has_headroom(headroom[cell])]
+    reasons = {
+        "The oracle earns no more than an ego that stays": flat,
+        "Not all tasks were played": [cell for cell in others if cell not in flat],
     }
-    cells = _in_order(scores.values())
-    if not cells:
-        return None
-    scale = _Scale(*return_limits(float(score.means.mean()) for of_run in scores.values() for score in of_run.values()))
-    layouts: dict[str, list[BarRow]] = {}
+    about = (
+        "A bar runs from the return of an ego that stays to that of the agent, relative to the oracle, which knows "
+        "everything; next to a family are both egos' returns. *: beyond the chart.",
+        *(f"{why}: {', '.join(f'{cell.layout} {cell.family}' for cell in of)}." for why, of in reasons.items() if of),
+    )
+    rows = {
+        cell: {
+            "scale": f"{headroom[cell]['stay']:z.1f} to {headroom[cell]['oracle']:z.1f}",
+            "marks": [Mark(name, scale.position(value), value) for name, value in stated[cell].items()],
+        }
+        for cell in cells
+    }
+    chart = _bar_chart("Normalised score in each cell", runs, values, scale, " ".join(about), rows, digits=2)
+    names = list(dict.fromkeys(name for of_cell in stated.values() for name in of_cell))
+    return [chart._replace(x_ticks=[Tick(scale.position(0), "stay"), Tick(scale.position(1), "oracle")], marks=names)]
+
+
+def _bar_chart(
+    title: str,
+    runs: NumberedRuns,
+    values: _CellValues,
+    scale: _Scale,
+    about: str,
+    rows: Mapping[ResultCell, dict[str, Any]] = MappingProxyType({}),
+    digits: int = 1,
+) -> Chart:
+    """Return bars from 0 to the mean of the values in each cell; `rows` has further fields of the cells' rows."""
+    shown = {number: run for number, run in runs.items() if values[number]}
+    bars: dict[str, list[BarRow]] = defaultdict(list)
+    cells = in_order(cell for of_run in values.values() for cell in of_run)
     for cell in cells:
-        row = BarRow(family_title(cell.family), "", _bars(runs, scores, cell, scale), [])
-        layouts.setdefault(cell.layout, []).append(row)
-    return BarChart(scale.ticks(), layouts, [], [])
+        of_cell = {number: values[number][cell] for number in shown if cell in values[number]}
+        drawn = [_bar(number, shown[number], cell, found, scale, digits) for number, found in of_cell.items()]
+        bars[cell.layout].append(BarRow(family_title(cell.family), drawn, **rows.get(cell, {})))
+    several = any(bar.interval for rows in bars.values() for row in rows for bar in row.bars)
+    lines = ["Lines: 95 % intervals over the instances."] * several
+    caption = " ".join([describe_conditions(shown.values(), cells), *lines, about]).rstrip()
+    return Chart(title, caption, _series(shown, cells), scale.ticks(), bars=bars)
 
 
-def _in_order(scores: Iterable[Iterable[ResultCell]]) -> list[ResultCell]:
-    return sorted({cell for of_run in scores for cell in of_run}, key=lambda cell: cell.order)
+def _bar(number: int, run: EvaluationRun, cell: ResultCell, values: np.ndarray, scale: _Scale, digits: int) -> Bar:
+    found, returns = mean_interval(values), run.returns[cell]
+    zero, end = scale.position(0), scale.position(found.mean)
+    clipped = "" if scale.low <= found.mean <= scale.high else "*"
+    text = f"{found.mean:z.{digits}f}{clipped}{overlap_marks(returns.overlaps).strip()}"
+    tooltip = f"{run.label}: {found.text(digits)}, return {mean_of([returns.mean]):z.1f}"
+    interval = (scale.position(found.low), scale.position(found.high)) if found.range() else None
+    return Bar(number, min(zero, end), abs(end - zero), interval, text, tooltip)
 
 
-def _bars(runs: NumberedRuns, scores: Mapping[int, Any], cell: ResultCell, scale: _Scale) -> list[Bar]:
-    return [_bar(number, run, scores[number][cell], scale) for number, run in runs.items() if cell in scores[number]]
+def _series(runs: NumberedRuns, cells: Sequence[ResultCell]) -> list[tuple[int, str]]:
+    return [
+        (number, run.label + overlap_marks(run.overlaps(cell for cell in cells if cell in run.cells)))
+        for number, run in runs.items()
+    ]
 
 
-def _bar(number: int, run: EvaluationRun, score: CellScore, scale: _Scale) -> Bar:
-    """Return the bar of a run in a cell, of its normalised score if it has one, otherwise of its return."""
-    values, digits = (score.means, 1) if score.normalised is None else (score.normalised, 2)
-    value, low, high = mean_interval(values)
-    text = f"{value:z.{digits}f}"
-    tooltip = f"{run.label}: {text}"
-    if len(values) > 1:
-        tooltip += f" (95 % interval {low:z.{digits}f} to {high:z.{digits}f})"
-    if score.normalised is not None and score.references:
-        egos = ", ".join(f"{name} {score.references[name]:z.1f}" for name in ("stay", "oracle"))
-        tooltip += f"; return {score.means.mean():z.1f}, {egos}"
-    zero, end = scale.position(0), scale.position(value)
-    interval = (scale.position(low), scale.position(high)) if len(values) > 1 else None
-    return Bar(number, min(zero, end), abs(end - zero), interval, text, tooltip, not scale.low <= value <= scale.high)
+def split_cells(cells: Iterable[ResultCell], most: int = MOST_PANELS) -> list[list[ResultCell]]:
+    """Return cells in lists of at most `most`, such as for pictures.
+
+    A list has one kind of tasks, and all cells of a layout unless these are more than `most`.
+    """
+    split: list[list[ResultCell]] = []
+    ordered = sorted(cells, key=lambda cell: (cell.order[-1], cell.order))
+    for (kind, _), group in groupby(ordered, key=lambda cell: (cell.kind, cell.layout)):
+        of_layout = list(group)
+        if split and split[-1][0].kind == kind and len(split[-1]) + len(of_layout) <= most:
+            split[-1] += of_layout
+        else:
+            split += [of_layout[start : start + most] for start in range(0, len(of_layout), most)]
+    return split
 
 
-def curve_figure(runs: NumberedRuns, cells: Sequence[ResultCell]) -> PanelFigure:
-    """Return a panel per cell with each run's return per episode, on shared axes.
+def curve_charts(runs: NumberedRuns) -> list[Chart]:
+    """Return charts with a panel per cell and each run's return per episode, of at most `MOST_PANELS` panels.
 
     Lines are running means of the mean over a cell's instances; bands are the range of the instances' running means.
     """
+    charts = []
+    parts = split_cells({cell for run in runs.values() for cell in run.cells})
+    kinds = [cells[0].kind for cells in parts]
+    for cells in parts:
+        title = f"{cells[0].kind.capitalize()} tasks"
+        if kinds.count(cells[0].kind) > 1:
+            title += f" on {', '.join(dict.fromkeys(cell.layout for cell in cells))}"
+        shown = {number: run for number, run in runs.items() if not run.cells.keys().isdisjoint(cells)}
+        charts.append(_curve_chart(title, shown, cells))
+    return charts
+
+
+def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) -> Chart:
     raw = {(number, cell): run.cells[cell] for number, run in runs.items() for cell in cells if cell in run.cells}
     smooth = {key: np.stack([smooth_returns(returns) for returns in of_cell]) for key, of_cell in raw.items()}
     drawn = [*smooth.values(), *(of_cell.mean(axis=0) for of_cell in raw.values())]
     y = _Scale(*return_limits(float(value) for found in drawn for value in found.flat))
     episodes = max(returns.shape[1] for returns in raw.values())
     x = _Scale(1, max(2, episodes))
-    panels = []
-    for cell in cells:
-        keys = [(number, cell) for number in runs if (number, cell) in raw]
-        panels.append(Panel(cell.title, [_curve(key[0], smooth[key], raw[key].mean(axis=0), x, y) for key in keys]))
-    ticks = [Tick(x.position(number), str(number)) for number in dict.fromkeys((1, (episodes + 1) // 2, episodes))]
-    return PanelFigure(panels, ticks, y.ticks(vertical=True))
+    panels = {
+        cell.title: [
+            _curve(number, smooth[number, cell], raw[number, cell].mean(axis=0), x, y)
+            for number in runs
+            if (number, cell) in raw
+        ]
+        for cell in cells
+    }
+    x_ticks = [Tick(x.position(number), str(number)) for number in dict.fromkeys((1, (episodes + 1) // 2, episodes))]
+    y_ticks = [Tick(round(100 - tick.position, 2), tick.label) for tick in y.ticks()]
+    return Chart(
+        title, describe_conditions(runs.values(), cells), _series(runs, cells), x_ticks, y_ticks, panels=panels
+    )
 
 
 def _curve(number: int, smooth: np.ndarray, raw: np.ndarray, x: _Scale, y: _Scale) -> Curve:

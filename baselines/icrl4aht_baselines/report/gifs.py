@@ -15,7 +15,7 @@ from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent
 from icrl4aht_baselines.evaluate.evaluator import play_tasks
 from icrl4aht_baselines.evaluate.protocols import Protocol
 from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, ResultSource
-from icrl4aht_baselines.report.scores import cell_scores
+from icrl4aht_baselines.report.scores import open_cells
 from icrl4aht_baselines.training.seen import describe_overlap
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
@@ -105,36 +105,22 @@ def family_gifs(
         The episodes of each run in turn, families in the paper's order. If an agent cannot be restored, the caption
         says why.
     """
-    chosen = []
+    chosen: list[tuple[EvaluationRun, ResultCell]] = []
     for run in runs:
-        scores = cell_scores(run)
-        for group in dict.fromkeys(cell[1:] for cell in sorted(run.cells, key=lambda cell: cell.order[1:])):
-            cells = [cell for cell in run.cells if cell[1:] == group]
-            chosen.append((run, next((cell for cell in cells if scores[cell].has_headroom), cells[0])))
-    sources = {source.folder: source for source in (run.source(cell) for run, cell in chosen)}
-    egos: dict[str, JaxEgoMaker | Icrl4ahtError] = {}
-    for name, source in sources.items():
-        try:
-            egos[name] = restore_ego(source)
-        except Icrl4ahtError as error:
-            egos[name] = error
-
-    def draw(number: int) -> EpisodePair:
-        run, cell = chosen[number]
-        return _draw_result(run, cell, egos[run.source(cell).folder], folder / str(number), suite)
-
+        scored, first = open_cells(run.protocol), {}
+        for cell in sorted(run.cells, key=lambda cell: (cell.order[1:], cell not in scored)):
+            first.setdefault(cell[1:], cell)
+        chosen += [(run, cell) for cell in first.values()]
     progress(_PROGRESS, 0, len(chosen))
     with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes longer than playing
-        drawn = [pool.submit(draw, number) for number in range(len(chosen))]
+        drawn = [pool.submit(_draw_result, *each, folder / str(number), suite) for number, each in enumerate(chosen)]
         for done, future in enumerate(as_completed(drawn), start=1):
             future.result()
             progress(_PROGRESS, done, len(chosen))
     return [future.result() for future in drawn]
 
 
-def _draw_result(
-    run: EvaluationRun, cell: ResultCell, ego: JaxEgoMaker | Icrl4ahtError, prefix: Path, suite: Path | None
-) -> EpisodePair:
+def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path | None) -> EpisodePair:
     source, task = run.source(cell), run.tasks(cell)[0]
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
     # A number without a kind of tasks names a published teammate.
@@ -142,10 +128,8 @@ def _draw_result(
     title = f"{run.label} with {cell.family}/t{task.teammate['theta_id']}{kind} on {cell.layout}"
     origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {describe_overlap(run.overlaps([cell]))}"
     try:
-        if isinstance(ego, Icrl4ahtError):
-            raise ego
         paths = {number: prefix.with_name(f"{prefix.name}-{number}.gif") for number in (1, protocol.episodes)}
-        shown = save_episodes(paths, task, ego, protocol, seed=seed, cell=24, suite=suite)
+        shown = save_episodes(paths, task, restore_ego(source), protocol, seed=seed, cell=24, suite=suite)
         return EpisodePair(cell, title, origin, shown)
     except Icrl4ahtError as error:
         return EpisodePair(cell, title, f"No picture: {error}. {origin}")

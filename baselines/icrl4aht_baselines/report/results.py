@@ -1,4 +1,4 @@
-"""Results of evaluation as one table, and the stored results of reference models (`cards/results.json`).
+"""Results of evaluation as one table.
 
 A table of results is a data frame with a row for each task, seed and block of episodes:
 
@@ -9,6 +9,8 @@ A table of results is a data frame with a row for each task, seed and block of e
     overlap                                 overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
 
 Tasks of different kinds never share a cell, since the paper's numbers and the headroom are of published test tasks.
+
+Shapes: U tasks of a cell, S seeds.
 """
 
 from __future__ import annotations
@@ -17,7 +19,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -103,6 +104,35 @@ class ResultCell(NamedTuple):
         return layout_order(self.layout), family_order(self.family), list(TASK_KINDS).index(self.kind)
 
 
+class CellReturns(NamedTuple):
+    """Returns of an agent in one cell, float64 (U, S).
+
+    Attributes:
+        mean, first, last, opening: mean return in the episodes of a block, see the module's docstring.
+        overlaps: kinds of overlap of the tasks with the training data.
+    """
+
+    mean: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    opening: np.ndarray
+    overlaps: tuple[str, ...] = ()
+
+    @property
+    def gain(self) -> np.ndarray:
+        """Returns of the last minus those of the first episodes (paper, App. F)."""
+        return self.last - self.first
+
+
+def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
+    """Return the returns of one agent under one protocol, cells in the paper's order."""
+    found: dict[ResultCell, dict[str, Any]] = defaultdict(dict)
+    for (*key, block), rows in table.groupby([*CELL_COLUMNS, "block"], sort=False):
+        values = rows["return"].to_numpy().reshape(rows["task"].nunique(), -1)
+        found[ResultCell(*map(str, key))] |= {str(block): values, "overlaps": tuple(rows["overlap"].iloc[0].split())}
+    return {cell: CellReturns(**found[cell]) for cell in in_order(found)}
+
+
 class ResultSource(NamedTuple):
     """Origin of results.
 
@@ -175,21 +205,21 @@ class EvaluationRun:
 
     def overlaps(self, cells: Iterable[ResultCell]) -> tuple[str, ...]:
         """Return the kinds of overlap between training data and the tasks of some cells, see `seen.OVERLAPS`."""
-        found = {name for cell in cells for name in find_overlaps(self.tasks(cell), self.source(cell).seen)}
+        found = {name for cell in cells for name in self.returns[cell].overlaps}
         return tuple(name for name in OVERLAPS if name in found)
 
-    def is_comparable(self, cell: ResultCell) -> bool:
-        """Return whether episodes have the benchmark's length, and all published tasks of a test cell were played."""
-        return self.is_complete(cell) and self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
+    @cached_property
+    def returns(self) -> dict[ResultCell, CellReturns]:
+        """The returns in each cell."""
+        return returns_by_cell(self.table)
 
     def is_complete(self, cell: ResultCell) -> bool:
         """Return whether all published test tasks of a cell were played, and no others."""
         return len(self.tasks(cell)) == published_instances(cell)
 
-    def is_like_the_papers(self, cell: ResultCell) -> bool:
-        """Return whether the paper's numbers of a cell are of the same tasks, protocol and episode length."""
-        usual = self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
-        return self.protocol == PUBLISHED_PROTOCOL and bool(published_instances(cell)) and usual
+    def is_comparable(self, cell: ResultCell) -> bool:
+        """Return whether a cell has published test tasks, and its episodes have the benchmark's length."""
+        return cell.kind == "test" and self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
 
     @cached_property
     def label(self) -> str:
@@ -324,21 +354,17 @@ def as_run(
         task = known[result.task_id]
         played[cell_of(task)].append((task, result.returns))
     seen = _find_seen(settings, trained, where)
-    agent, protocol = settings["agent"], settings["protocol"]["name"]
-    sources = []
-    for track, of_track in seen.items():
-        own = {cell: tuple(task for task, _ in found) for cell, found in played.items()}
-        own = {cell: played_tasks for cell, played_tasks in own.items() if track in ("", track_of(cell.layout))}
-        sources += [ResultSource(where, settings, trained, own, of_track)] if own else []
-    variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
-    run = EvaluationRun(agent, protocol, pd.DataFrame(), {}, variant, sources=tuple(sources))
-    rows, cells = [], {}
-    for cell in sorted(played, key=lambda cell: cell.order):
+    agent, seeds = (settings["agent"], settings["protocol"]["name"]), settings["seeds"]
+    rows, cells, tracks = [], {}, defaultdict(dict)
+    for cell in in_order(played):
+        of_cell, track = tuple(task for task, _ in played[cell]), "" if "" in seen else track_of(cell.layout)
         returns = np.array([of_task for _, of_task in played[cell]], np.float64)  # (tasks, seeds, episodes)
-        cells[cell] = returns.mean(axis=1)
-        names, blocks = [task.task_id for task, _ in played[cell]], episode_blocks(returns)
-        rows += cell_rows((agent, protocol), cell, blocks, run.overlaps([cell]), names, settings["seeds"])
-    return replace(run, table=results_table(rows), cells=cells)
+        cells[cell], tracks[track][cell] = returns.mean(axis=1), of_cell
+        overlaps, names = find_overlaps(of_cell, seen[track]), [task.task_id for task in of_cell]
+        rows += cell_rows(agent, cell, episode_blocks(returns), overlaps, names, seeds)
+    sources = tuple(ResultSource(where, settings, trained, own, seen[track]) for track, own in tracks.items())
+    variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
+    return EvaluationRun(*agent, results_table(rows), cells, variant, sources=sources)
 
 
 def _find_seen(
@@ -375,7 +401,8 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
             merged.append(replace(run, note=run.sources[0].folder) if same else run)
             continue
         other = fitting[0]
-        cells = dict(sorted((other.cells | run.cells).items(), key=lambda found: found[0].order))
+        both = other.cells | run.cells
+        cells = {cell: both[cell] for cell in in_order(both)}
         table, sources = pd.concat([other.table, run.table], ignore_index=True), other.sources + run.sources
         merged[merged.index(other)] = replace(other, table=table, cells=cells, sources=sources)
     return merged
@@ -409,6 +436,11 @@ def cell_of(task: Task) -> ResultCell:
     return ResultCell(task.layout.name, task.teammate_family, kind)
 
 
+def in_order(cells: Iterable[ResultCell]) -> list[ResultCell]:
+    """Return cells in the paper's order, each once."""
+    return sorted(set(cells), key=lambda cell: cell.order)
+
+
 def instances_range(numbers: Iterable[int]) -> str:
     """Return numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
     found = sorted(set(numbers))
@@ -418,22 +450,6 @@ def instances_range(numbers: Iterable[int]) -> str:
 def family_title(family: str) -> str:
     """Return a family of teammates as people read it."""
     return "learned" if family == "rl" else family
-
-
-def split_cells(cells: Iterable[ResultCell], most: int) -> list[list[ResultCell]]:
-    """Return cells in lists of at most `most`, such as for pictures.
-
-    A list has one kind of tasks, and all cells of a layout unless these are more than `most`.
-    """
-    split: list[list[ResultCell]] = []
-    ordered = sorted(cells, key=lambda cell: (cell.order[-1], cell.order))
-    for (kind, _), group in groupby(ordered, key=lambda cell: (cell.kind, cell.layout)):
-        of_layout = list(group)
-        if split and split[-1][0].kind == kind and len(split[-1]) + len(of_layout) <= most:
-            split[-1] += of_layout
-        else:
-            split += [of_layout[start : start + most] for start in range(0, len(of_layout), most)]
-    return split
 
 
 @cache

@@ -3,7 +3,7 @@
 The score of a single cell is the mean over its instances, that of several cells the mean over the cells. A normalised
 score is (return - stay) / (oracle - stay), of cells with headroom that were played completely.
 
-Shapes: U instances of a cell.
+Shapes: U instances of a cell, S seeds.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from icrl4aht_baselines.report.results import (
-    CELL_COLUMNS,
     PUBLISHED_PROTOCOL,
     TASK_KINDS,
     EvaluationRun,
     ResultCell,
     end_episodes,
+    in_order,
     instances_range,
     published_cells,
     published_instances,
     read_published,
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
-from icrl4aht_baselines.training.seen import describe_overlap, overlap_marks
+from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, TRACKS, family_order
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_headroom
 from icrl4aht_data.utils.text import counted_noun
@@ -46,61 +46,6 @@ Published = tuple[float, float | None]
 """A published mean and its standard deviation, which the paper does not always state."""
 
 
-class CellScore(NamedTuple):
-    """Score of a run in one cell.
-
-    Attributes:
-        means: mean return of each instance, float64 (U,), over seeds and episodes.
-        first, last: mean return of each instance in its first and last episodes, see `results.BLOCKS`.
-        references: reference ego -> its mean return in the cell; None where it was not measured.
-        normalised: normalised score of each instance; None without headroom or if the cell was not played completely.
-        published: the paper's mean and std of the agent in this cell; None if it has none of these conditions.
-        overlaps: names of the overlaps with the training data.
-    """
-
-    means: np.ndarray
-    first: np.ndarray
-    last: np.ndarray
-    references: Mapping[str, float] | None
-    normalised: np.ndarray | None
-    published: Published | None
-    overlaps: tuple[str, ...]
-
-    @property
-    def gain(self) -> float:
-        """Mean return of the last episodes minus that of the first (paper, App. F)."""
-        return float((self.last - self.first).mean())
-
-    @property
-    def has_headroom(self) -> bool | None:
-        """Whether the cell has headroom; None where it was not measured."""
-        return None if self.references is None else has_headroom(self.references)
-
-
-@lru_cache(maxsize=256)
-def cell_scores(run: EvaluationRun) -> dict[ResultCell, CellScore]:
-    """Return the scores of a run in its cells, in their order."""
-    # Means over the seeds, a row for each task and a column for each block.
-    table = run.table.pivot_table(index=[*CELL_COLUMNS, "task"], columns="block", values="return", sort=False)
-    by_cell = {ResultCell(*map(str, key)): rows for key, rows in table.groupby(level=CELL_COLUMNS, sort=False)}
-    headroom, stated = cell_headroom(run.protocol), {} if run.variant else published_cells(run.agent)
-    found = {}
-    for cell in run.cells:
-        means, first, last = (by_cell[cell][name].to_numpy() for name in ("mean", "first", "last"))
-        references = headroom.get(cell)
-        scored = references if references and has_headroom(references) and run.is_comparable(cell) else None
-        found[cell] = CellScore(
-            means,
-            first,
-            last,
-            references,
-            normalise(means, scored) if scored else None,
-            stated.get(cell.layout, {}).get(cell.family) if run.is_like_the_papers(cell) else None,
-            run.overlaps([cell]),
-        )
-    return found
-
-
 def cell_headroom(protocol: str) -> dict[ResultCell, dict[str, float]]:
     """Return test cell -> reference ego -> mean return; empty if none was measured under this protocol."""
     return {ResultCell(*cell): references for cell, references in read_headroom(protocol).items()}
@@ -109,12 +54,42 @@ def cell_headroom(protocol: str) -> dict[ResultCell, dict[str, float]]:
 def open_cells(protocol: str) -> list[ResultCell]:
     """Return the test cells with headroom under a protocol, in the paper's order."""
     measured = cell_headroom(protocol)
-    return sorted((cell for cell in measured if has_headroom(measured[cell])), key=lambda cell: cell.order)
+    return in_order(cell for cell in measured if has_headroom(measured[cell]))
 
 
 def normalise(returns: Returns, references: Mapping[str, float]) -> Returns:
     """Return (return - stay) / (oracle - stay), for returns in a cell with headroom."""
     return (returns - references["stay"]) / (references["oracle"] - references["stay"])
+
+
+@lru_cache(maxsize=256)
+def normalised_returns(run: EvaluationRun) -> dict[ResultCell, np.ndarray]:
+    """Return the normalised returns (U, S) in the cells with headroom that a run played completely."""
+    headroom = cell_headroom(run.protocol)
+    scored = [cell for cell in open_cells(run.protocol) if cell in run.cells]
+    scored = [cell for cell in scored if run.is_complete(cell) and run.is_comparable(cell)]
+    return {cell: normalise(run.returns[cell].mean, headroom[cell]) for cell in scored}
+
+
+def _is_like_the_papers(run: EvaluationRun, cell: ResultCell) -> bool:
+    return run.variant is None and run.protocol == PUBLISHED_PROTOCOL and run.is_comparable(cell)
+
+
+def paper_methods(run: EvaluationRun) -> tuple[str, ...]:
+    """Return the run's own method if the paper has results of it, or else AD and DPT."""
+    return (run.agent,) if published_cells(run.agent) else PAPER_METHODS
+
+
+def paper_scores(run: EvaluationRun, cell: ResultCell) -> dict[str, float]:
+    """Return the normalised scores of published methods in a cell with headroom.
+
+    Empty if the results are not of the paper's protocol, tasks and episode length, or of a sweep.
+    """
+    if not _is_like_the_papers(run, cell):
+        return {}
+    stated = {name: published_cells(name).get(cell.layout, {}).get(cell.family) for name in paper_methods(run)}
+    references = cell_headroom(run.protocol)[cell]
+    return {name: normalise(found[0], references) for name, found in stated.items() if found}
 
 
 def rows(run: EvaluationRun) -> list[dict[str, Any]]:
@@ -125,31 +100,32 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
     headroom, the normalised score (None for cells without headroom and incomplete cells), and `overlap`: the ways in
     which training data and tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
     """
-    found = []
-    for cell, score in cell_scores(run).items():
-        source, several = run.source(cell), len(score.means) > 1
-        interval, published = mean_interval(score.means), score.published or (None, None)
+    headroom, normalised, found = cell_headroom(run.protocol), normalised_returns(run), []
+    for cell, returns in run.returns.items():
+        source, interval, several = run.source(cell), mean_interval(returns.mean), len(returns.mean) > 1
+        published = published_cells(run.agent if _is_like_the_papers(run, cell) else "").get(cell.layout, {})
+        paper = published.get(cell.family, (None, None))
         found.append(
             {
                 "agent": run.agent,
                 "protocol": run.protocol,
                 "layout": cell.layout,
                 "family": cell.family,
-                "instances": len(score.means),
+                "instances": len(returns.mean),
                 "episodes": run.cells[cell].shape[1],
                 "mean": interval.mean,
-                "std": float(score.means.std()) if several else None,
+                "std": float(returns.mean.mean(axis=1).std()) if several else None,
                 "low": interval.low if several else None,
                 "high": interval.high if several else None,
-                "published_mean": published[0],
-                "published_std": published[1],
-                "gain": score.gain,
-                "headroom": score.has_headroom,
-                "normalised": None if score.normalised is None else float(score.normalised.mean()),
+                "published_mean": paper[0],
+                "published_std": paper[1],
+                "gain": float(returns.gain.mean()),
+                "headroom": has_headroom(headroom[cell]) if cell in headroom else None,
+                "normalised": float(normalised[cell].mean()) if cell in normalised else None,
                 "tasks": cell.kind,
                 "seeds": len(source.settings["seeds"]),
                 "steps": source.settings["protocol"]["steps"],
-                "overlap": " ".join(score.overlaps),
+                "overlap": " ".join(returns.overlaps),
                 "acting": source.detail("acting"),
                 "encoder": source.detail("encoder"),
                 "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
@@ -165,224 +141,140 @@ class Headline(NamedTuple):
     is none. Intervals are bootstraps over the instances within each cell.
 
     Attributes:
-        run: the results.
-        kind: kind of the tasks, one of `TASK_KINDS`.
-        cells: the cells of the means.
-        played: number of cells of this kind that were played.
+        label: the run's label with marks for overlap of its training data with these tasks.
+        protocol: name of the protocol.
+        tasks: the cells of the means in words, such as "12 test cells with headroom, of 16 played".
         score: normalised score; None without a cell with headroom.
         mean: return of an episode.
         gain: return of the last minus that of the first episodes; None for one episode.
-        ends: return of the first and of the last of these episodes.
+        change: returns of both in words, such as "18.7 in the first, 17.4 in the last 20 episodes".
         paper: published method -> its normalised score in the same cells; empty unless the results are of the paper's
             protocol.
+        why_no_score: reason for a missing score, as a sentence; empty if there is a score.
+        overlaps: kinds of overlap of the training data with these tasks.
     """
 
-    run: EvaluationRun
-    kind: str
-    cells: tuple[ResultCell, ...]
-    played: int
+    label: str
+    protocol: str
+    tasks: str
     score: MeanInterval | None
     mean: MeanInterval
     gain: MeanInterval | None
-    ends: tuple[float, float]
+    change: str
     paper: dict[str, float]
-
-    @property
-    def label(self) -> str:
-        """The run's label with marks for overlap of its training data with these tasks."""
-        return self.run.label + overlap_marks(self.run.overlaps(self.cells))
-
-    @property
-    def tasks(self) -> str:
-        """The cells of the means in words, such as "12 test cells with headroom, of 16 played"."""
-        counted = counted_noun(len(self.cells), f"{self.kind} cell")
-        return counted if self.score is None else f"{counted} with headroom, of {self.played} played"
-
-    @property
-    def has_interval(self) -> bool:
-        """Whether a cell has several instances, without which there is no interval."""
-        return any(len(self.run.cells[cell]) > 1 for cell in self.cells)
-
-    @property
-    def change(self) -> str:
-        """Returns at both ends of a task in words, such as "18.7 in the first, 17.4 in the last 20 episodes"."""
-        count = min(end_episodes(self.run.cells[cell].shape[1]) for cell in self.cells)
-        episodes = f"{count} episodes" if count > 1 else "episode"
-        return f"{self.ends[0]:z.1f} in the first, {self.ends[1]:z.1f} in the last {episodes}"
-
-    @property
-    def why_no_score(self) -> str:
-        """Reason for a missing score, as a sentence; empty if there is a score."""
-        if self.score is not None:
-            return ""
-        if self.kind != "test":
-            return f"No score: reference returns exist for test tasks only, and these are {self.kind} tasks."
-        if any(self.run.is_comparable(cell) for cell in self.cells):
-            return "No score: no cell that was played completely has headroom."
-        return f"No score: it needs all published tasks of a cell, in episodes of {KEPT_STEPS} steps."
+    why_no_score: str
+    overlaps: tuple[str, ...]
 
     @property
     def text(self) -> str:
         """The summary as sentences for the console and Markdown."""
-
-        def interval(found: MeanInterval, digits: int) -> str:
-            return f" ({found.low:z.{digits}f} to {found.high:z.{digits}f})" if self.has_interval else ""
-
-        parts = [f"normalised score {self.score.mean:z.2f}{interval(self.score, 2)}"] if self.score else []
-        parts.append(f"return {self.mean.mean:z.1f}{interval(self.mean, 1)}")
-        if self.gain is not None:
-            parts.append(f"gain {self.gain.mean:+z.1f}{interval(self.gain, 1)}: {self.change}")
-        text = f"{self.label} ({self.run.protocol}), {self.tasks}: {'; '.join(parts)}."
-        text += " Parentheses: 95 % intervals." if self.has_interval else ""
-        if self.paper:
-            stated = ", ".join(f"{name} {value:z.2f}" for name, value in self.paper.items())
-            text += f" The paper's normalised score in these cells: {stated}."
+        parts = [f"normalised score {self.score.text(2)}"] if self.score else []
+        parts.append(f"return {self.mean.text()}")
+        parts += [f"gain {self.gain.text(sign='+')}: {self.change}"] if self.gain else []
+        text = f"{self.label} ({self.protocol}), {self.tasks}: {'; '.join(parts)}."
+        text += " Parentheses: 95 % intervals." if self.mean.range() else ""
+        stated = ", ".join(f"{name} {value:z.2f}" for name, value in self.paper.items())
+        text += f" The paper's normalised score in these cells: {stated}." if stated else ""
         return f"{text} {self.why_no_score}".rstrip()
 
 
 def find_headlines(run: EvaluationRun) -> list[Headline]:
     """Return a run's summaries, one for each kind of tasks that was played, test tasks first."""
-    scores, found = cell_scores(run), []
+    normalised, found = normalised_returns(run), []
     for kind in TASK_KINDS:
-        played = [cell for cell in scores if cell.kind == kind]
-        scored = [cell for cell in played if scores[cell].normalised is not None]
-        cells = [scores[cell] for cell in scored or played]
-        if not cells:
+        played = [cell for cell in run.returns if cell.kind == kind]
+        scored = [cell for cell in played if cell in normalised]
+        if not played:
             continue
-        normalised = [score.normalised for score in cells if score.normalised is not None]
-        several = all(run.cells[cell].shape[1] > 1 for cell in scored or played)
-        of_cells = [paper_scores(run, cell) for cell in scored]
-        stated = [name for name in paper_methods(run) if of_cells and all(name in of_cell for of_cell in of_cells)]
-        headline = Headline(
-            run,
-            kind,
-            tuple(scored or played),
-            len(played),
-            mean_interval(*normalised) if scored else None,
-            mean_interval(*(score.means for score in cells)),
-            mean_interval(*(score.last - score.first for score in cells)) if several else None,
-            (float(np.mean([score.first.mean() for score in cells])), float(np.mean([s.last.mean() for s in cells]))),
-            {name: float(np.mean([of_cell[name] for of_cell in of_cells])) for name in stated},
+        cells = scored or played
+        returns, episodes = [run.returns[cell] for cell in cells], min(run.cells[cell].shape[1] for cell in cells)
+        first, last = (mean_of(getattr(of, end) for of in returns) for end in ("first", "last"))
+        ends = f"{end_episodes(episodes)} episodes" if end_episodes(episodes) > 1 else "episode"
+        counted, overlaps = counted_noun(len(cells), f"{kind} cell"), run.overlaps(cells)
+        stated = [paper_scores(run, cell) for cell in scored]
+        methods = [name for name in paper_methods(run) if stated and all(name in of_cell for of_cell in stated)]
+        found.append(
+            Headline(
+                label=run.label + overlap_marks(overlaps),
+                protocol=run.protocol,
+                tasks=f"{counted} with headroom, of {len(played)} played" if scored else counted,
+                score=mean_interval(*(normalised[cell] for cell in scored)) if scored else None,
+                mean=mean_interval(*(of.mean for of in returns)),
+                gain=mean_interval(*(of.gain for of in returns)) if episodes > 1 else None,
+                change=f"{first:z.1f} in the first, {last:z.1f} in the last {ends}",
+                paper={name: float(np.mean([of_cell[name] for of_cell in stated])) for name in methods},
+                why_no_score="" if scored else _why_no_score(run, kind, played),
+                overlaps=overlaps,
+            )
         )
-        found.append(headline)
     return found
 
 
-def paper_methods(run: EvaluationRun) -> tuple[str, ...]:
-    """Return the run's own method if the paper has results of it, or else AD and DPT."""
-    return (run.agent,) if published_cells(run.agent) else PAPER_METHODS
+def mean_of(cells: Iterable[np.ndarray]) -> float:
+    """Return the mean of the cells' means."""
+    return float(np.mean([values.mean() for values in cells]))
 
 
-def paper_scores(run: EvaluationRun, cell: ResultCell) -> dict[str, float]:
-    """Return the normalised scores of published methods in a cell with headroom.
-
-    Empty if the results are not of the paper's protocol, tasks and episode length, or of a sweep.
-    """
-    references = cell_headroom(run.protocol).get(cell)
-    if run.variant or not run.is_like_the_papers(cell) or references is None or not has_headroom(references):
-        return {}
-    stated = {name: published_cells(name).get(cell.layout, {}).get(cell.family) for name in paper_methods(run)}
-    return {name: normalise(found[0], references) for name, found in stated.items() if found}
+def _why_no_score(run: EvaluationRun, kind: str, cells: Sequence[ResultCell]) -> str:
+    if kind != "test":
+        return f"No score: reference returns exist for test tasks only, and these are {kind} tasks."
+    if any(run.is_complete(cell) and run.is_comparable(cell) for cell in cells):
+        return "No score: no cell that was played completely has headroom."
+    return f"No score: it needs all published tasks of a cell, in episodes of {KEPT_STEPS} steps."
 
 
-class GroupScore(NamedTuple):
+class TableScore(NamedTuple):
     """Score of an agent on a group of cells, one entry of a table.
 
     Attributes:
-        played: (number of cells played, number of cells).
-        measured: (number of measured cells with headroom, number of measured cells).
-        published: the paper's mean and std; None under other protocols than the paper's.
-        mean: mean return; None if nothing was played.
-        std: standard deviation over the instances of a single cell, or over cells; None if there is only one.
-        normalised: normalised score, mean over the complete cells with headroom.
-        gain: mean gain over the cells played; None if nothing was played.
-        shortfall: instances played, if they are not the published ones, such as "1 of 5 instances"; usually empty.
+        text: mean, std over the instances of a single cell or over cells, and marks of overlaps; a dash if nothing was
+            played.
+        notes: further numbers as text: what is missing, the paper's numbers, normalised score, gain.
+        is_flat: whether no cell that was measured has headroom.
         overlaps: the ways in which training data and tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
-        details: what the score is of, with the conditions of the evaluation and the training of the agent; sentences.
     """
 
-    played: tuple[int, int]
-    measured: tuple[int, int] = (0, 0)
-    published: Published | None = None
-    mean: float | None = None
-    std: float | None = None
-    normalised: float | None = None
-    gain: float | None = None
-    shortfall: str = ""
+    text: str = "–"
+    notes: Sequence[str] = ()
+    is_flat: bool = False
     overlaps: tuple[str, ...] = ()
-    details: str = ""
-
-    @property
-    def is_flat(self) -> bool:
-        """Whether no cell that was measured has headroom."""
-        return self.measured[1] > 0 and self.measured[0] == 0
-
-    @property
-    def text(self) -> str:
-        """Mean, std and marks of overlaps as text; a dash if nothing was played."""
-        if self.mean is None:
-            return "–"
-        std = "" if self.std is None else f" ± {self.std:z.1f}"
-        return f"{self.mean:z.1f}{std}{overlap_marks(self.overlaps)}"
-
-    @property
-    def notes(self) -> list[str]:
-        """Further numbers as text."""
-        played, total = self.played
-        std = f" ± {self.published[1]:z.1f}" if self.published and self.published[1] is not None else ""
-        notes = [
-            f"{played} of {total} cells" if 0 < played < total else "",
-            self.shortfall,
-            f"paper {self.published[0]:z.1f}{std}" if self.published else "",
-            "" if self.normalised is None else f"normalised {self.normalised:z.2f}",
-            "" if self.gain is None else f"gain {self.gain:+z.1f}",
-            "no headroom" if self.is_flat and self.mean is not None else "",
-        ]
-        return [note for note in notes if note]
 
 
-def group_score(
+def table_score(
     cells: Sequence[ResultCell], run: EvaluationRun | None, protocol: str, published: Published | None = None
-) -> GroupScore:
+) -> TableScore:
     """Return a run's score on a group of cells.
 
     Args:
         cells: the group.
         run: None if the agent was not run.
         protocol: of the run.
-        published: the paper's mean and std; left out if a played cell has another protocol or episode length.
+        published: the paper's mean and std; left out if a cell was not played, or with another episode length.
     """
-    headroom = cell_headroom(protocol)
+    headroom, played = cell_headroom(protocol), [cell for cell in cells if run and cell in run.cells]
     measured = [has_headroom(headroom[cell]) for cell in cells if cell in headroom]
-    scores = {cell: score for cell, score in cell_scores(run).items() if cell in cells} if run else {}
-    empty = GroupScore((len(scores), len(cells)), (sum(measured), len(measured)), published)
-    if run is None or not scores:
-        return empty
-    means = [score.means for score in scores.values()]
+    is_flat = bool(measured) and not any(measured)
+    std = f" ± {published[1]:z.1f}" if published and published[1] is not None else ""
+    paper = [f"paper {published[0]:z.1f}{std}"] if published else []
+    if run is None or not played:
+        return TableScore(notes=paper, is_flat=is_flat)
+    means = [run.returns[cell].mean.mean(axis=1) for cell in played]
     values = means[0] if len(cells) == 1 else np.array([of_cell.mean() for of_cell in means])
-    normalised = [score.normalised.mean() for score in scores.values() if score.normalised is not None]
-    details = [f"{cell.layout}, {cell.group}: {run.source(cell).conditions}." for cell in scores]
-    overlaps = run.overlaps(scores)
-    return empty._replace(
-        published=published if len(scores) == len(cells) and all(map(run.is_like_the_papers, scores)) else None,
-        mean=float(values.mean()),
-        std=float(values.std()) if len(values) > 1 else None,
-        normalised=float(np.mean(normalised)) if normalised else None,
-        gain=float(np.mean([score.gain for score in scores.values()])),
-        shortfall=_shortfall(run, list(scores)),
-        overlaps=overlaps,
-        details=" ".join([*["Mean over cells:"] * (len(cells) > 1), *details, describe_overlap(overlaps)]),
-    )
-
-
-def _shortfall(run: EvaluationRun, cells: Sequence[ResultCell]) -> str:
-    if all(map(run.is_complete, cells)):
-        return ""
-    played = instances_range(len(run.cells[cell]) for cell in cells)
-    total = published_instances(cells[0])
-    if len(cells) > 1:
-        return f"{played} a cell"
-    return f"{len(run.cells[cells[0]])} of {counted_noun(total, 'instance')}" if total else played
+    std = f" ± {values.std():z.1f}" if len(values) > 1 else ""
+    complete = all(cell.kind != "test" or run.is_complete(cell) for cell in played)
+    counts = f"{len(means[0])} of {counted_noun(published_instances(cells[0]), 'instance')}"
+    scores = [score for cell, score in normalised_returns(run).items() if cell in played]
+    overlaps = run.overlaps(played)
+    notes = [
+        f"{len(played)} of {len(cells)} cells" if len(played) < len(cells) else "",
+        "" if complete else counts if len(cells) == 1 else "incomplete cells",
+        *(paper if len(played) == len(cells) and all(map(run.is_comparable, played)) else []),
+        f"normalised {mean_of(scores):z.2f}" if scores else "",
+        f"gain {mean_of(run.returns[cell].gain for cell in played):+z.1f}",
+        "no headroom" if is_flat else "",
+    ]
+    text = f"{values.mean():z.1f}{std}{overlap_marks(overlaps)}"
+    return TableScore(text, [note for note in notes if note], is_flat, overlaps)
 
 
 class ScoreTable(NamedTuple):
@@ -399,7 +291,7 @@ class ScoreTable(NamedTuple):
     title: str
     kind: str
     columns: Mapping[str, Sequence[str]]
-    rows: Mapping[tuple[str, str], list[GroupScore]]
+    rows: Mapping[tuple[str, str], list[TableScore]]
     caption: str
 
 
@@ -414,7 +306,7 @@ def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTa
     """
     tables = []
     for kind in TASK_KINDS:
-        cells = sorted({cell for run in runs for cell in run.cells if cell.kind == kind}, key=lambda cell: cell.order)
+        cells = in_order(cell for run in runs for cell in run.cells if cell.kind == kind)
         if not cells:
             continue
         layouts = tuple(dict.fromkeys(cell.layout for cell in cells))
@@ -431,8 +323,8 @@ def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTa
             for of_column in columns.values():
                 group = [ResultCell(*cell, kind) for cell in product(of_column, labels[label])]
                 stated = published_score(agent if run is None else run, group) if quoted else None
-                scores.append(group_score(group, run, protocol, stated))
-            if any(score.mean is not None or score.published for score in scores):
+                scores.append(table_score(group, run, protocol, stated))
+            if any(score.notes or score.text != TableScore().text for score in scores):
                 rows[label, agent] = scores
         caption = describe_conditions(played.values(), cells)
         tables.append(ScoreTable(f"{kind.capitalize()} tasks", kind, columns, rows, caption))

@@ -15,7 +15,7 @@ from icrl4aht_baselines import report
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.report import gifs, merge, write_report
 from icrl4aht_baselines.report.cards import model_card, write_headroom_cards, write_model_cards
-from icrl4aht_baselines.report.figures import curve_figure, return_bars, score_bars
+from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
 from icrl4aht_baselines.report.page import markdown, report_files, write_page, write_page_with_episodes
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultCell
@@ -31,11 +31,11 @@ EVIL = '<img src=x onerror="alert(1)">&co'
 
 
 class Elements(HTMLParser):
-    """Parser that collects external addresses, scripts and tooltips of a page."""
+    """Parser that collects external addresses, scripts and images of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.outside, self.images, self.open, self.tooltips = [], [], [], []
+        self.outside, self.images, self.open = [], [], []
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
@@ -49,7 +49,6 @@ class Elements(HTMLParser):
         self.outside += [value for value in loaded if not value.startswith(("data:", "#"))]
         self.outside += [tag] if tag in ("script", "link", "iframe", "object") else []
         self.outside += [name for name in values if name.startswith("on")]
-        self.tooltips += [values["title"]] if "title" in values else []
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
@@ -75,13 +74,9 @@ def test_the_page_is_complete_and_fetches_nothing(tmp_path):
         "Episode 2: return 40",
         "No picture: &lt;its run&gt; is gone",
     ]
-    parts += ["paper 12.5 ± 11.3", "the paper&#39;s AD", "AD, K = 250", 'name="viewport"', "prefers-color-scheme: dark"]
+    parts += ["paper 12.5 ± 11.3", "the paper's AD", "AD, K = 250", 'name="viewport"', "prefers-color-scheme: dark"]
     assert [part for part in parts if part not in text] == []
     assert text.count("<table") == text.count("<caption>") and "url(" not in text and "@import" not in text
-    tooltip = "AD. demo_wide, H1: protocol published, 1 seed (0), 40 episodes of 100 steps. No overlap with the "
-    tooltip += "training data."
-    assert tooltip in found.tooltips
-    assert "Not run; the paper's 5 instances, 100 episodes of 100 steps." in found.tooltips
     with pytest.raises(OptionError, match=r"report\.txt: expected a name that ends in \.html"):
         write_page(runs, tmp_path / "report.txt")
     with pytest.raises(OptionError, match="no run to report"):
@@ -97,7 +92,7 @@ def test_names_are_escaped_in_all_reports(tmp_path):
         assert "<br>gain +2.0 |" in text, "line breaks in cells stay"
 
 
-def test_captions_name_conditions_and_the_cells_that_tables_mark(tmp_path):
+def test_figures_name_conditions_and_mark_overlaps(tmp_path):
     record = [{"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}]
     runs = [evaluated_run("AD", trained_on=record), evaluated_run("mine", trained_on=None)]
     text = unescape(write_page(runs, tmp_path / "report.html").read_text())
@@ -105,18 +100,20 @@ def test_captions_name_conditions_and_the_cells_that_tables_mark(tmp_path):
     assert len(captions) == 2
     for caption in captions:
         assert caption.startswith("Evaluated under protocol seeded, 1 seed (0), 40 episodes of 100 steps; 5 instances")
-        assert caption.endswith("Overlap with the training data: AD: demo_wide H4 †; mine: all cells ?.")
-    short = dataclasses.replace(evaluated_run("DPT", steps=20), agent="DPT")
+    assert text.count('<i class="key"></i>AD †</span>') == text.count('<i class="key"></i>mine ?</span>') == 2
+    (chart,) = bar_charts(dict(enumerate(runs)), "seeded")
+    marks = [[bar.text.lstrip("-0123456789.") for bar in row.bars] for row in chart.bars["demo_wide"]]
+    assert marks == [["", "?"]] * 3 + [["†", "?"]]
+    short = evaluated_run("DPT", steps=20)
     text = unescape(write_page([*runs, short], tmp_path / "report.html").read_text())
     assert "Evaluated AD and mine under protocol seeded, 1 seed (0), 40 episodes of 100 steps; DPT under" in text
 
 
 def test_bars_run_from_stay_to_the_score():
-    runs = {0: evaluated_run("mine", ("coord_simple", "demo_wide"), value=39.0, protocol="published")}
-    chart = score_bars(runs, "published")
-    assert chart is not None
-    (rows,) = chart.layouts.values()
-    stay, oracle = (tick.position for tick in chart.ticks)
+    run = evaluated_run("mine", ("coord_simple", "demo_wide"), value=39.0, protocol="published")
+    (chart,) = bar_charts({0: run}, "published")
+    (rows,) = chart.bars.values()
+    stay, oracle = (tick.position for tick in chart.x_ticks)
     for row in rows:
         (bar,) = row.bars
         egos = cell_headroom("published")[ResultCell("demo_wide", row.label)]
@@ -125,21 +122,21 @@ def test_bars_run_from_stay_to_the_score():
         assert [mark.name for mark in row.marks] == ["AD", "DPT"]
     assert rows[0].scale == "0.0 to 40.0" and rows[0].bars[0].text == "1.00"
     flat = ", ".join(f"coord_simple H{number}" for number in range(1, 5))
-    assert chart.left_out == [f"The oracle earns no more than an ego that stays: {flat}."]
-    low = score_bars({0: evaluated_run("mine", ("asymm_right",), value=-90.0)}, "seeded")
-    assert low is not None and low.layouts["asymm_right"][3].bars[0].clipped
-    assert score_bars({0: evaluated_run("mine", ("coord_simple",))}, "seeded") is None
-    returns = return_bars({0: evaluated_run("mine", ("coord_simple",))}, "test")
-    assert returns and [row.bars[0].text for row in returns.layouts["coord_simple"]] == ["11.0"] * 4
+    assert chart.caption.endswith(f"The oracle earns no more than an ego that stays: {flat}.")
+    (low,) = bar_charts({0: evaluated_run("mine", ("asymm_right",), value=-90.0)}, "seeded")
+    assert low.bars["asymm_right"][3].bars[0].text.endswith("*")
+    (returns,) = bar_charts({0: evaluated_run("mine", ("coord_simple",))}, "seeded")
+    assert returns.title == "Return in each cell, test tasks"
+    assert [row.bars[0].text for row in returns.bars["coord_simple"]] == ["11.0"] * 4
 
 
 def test_curves_share_their_axes_and_may_have_one_episode():
     run = evaluated_run("mine", value=40.0)
-    figure = curve_figure({0: run}, list(run.cells))
-    assert [tick.label for tick in figure.y_ticks] == ["0", "10", "20", "30", "40"] and len(figure.panels) == 4
-    assert figure.panels[0].curves[0].line.count("L") == 39
+    (chart,) = curve_charts({0: run})
+    assert [tick.label for tick in chart.y_ticks] == ["0", "10", "20", "30", "40"] and len(chart.panels) == 4
+    assert chart.panels["demo_wide, H1"][0].line.count("L") == 39
     one = dataclasses.replace(run, cells={cell: returns[:, :1] for cell, returns in run.cells.items()})
-    assert curve_figure({0: one}, list(one.cells)).panels[0].curves[0].line.count("L") == 1
+    assert curve_charts({0: one})[0].panels["demo_wide, H1"][0].line.count("L") == 1
 
 
 def trained(run: EvaluationRun, **model) -> EvaluationRun:
@@ -165,7 +162,7 @@ def test_trained_models_have_cards(tmp_path):
         "| data | you/icrl4aht, data version 1.0.0 |",
         "| demo_wide | 14 of demo_wide; the release's manifest has SHA-256 `ab12` | demo_wide; with utility_greedy (1) "
         "| 3 | protocol seeded, 1 seed (0), 40 episodes of 100 steps, cached acting, 5 instances in a cell |",
-        "* layers: 4\n* seed: 3\n* channels: own\n* labels: oracle\n* queries: 201\n",
+        "* layers: 4\n* seed: 3\n* queries: 201\n* every: 1\n* labels: oracle\n",
         "| H4 | AD | 11.0 ± 0.0 †<br>",
         "It is one run, of seed 3",
     ]

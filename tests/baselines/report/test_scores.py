@@ -12,12 +12,12 @@ from icrl4aht_baselines.report.results import PUBLISHED_PROTOCOL, ResultCell, pu
 from icrl4aht_baselines.report.scores import (
     AVERAGE,
     cell_headroom,
-    cell_scores,
     find_headlines,
-    group_score,
+    normalised_returns,
     open_cells,
     published_score,
     returns_tables,
+    table_score,
 )
 
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -41,8 +41,8 @@ def test_there_are_20_cells_with_headroom():
 
 def test_the_score_is_the_mean_over_complete_cells_with_headroom():
     run = evaluated_run("mine", ("coord_simple", "demo_wide"), protocol="published")
-    assert cell_scores(run)[DEMO_WIDE[0]].normalised == pytest.approx(score(11.0, DEMO_WIDE[0]))
-    assert cell_scores(run)[ResultCell("coord_simple", "H1")].normalised is None
+    assert [*normalised_returns(run)] == DEMO_WIDE, "coord_simple has no headroom"
+    np.testing.assert_allclose(normalised_returns(run)[DEMO_WIDE[0]], np.full((5, 1), score(11.0, DEMO_WIDE[0])))
     (headline,) = find_headlines(run)
     expected = np.mean([score(11.0, cell) for cell in DEMO_WIDE])
     assert headline.score == pytest.approx((expected,) * 3), "equal instances"
@@ -52,7 +52,7 @@ def test_the_score_is_the_mean_over_complete_cells_with_headroom():
     assert headline.paper["AD"] == pytest.approx(paper)
     assert headline.text == (
         "mine (published), 4 test cells with headroom, of 8 played: normalised score 0.26 (0.26 to 0.26); return 11.0 "
-        "(11.0 to 11.0); gain +2.0 (2.0 to 2.0): 10.0 in the first, 12.0 in the last 20 episodes. Parentheses: 95 % "
+        "(11.0 to 11.0); gain +2.0 (+2.0 to +2.0): 10.0 in the first, 12.0 in the last 20 episodes. Parentheses: 95 % "
         f"intervals. The paper's normalised score in these cells: AD {paper:z.2f}, DPT {headline.paper['DPT']:z.2f}."
     )
 
@@ -67,7 +67,7 @@ def test_results_without_a_score_say_why():
     tasks = [task for task in TEST_TASKS if task.layout.name == "demo_wide"]
     own = make_task("teammate", "validation", "demo_wide", tasks[-1].teammate | {"theta_id": 70}, 3)
     test, validation = find_headlines(evaluated_run("mine", tasks=[tasks[0], own]))
-    assert test.score is None and not test.has_interval
+    assert test.score is None and not test.mean.range()
     assert test.why_no_score == "No score: it needs all published tasks of a cell, in episodes of 100 steps."
     assert "these are validation tasks" in validation.why_no_score
     flat = find_headlines(evaluated_run("mine", ("coord_simple",)))[0]
@@ -77,8 +77,7 @@ def test_results_without_a_score_say_why():
 
 def test_other_episode_lengths_have_no_paper_numbers():
     run = evaluated_run("AD", protocol="published", steps=20)
-    found = group_score(DEMO_WIDE[:1], run, "published", (1.0, 1.0))
-    assert (found.published, found.normalised) == (None, None)
+    assert table_score(DEMO_WIDE[:1], run, "published", (1.0, 1.0)).notes == ["gain +2.0"]
     assert find_headlines(run)[0].score is None
 
 
@@ -89,13 +88,15 @@ def test_tables_have_our_and_the_papers_numbers():
     assert list(dict.fromkeys(agent for _, agent in table.rows)) == ["AD", "mine", "DPT", "random"]
     one, mine = table.rows["H1", "AD"][0], table.rows["H1", "mine"][0]
     assert (one.text, one.notes) == ("11.0 ± 0.0", ["paper -3.2 ± 2.6", "normalised 0.28", "gain +2.0"])
-    assert one.normalised == pytest.approx(score(11.0, DEMO_WIDE[0])) and mine.published is None
-    assert (table.rows["H1", "DPT"][0].text, table.rows["H1", "DPT"][0].published) == ("–", (1.0, 0.7))
-    assert [found.played for found in table.rows[AVERAGE, "mine"]] == [(4, 4), (4, 4), (8, 8)]
-    assert table.rows[AVERAGE, "AD"][0].published == tuple(published_cells("AD")["demo_wide"][AVERAGE])
+    assert mine.notes == ["normalised 0.28", "gain +2.0"]
+    dpt = table.rows["H1", "DPT"][0]
+    assert (dpt.text, dpt.notes) == ("–", ["paper 1.0 ± 0.7"])
+    assert table.rows[AVERAGE, "AD"][0].notes[0] == "paper {:.1f} ± {:.1f}".format(
+        *published_cells("AD")["demo_wide"][AVERAGE]
+    )
     seeded = returns_tables([evaluated_run("AD", families=("H1", "H4"))], "seeded")[0]
     assert list(seeded.rows) == [("H1", "AD"), ("H4", "AD"), (AVERAGE, "AD")]
-    assert all(found.published is None for scores in seeded.rows.values() for found in scores)
+    assert not any("paper" in note for scores in seeded.rows.values() for found in scores for note in found.notes)
 
 
 def test_published_numbers_of_groups_of_cells():
@@ -121,12 +122,11 @@ def test_the_papers_averages_equal_the_means_of_its_cells():
 
 def test_incomplete_groups_are_marked():
     run = evaluated_run("AD", families=("H1", "H2"))
-    found = group_score(DEMO_WIDE, run, "seeded")
-    assert (found.played, found.mean, found.notes[0]) == ((2, 4), 11.0, "2 of 4 cells")
+    found = table_score(DEMO_WIDE, run, "seeded")
+    assert (found.text, found.notes[0]) == ("11.0 ± 0.0", "2 of 4 cells")
     few = evaluated_run("AD", tasks=[task for task in TEST_TASKS if task.layout.name == "demo_wide"][:2])
-    found = group_score(DEMO_WIDE[:1], few, "seeded")
-    assert found.notes == ["2 of 5 instances", "gain +2.0"] and found.normalised is None
-    assert "demo_wide, H1: protocol seeded, 1 seed (0), 40 episodes of 100 steps." in found.details
+    assert table_score(DEMO_WIDE[:1], few, "seeded").notes == ["2 of 5 instances", "gain +2.0"]
+    assert table_score(DEMO_WIDE, few, "seeded").notes[:2] == ["1 of 4 cells", "incomplete cells"]
 
 
 def test_csv_and_markdown_have_the_numbers_of_each_cell():
