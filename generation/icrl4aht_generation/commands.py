@@ -21,6 +21,7 @@ from icrl4aht_data.commands.options import (
     SEED,
     Folder,
     Names,
+    NewFile,
     examples,
     json_option,
     overwrite_option,
@@ -28,10 +29,12 @@ from icrl4aht_data.commands.options import (
 from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.files import atomic_write, check_output
 from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_generation.collection.options import CollectOptions, allocate_gpu_memory_on_demand, request_determinism
+from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
+from icrl4aht_generation.layouts.sheet import save_sheet
 from icrl4aht_generation.learners.config import PPOConfig, Widths
 from icrl4aht_generation.teammates.instances import published_tasks
 
@@ -149,6 +152,75 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
 
     profile = load_profile(name, limit)
     return replace(profile, xla_threads=threads) if threads else profile
+
+
+@click.command(
+    epilog=examples(
+        "icrl4aht-data layouts --family templates --count 24 --out sheet.png",
+        "icrl4aht-data layouts --family rooms --seed 1 --split train --json",
+    )
+)
+@click.option(
+    "--family",
+    type=Names("family of layouts", lambda: LAYOUT_FAMILIES),
+    required=True,
+    help="rearranged, templates or rooms.",
+)
+@click.option("--count", type=COUNT, default=24, help="Number of layouts.")
+@click.option("--seed", type=SEED, default=0, help="Seed of the family's layouts.")
+@click.option(
+    "--split",
+    type=Names("split of layouts", lambda: LAYOUT_SPLITS),
+    help="Only layouts of this split: train, validation or test.",
+)
+@click.option(
+    "--check",
+    is_flag=True,
+    help="Play each: exit with 1 if the oracle, or a pair of them, delivers no soup in 400 steps.",
+)
+@click.option("--out", type=NewFile(".png"), metavar="FILE", help="Draw a sheet of pictures here.")
+@overwrite_option
+@json_option
+def layouts(
+    family: str, count: int, seed: int, split: str | None, check: bool, out: Path | None, overwrite: bool, as_json: bool
+) -> None:
+    """List generated layouts, and draw them.
+
+    A layout is a function of its family, seed and number: templates-0-17. The families: rearranged, with the fixtures
+    of asymm_both and cramped_up in other cells; templates, with new fixtures in the rooms of the published layouts,
+    mirrored and rotated; rooms, with new rooms.
+    """
+    if out:
+        check_output(out, overwrite)
+    found = generate_layouts(family, seed, count, split=split)
+    if out:
+        save_sheet(out, found)
+    delivered = [None] * count
+    if check:
+        from icrl4aht_generation.layouts.playable import layouts_delivered
+
+        delivered = layouts_delivered(found).tolist()
+    rows = [
+        {
+            "name": layout.name,
+            "split": split_of(layout),
+            "rows": layout.rows,
+            "recipes": layout.recipes,
+            "indicates_delivery": layout.indicates_delivery,
+        }
+        | ({"delivered": one} if check else {})
+        for layout, one in zip(found, delivered, strict=True)
+    ]
+    if as_json:
+        click.echo(json.dumps(rows))
+    else:
+        for layout, row in zip(found, rows, strict=True):
+            size = f"{layout.width}x{layout.height}"
+            fault = "  no soup delivered" if row.get("delivered") is False else ""
+            click.echo(f"{layout.name:<20} {row['split']:<10} {size:<5} {len(layout.recipes):>2} recipes{fault}")
+    if out:
+        click.echo(f"wrote {out}", err=as_json)
+    sys.exit(int(False in delivered))
 
 
 @click.command()

@@ -8,6 +8,7 @@ _TASKS = "Tasks and teammates"
 VERBS = (
     Verb("generate", f"{_CLI}:generate", "Generate", "Rebuild a release, or resume a rebuild."),
     Verb("teammates", f"{_CLI}:teammates", "Generate", "Train populations of teammates."),
+    Verb("layouts", f"{_CLI}:layouts", "Generate", "List generated layouts, and draw them."),
     Verb("plan", f"{_CLI}:plan", "Generate", "Estimate the cost of a rebuild."),
     Verb("check", f"{_CLI}:check", "Generate", "Compare two rebuilds bit for bit."),
     Verb("research draws", f"{_CLI}:draws", _TASKS, "Measure the heuristic teammates that tasks may draw."),

@@ -41,6 +41,9 @@ TESTED_ON = {
 LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names in splits.values() for name in names))
 """Every layout of the benchmark, in the paper's order."""
 
+FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
+"""Recipes of the published numbers on the layout track; a layout's own are the first and the last."""
+
 _OTHER_NUMBERS = 10_000  # number of possible `layout_number` values of registered layouts
 
 SPLITS = ("train", "validation", "test", "heldout")

@@ -17,8 +17,8 @@ from icrl4aht_data.commands.verbs import Verb
 from tests.packaging.test_readme import understand
 
 PUBLIC = (
-    "list show browse verify download convert combine release upload doctor generate teammates plan check train "
-    "evaluate report results models control demo watch collect"
+    "list show browse verify download convert combine release upload doctor generate teammates layouts plan check "
+    "train evaluate report results models control demo watch collect"
 )
 RESEARCH = "draws manifests diversity speed reference unseen drift headroom sweep ablate tracks heldout-rl"
 

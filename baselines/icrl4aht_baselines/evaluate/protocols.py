@@ -35,9 +35,6 @@ class Protocol:
     steps: int = KEPT_STEPS
 
 
-FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
-"""Recipes of the published numbers on the layout track; a layout's own are the first and the last."""
-
 EVALUATION_SPLITS = ("test", "validation", "diverse")
 """Tasks in the package: the published test tasks, and two sets of validation tasks, by which models are chosen. Their
 teammates are of the published training ranges, or diverse, see `icrl4aht_generation.teammates.draws`."""

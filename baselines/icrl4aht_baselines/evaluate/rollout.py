@@ -19,8 +19,8 @@ from icrl4aht_generation.policy import Policy, stacked
 from jaxtyping import Array, Float, Int, UInt8
 
 from icrl4aht_baselines.agents.host import EgoInput, HostPolicy
-from icrl4aht_baselines.evaluate.protocols import FOUR_RECIPES, Protocol
-from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_baselines.evaluate.protocols import Protocol
+from icrl4aht_data.benchmark.facts import FOUR_RECIPES, TRACKS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 

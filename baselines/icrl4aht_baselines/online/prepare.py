@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from icrl4aht_generation.layouts.rearranged import rearranged_layouts, with_four_recipes
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.draws import find_draw
 from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate
@@ -16,7 +17,6 @@ from icrl4aht_generation.teammates.registry import build_teammate, recover_teamm
 from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
-from icrl4aht_baselines.online.layouts import rearranged_layouts, with_four_recipes
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup, chosen_teammates, make_groups
 from icrl4aht_baselines.online.teammates import check_heuristics, mixed_chances, with_behaviours
 from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cells

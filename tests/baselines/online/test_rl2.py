@@ -20,7 +20,6 @@ from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.methods.tokens import StepInput
 from icrl4aht_baselines.methods.view_change import ViewChange
-from icrl4aht_baselines.online.layouts import rearranged_layouts
 from icrl4aht_baselines.online.prepare import FLAT_SHARE, REARRANGED_SHARE, _shares, prepare_play
 from icrl4aht_baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
@@ -37,6 +36,7 @@ from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import read_trained_on
 from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_generation.layouts.rearranged import rearranged_layouts
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task
 from icrl4aht_generation.teammates.registry import build_teammate, sample_teammate

@@ -13,14 +13,17 @@ from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
 from icrl4aht_baselines.online import unseen
-from icrl4aht_baselines.online.layouts import unseen_layouts
-from icrl4aht_baselines.online.unseen import unseen_returns
+from icrl4aht_baselines.online.unseen import unseen_layouts, unseen_returns
 from icrl4aht_baselines.report import comparison
 from icrl4aht_baselines.report.comparison import UNSEEN, read_stored
+from icrl4aht_baselines.training.options import MOST_REARRANGED
+from icrl4aht_generation.layouts.grids import canonical_map
+from icrl4aht_generation.layouts.rearranged import rearranged_layouts
 from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import get_layout
 
 TASKS = [
     task
@@ -29,13 +32,18 @@ TASKS = [
 ]
 
 
+def test_unseen_layouts_are_not_training_layouts():
+    layout = get_layout("asymm_both")
+    trained = set(map(canonical_map, rearranged_layouts(layout, MOST_REARRANGED)))
+    new = unseen_layouts(layout, 4)
+    assert len(new) == 4 and not set(map(canonical_map, new)) & trained
+    assert {(one.name, one.recipes) for one in new} == {(layout.name, layout.recipes)}
+
+
 def test_returns_equal_playing_each_layout_alone():
     found = unseen_returns({"oracle": AGENTS["oracle"]}, TASKS, 3, 2)["oracle"]["cramped_up", "H1"]
     assert found.shape == (3, 2)
-    layout, task = (
-        unseen_layouts(TASKS[0].layout, 3)[-1],
-        TASKS[-1],
-    )  # last version, last teammate
+    layout, task = unseen_layouts(TASKS[0].layout, 3)[-1], TASKS[-1]  # last version, last teammate
     mates = [build_teammate(layout, task.teammate)]
     rollout = EvaluationRollout(layout, AGENTS["oracle"](layout), mates, get_protocol("seeded"))
     state = rollout.start(task_key(2, task.task_id)[None])

@@ -1,0 +1,111 @@
+"""Families of generated layouts, their names and splits."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
+from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_generation.layouts.fixtures import Kitchen
+from icrl4aht_generation.layouts.grids import canonical_map
+from icrl4aht_generation.layouts.rearranged import MOST_REPEATS, draw_rearranged
+from icrl4aht_generation.layouts.rooms import draw_rooms
+from icrl4aht_generation.layouts.templates import draw_templates, has_tested_rooms
+
+LAYOUT_FAMILIES: dict[str, Callable[[int], Iterator[Kitchen]]] = {
+    "rearranged": draw_rearranged,
+    "templates": draw_templates,
+    "rooms": draw_rooms,
+}
+"""Family -> function that yields the kitchens of a seed."""
+
+LAYOUT_SPLITS = {"train": 0.8, "validation": 0.1, "test": 0.1}
+"""Split -> share of the layouts that may be trained on; the others are divided equally among the last two."""
+
+
+def generate_layouts(family: str, seed: int, count: int, *, split: str | None = None) -> list[Layout]:
+    """Return the first layouts of a family.
+
+    None equals a published layout or another one of the list, mirrored or rotated, and `check_solvable` accepts each. A
+    layout is a function of its family, seed and number, which its name tells: templates-0-17. With a smaller count the
+    result is the beginning of a longer one.
+
+    Args:
+        family: "rearranged", "templates" or "rooms".
+        seed: number of the sequence of layouts, at least 0.
+        count: number of layouts.
+        split: "train", "validation" or "test": only layouts of this split, see `split_of`.
+
+    Raises:
+        UnknownNameError: for an unknown family or split.
+        OptionError: if the family does not have so many layouts, or for a negative seed or count.
+    """
+    if family not in LAYOUT_FAMILIES:
+        raise unknown("family of layouts", family, LAYOUT_FAMILIES)
+    if split not in (None, *LAYOUT_SPLITS):
+        raise unknown("split of layouts", split, LAYOUT_SPLITS)
+    if seed < 0 or count < 0:
+        raise OptionError(f"seed = {seed}, count = {count}: expected numbers of at least 0")
+    found: list[Layout] = []
+    numbered = _numbered(family, seed)
+    while len(found) < count:
+        layout = next(numbered, None)
+        if layout is None:
+            kept = "" if split is None else f" of split {split}"
+            raise OptionError(
+                f"family {family}, seed {seed}: it has {len(found)} layouts{kept}, expected {count}; ask for fewer, or "
+                f"give another seed or family"
+            )
+        if split is None or split_of(layout) == split:
+            found.append(layout)
+    return found
+
+
+def find_generated(name: str) -> Layout:
+    """Return the generated layout with a name such as templates-0-17; draws it and all before it.
+
+    Raises:
+        OptionError: if the name is not family-seed-number, or the family has fewer layouts.
+        UnknownNameError: for an unknown family.
+    """
+    parts = re.fullmatch(r"(\w+)-(\d+)-(\d+)", name, re.ASCII)
+    if not parts:
+        raise OptionError(
+            f"{name}: expected the name of a generated layout, family-seed-number, such as templates-0-17"
+        )
+    family, seed, number = parts[1], int(parts[2]), int(parts[3])
+    return generate_layouts(family, seed, number + 1)[number]
+
+
+def _numbered(family: str, seed: int) -> Iterator[Layout]:
+    """Yield the different layouts of a family with their names, until many draws in a row repeat earlier ones."""
+    known = {canonical_map(get_layout(name)) for name in LAYOUT_NAMES}
+    number = repeats = 0
+    for kitchen in LAYOUT_FAMILIES[family](seed):
+        name = f"{family}-{seed}-{number}"
+        layout = Layout(name, name, *kitchen)
+        canonical = canonical_map(layout)
+        repeats += 1
+        if canonical not in known:
+            known.add(canonical)
+            yield layout
+            number, repeats = number + 1, 0
+        elif repeats == MOST_REPEATS:
+            return
+
+
+def split_of(layout: Layout) -> str:
+    """Return the split of a layout, "train", "validation" or "test", which is a hash of its `canonical_map`.
+
+    Layouts with the rooms of a published test layout, see `published_rooms`, are in no training split.
+    """
+    splits = [split for split in LAYOUT_SPLITS if split != "train" or not has_tested_rooms(layout)]
+    digest = hashlib.sha256("\n".join(canonical_map(layout)).encode()).digest()
+    ends = np.cumsum([LAYOUT_SPLITS[split] for split in splits])
+    position = int.from_bytes(digest[:6], "big") / 2**48  # of six bytes, so that it is below 1
+    return splits[int(np.searchsorted(ends, position * ends[-1], side="right"))]

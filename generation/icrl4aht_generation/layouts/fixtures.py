@@ -1,0 +1,74 @@
+"""Fixtures, recipes and starts of new kitchens, drawn for given rooms. Shapes: `H` rows, `W` columns."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from icrl4aht_generation.layouts.grids import rows_of
+from icrl4aht_generation.layouts.solvable import delivery_fault, faced_cells
+
+MORE_FIXTURES = (4, 6)
+"""Least and most fixtures besides those that a dish needs: one pile of each ingredient and of plates, a pot, a goal."""
+
+FREE_COUNTERS = 2
+"""Least number of counters that remain; in small rooms there are fewer fixtures for that."""
+
+Kitchen = tuple[tuple[str, ...], tuple[tuple[int, int, int], ...], bool]
+"""Arguments of a `Layout` after its names: map, recipes, delivery indicator."""
+
+_INGREDIENT_IDS = 4  # ids 0 to 3 have canonical channels
+_MOST = {"P": 3, "L": 2}  # most copies of a fixture; others have no limit
+_ARRANGEMENTS = 60  # tries with one choice of fixtures
+
+
+def furnished(rooms: np.ndarray, rng: np.random.Generator) -> Kitchen | None:
+    """Return a kitchen with these rooms and random fixtures, recipes and starts.
+
+    One agent can bring all ingredients of each recipe to a pot, and one of them, the same or the other, can serve its
+    soup: the scripted experts hand nothing over on counters.
+
+    Args:
+        rooms: bool (2, H, W), the floor of each agent; the same one if they share a room.
+        rng: source of the draws.
+
+    Returns:
+        The kitchen, or None if the rooms have too few walls, or no arrangement was found.
+    """
+    reach = faced_cells(rooms)
+    walls = np.flatnonzero(reach.any(axis=0))
+    fixtures, recipes = _draw_fixtures(len(walls), rng)
+    if len(fixtures) + FREE_COUNTERS > len(walls):
+        return None
+    grid = np.where(rooms.any(axis=0), " ", "W")
+    for _ in range(_ARRANGEMENTS):
+        grid.flat[walls] = "W"
+        grid.flat[rng.permutation(walls)[: len(fixtures)]] = fixtures
+        if delivery_fault(grid, reach, recipes, handover=False) is None:
+            break
+    else:
+        return None
+    if np.array_equal(*rooms):
+        starts = rng.choice(np.flatnonzero(rooms[0]), 2, replace=False)
+    else:
+        starts = [rng.choice(np.flatnonzero(room)) for room in rooms]
+    grid.flat[starts] = "A"
+    return rows_of(grid), recipes, bool(rng.integers(2))
+
+
+def _draw_fixtures(walls: int, rng: np.random.Generator) -> tuple[list[str], tuple[tuple[int, int, int], ...]]:
+    """Return the letters of a kitchen's fixtures, and its recipes: 2 to 4 of two ingredients, or 2 to 10 of three."""
+    types = sorted(rng.choice(_INGREDIENT_IDS, rng.integers(2, 4), replace=False).tolist())
+    dishes = list(combinations_with_replacement(types, 3))
+    chosen = rng.choice(len(dishes), rng.integers(2, len(dishes) + 1), replace=False)
+    needed = [*map(str, types), "B", "P", "X"]
+    shown = [letter for letter, chance in (("R", 0.6), ("L", 0.3)) if rng.random() < chance]
+    more = rng.integers(MORE_FIXTURES[0], MORE_FIXTURES[1] + 1)
+    count = max(len(needed), min(len(needed) + more, walls - FREE_COUNTERS))
+    fixtures = [*needed, *shown][:count]
+    while len(fixtures) < count:
+        letter = str(rng.choice([*needed, *shown]))
+        if fixtures.count(letter) < _MOST.get(letter, count):
+            fixtures.append(letter)
+    return fixtures, tuple(dishes[number] for number in sorted(chosen))

@@ -1,0 +1,109 @@
+"""New rooms: one that both agents share, two next to each other with counters between them, or a ring.
+
+Shapes: `H` rows, `W` columns, at most 9 and 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from icrl4aht_generation.layouts.fixtures import Kitchen, furnished
+from icrl4aht_generation.layouts.grids import canonical_floor, neighbours, room_around
+from icrl4aht_generation.layouts.templates import published_rooms
+
+MOST_ROWS, MOST_COLUMNS = 9, 11
+
+_FEWEST_CELLS = 6  # of a room for two agents
+
+
+def draw_rooms(seed: int) -> Iterator[Kitchen]:
+    """Yield kitchens, of the three kinds in turn, none with the rooms of a published layout."""
+    rng = np.random.default_rng([seed, *b"rooms"])
+    published = published_rooms(tested=False) | published_rooms(tested=True)
+    while True:
+        for draw in (_shared_room, _two_rooms, _ring):
+            kitchen = None
+            while kitchen is None:
+                rooms = np.stack(draw(rng))
+                if canonical_floor(rooms[0] | rooms[1]) not in published:
+                    kitchen = furnished(rooms, rng)
+            yield kitchen
+
+
+def _shared_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return a room of one to three rectangles, perhaps with islands of one counter.
+
+    Rectangles are at least two cells wide and overlap in at least two cells, and islands are surrounded by floor: no
+    agent can block the way of the other.
+    """
+    floor = np.zeros((MOST_ROWS, MOST_COLUMNS), bool)
+    for _ in range(rng.integers(1, 4)):
+        while True:
+            height, width = rng.integers(2, MOST_ROWS - 1), rng.integers(2, MOST_COLUMNS - 1)
+            top, left = rng.integers(1, MOST_ROWS - height), rng.integers(1, MOST_COLUMNS - width)
+            block = np.zeros_like(floor)
+            block[top : top + height, left : left + width] = True
+            if (not floor.any() and block.sum() >= _FEWEST_CELLS) or (floor & block).sum() >= 2:
+                break
+        floor |= block
+    for _ in range(rng.integers(0, 3)):
+        surrounded = np.argwhere(_shrunk(floor))
+        if len(surrounded):
+            floor[tuple(rng.choice(surrounded))] = False
+    floor = _cropped(floor)
+    return floor, floor
+
+
+def _shrunk(floor: np.ndarray) -> np.ndarray:
+    """Return bool (H, W), the cells of a floor whose eight neighbours are floor."""
+    rows = floor.copy()
+    rows[1:-1] &= floor[:-2] & floor[2:]
+    found = rows.copy()
+    found[:, 1:-1] &= rows[:, :-2] & rows[:, 2:]
+    return found
+
+
+def _cropped(floor: np.ndarray) -> np.ndarray:
+    """Return a floor with one wall around it."""
+    rows, columns = np.flatnonzero(floor.any(axis=1)), np.flatnonzero(floor.any(axis=0))
+    return np.pad(floor[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)
+
+
+def _two_rooms(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return two rooms with a line of counters between them, which may have a step; a corner of each may be cut off."""
+    upright = bool(rng.integers(2))
+    rows, columns = (MOST_ROWS, MOST_COLUMNS) if upright else (MOST_COLUMNS, MOST_ROWS)
+    while True:
+        height, width = rng.integers(2, rows - 1), rng.integers(4, columns - 1)
+        border = np.full(height, rng.integers(1, width - 1))
+        border[rng.integers(1, height) :] += rng.integers(-1, 2)
+        column = np.arange(width)
+        left, right = column < border[:, None], column > border[:, None]
+        for room in (left, right[:, ::-1]):
+            if rng.integers(2):
+                deep, wide = rng.integers(1, height // 2 + 1), rng.integers(1, max(2, room[0].sum()))
+                room[:: rng.choice((-1, 1))][:deep, :wide] = False
+        left, right = np.pad(left, 1), np.pad(right, 1)
+        if _is_room(left) and _is_room(right) and (neighbours(left) & neighbours(right)).any():
+            return (left, right) if upright else (left.T, right.T)
+
+
+def _is_room(floor: np.ndarray) -> bool:
+    """Return whether a floor has at least two cells, and all of them are connected."""
+    cells = np.argwhere(floor)
+    return len(cells) > 1 and np.array_equal(room_around(floor, tuple(cells[0])), floor)
+
+
+def _ring(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return a room around an island of at least two counters; the ways around it may be one cell wide."""
+    while True:
+        height, width = rng.integers(3, MOST_ROWS - 1), rng.integers(3, MOST_COLUMNS - 1)
+        tall, wide = rng.integers(1, height - 1), rng.integers(1, width - 1)
+        if tall * wide > 1:
+            break
+    floor = np.pad(np.ones((height, width), bool), 1)
+    top, left = rng.integers(2, height - tall + 1), rng.integers(2, width - wide + 1)
+    floor[top : top + tall, left : left + wide] = False
+    return floor, floor

@@ -1,0 +1,57 @@
+"""Rooms of the published layouts with other fixtures, mirrored and rotated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TESTED_ON
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_generation.layouts.fixtures import Kitchen, furnished
+from icrl4aht_generation.layouts.grids import agent_rooms, canonical_floor, symmetric_images
+
+
+@cache
+def published_rooms(tested: bool) -> dict[tuple[str, ...], list[np.ndarray]]:
+    """Return the rooms of the published layouts, without repeats.
+
+    Args:
+        tested: whether to return the rooms on which no layout is only trained. The layouts of the teammate track are
+            trained and tested on; only trained on are asymm_both and cramped_up, which share their rooms with the
+            layouts that their models are tested on.
+
+    Returns:
+        Floor, in the form of `canonical_floor` -> symmetric images of the agents' rooms, each bool (2, H, W).
+    """
+    trained = {_floor(get_layout(name)) for name in TESTED_ON if name not in TESTED_ON.values()}
+    found: dict[tuple[str, ...], list[np.ndarray]] = {}
+    for layout in map(get_layout, LAYOUT_NAMES):
+        floor = _floor(layout)
+        if (floor not in trained) == tested:
+            pairs = zip(*map(symmetric_images, agent_rooms(layout)), strict=True)
+            found.setdefault(floor, [np.stack(pair) for pair in pairs])
+    return found
+
+
+def _floor(layout: Layout) -> tuple[str, ...]:
+    return canonical_floor(layout.walkable.reshape(layout.height, layout.width))
+
+
+def has_tested_rooms(layout: Layout) -> bool:
+    """Return whether a layout has the rooms of a test layout, which no layout is only trained on."""
+    return _floor(layout) in published_rooms(tested=True)
+
+
+def draw_templates(seed: int) -> Iterator[Kitchen]:
+    """Yield kitchens, every second one with rooms that may be trained on, see `published_rooms`."""
+    rng = np.random.default_rng([seed, *b"templates"])
+    groups = [list(published_rooms(tested).values()) for tested in (False, True)]
+    while True:
+        for group in groups:
+            kitchen = None
+            while kitchen is None:
+                images = group[rng.integers(len(group))]
+                kitchen = furnished(images[rng.integers(len(images))], rng)
+            yield kitchen

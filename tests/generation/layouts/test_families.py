@@ -1,0 +1,205 @@
+"""Generated layouts: a function of family, seed and number; new under symmetry; disjoint splits; the command."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from icrl4aht_generation.layouts import canonical_map, check_solvable, find_generated, generate_layouts, split_of
+from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS
+from icrl4aht_generation.layouts.fixtures import FREE_COUNTERS
+from icrl4aht_generation.layouts.grids import agent_rooms, grid_of, symmetric_images
+from icrl4aht_generation.layouts.playable import layouts_delivered
+from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
+from icrl4aht_generation.layouts.solvable import faced_cells
+from icrl4aht_generation.layouts.templates import has_tested_rooms, published_rooms
+
+from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.install_hints import install_command
+
+GOLDEN = {
+    "rearranged": "40f6dac5bd75f870cf4813c9d5a9248dfaa7bb1315b5a03b4c6cfc9fd616d4ab",
+    "templates": "2991d44485a8271726b7e6b7deaff3436818ed505d6b2645324f64afe7ef8cd5",
+    "rooms": "9fb0747871caba692ea4900ad89647ace176f0c1be2e2dd9bbdd12a32a61f9fb",
+}
+"""SHA-256 of the first 40 layouts of seed 0: layouts that were published or trained on must never change."""
+
+EVERY_FAMILY = pytest.mark.parametrize("family", LAYOUT_FAMILIES)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> dict[str, list[Layout]]:
+    """800 layouts of each family."""
+    return {family: generate_layouts(family, 0, 800) for family in LAYOUT_FAMILIES}
+
+
+def content(layouts: list[Layout]) -> list[tuple]:
+    return [(one.name, one.alias, one.rows, one.recipes, one.indicates_delivery) for one in layouts]
+
+
+@EVERY_FAMILY
+def test_layouts_never_change(family, drawn):
+    text = repr(content(drawn[family][:40]) + [split_of(one) for one in drawn[family][:40]])
+    assert hashlib.sha256(text.encode()).hexdigest() == GOLDEN[family]
+
+
+@EVERY_FAMILY
+def test_more_layouts_begin_with_the_same_ones(family, drawn):
+    assert content(generate_layouts(family, 0, 30)) == content(drawn[family][:30])
+    assert [one.rows for one in generate_layouts(family, 1, 5)] != [one.rows for one in drawn[family][:5]]
+    assert generate_layouts(family, 0, 0) == []
+
+
+@EVERY_FAMILY
+def test_a_name_alone_rebuilds_a_layout(family, drawn):
+    assert content([find_generated(f"{family}-0-7")]) == content(drawn[family][7:8])
+
+
+@EVERY_FAMILY
+def test_no_two_are_equal_under_symmetry(family, drawn):
+    maps = [canonical_map(get_layout(name)) for name in LAYOUT_NAMES] + [canonical_map(one) for one in drawn[family]]
+    assert len(set(maps)) == len(maps)
+
+
+@EVERY_FAMILY
+def test_every_layout_is_solvable(family, drawn):
+    for layout in drawn[family]:
+        check_solvable(layout)
+
+
+@pytest.mark.parametrize("family", ["templates", "rooms"])
+def test_fixtures_and_recipes(family, drawn):
+    """Fixtures are on walls that an agent can face; a kitchen has 4 to 6 more than it needs, in small rooms fewer."""
+    shown = set()
+    for layout in drawn[family]:
+        grid, types = grid_of(layout), layout.ingredients
+        faced = np.logical_or(*faced_cells(agent_rooms(layout)))
+        assert faced[(grid != "W") & (grid != " ") & (grid != "A")].all()
+        assert np.array_equal(agent_rooms(layout).any(axis=0), (grid == " ") | (grid == "A"))
+        fixtures = int((faced & (grid != "W")).sum())
+        more, free = fixtures - len(types) - 3, int((faced & (grid == "W")).sum())
+        assert 4 <= more <= 6 or (more < 4 and free == FREE_COUNTERS)
+        assert len(types) in (2, 3) and max(types) <= 3
+        assert 2 <= len(set(layout.recipes)) == len(layout.recipes) <= {2: 4, 3: 10}[len(types)]
+        shown.add(((grid == "R").any(), (grid == "L").any(), layout.indicates_delivery))
+    assert len(shown) == 8, "with and without recipe indicators, buttons and the delivery indicator"
+
+
+def test_rooms_are_new_and_small(drawn):
+    published = published_rooms(False) | published_rooms(True)
+    assert len(published) == 7  # asymm_*, cramped_* and coord_simple with test_simple share rooms
+    for layout in drawn["rooms"]:
+        assert layout.height <= MOST_ROWS and layout.width <= MOST_COLUMNS
+    shared = [np.array_equal(*layout.rooms) for layout in drawn["rooms"][:300]]
+    assert shared == [True, False, True] * 100
+
+
+def test_canonical_map_is_that_of_every_symmetric_layout(drawn):
+    for layout in (get_layout("asymm_both"), get_layout("cramped_up"), *drawn["rooms"][:20], *drawn["templates"][:20]):
+        images = [
+            Layout("", "", tuple(map("".join, grid)), layout.recipes) for grid in symmetric_images(grid_of(layout))
+        ]
+        assert {canonical_map(one) for one in images} == {canonical_map(layout)}
+        assert {split_of(one) for one in images} == {split_of(layout)}
+
+
+def test_starts_in_the_same_rooms_make_no_difference():
+    first = Layout("", "", ("W0PWW", "WA A1", "W   W", "WBWXW"))
+    second = Layout("", "", ("W0PWW", "W   1", "WA AW", "WBWXW"))
+    one_each = Layout("", "", ("W0PBX1W", "W WA AW", "WWWWWWW"), recipes=((0, 0, 1),))
+    other = Layout("", "", ("W0PBX1W", "WAWA  W", "WWWWWWW"), recipes=((0, 0, 1),))
+    assert canonical_map(first) == canonical_map(second)
+    assert canonical_map(one_each) != canonical_map(other), "another room has an agent"
+
+
+def test_splits(drawn):
+    for family, layouts in drawn.items():
+        splits = [split_of(one) for one in layouts]
+        may_train = np.array([not has_tested_rooms(one) for one in layouts])
+        assert not {"train"} & {split for split, may in zip(splits, may_train, strict=True) if not may}
+        for split, share in LAYOUT_SPLITS.items():
+            trained = np.array(splits)[may_train] == split
+            assert abs(trained.mean() - share) < 0.05
+        some = generate_layouts(family, 0, 20, split="validation")
+        assert content(some) == content([one for one in layouts if split_of(one) == "validation"][:20])
+
+
+def test_rooms_of_test_layouts_are_in_no_training_split(drawn):
+    """Rooms that a layout is only trained on may be: a test layout of the layout track shares them."""
+    assert {name for name in LAYOUT_NAMES if not has_tested_rooms(get_layout(name))} == {
+        *TRACKS["layout"]["train"],
+        *TRACKS["layout"]["test"],
+    }
+    tested = [one for one in drawn["templates"] if has_tested_rooms(one)]
+    assert len(tested) == 400 and {split_of(one) for one in tested} == {"validation", "test"}
+
+
+def test_bad_arguments():
+    with pytest.raises(UnknownNameError, match=r"unknown family of layouts 'template'.*Did you mean 'templates'"):
+        generate_layouts("template", 0, 1)
+    with pytest.raises(UnknownNameError, match="unknown split of layouts 'heldout'"):
+        generate_layouts("rooms", 0, 1, split="heldout")
+    with pytest.raises(OptionError, match="seed = -1, count = 3: expected numbers of at least 0"):
+        generate_layouts("rooms", -1, 3)
+    for name in ("templates-0", "templates-0-x", "coord_ring"):
+        with pytest.raises(OptionError, match=f"{name}: expected the name of a generated layout"):
+            find_generated(name)
+
+
+def test_a_family_says_how_many_layouts_it_has(monkeypatch):
+    few = generate_layouts("rooms", 0, 3)
+    kitchens = [(one.rows, one.recipes, False) for one in few]
+    monkeypatch.setitem(LAYOUT_FAMILIES, "few", lambda seed: iter(kitchens * 400))
+    with pytest.raises(OptionError, match="family few, seed 0: it has 3 layouts, expected 4; ask for fewer"):
+        generate_layouts("few", 0, 4)
+    trained = sum(split_of(one) == "train" for one in few)
+    with pytest.raises(OptionError, match=f"it has {trained} layouts of split train, expected 4"):
+        generate_layouts("few", 0, 4, split="train")
+
+
+def test_the_command_lists_and_draws(tmp_path):
+    from PIL import Image
+
+    sheet = tmp_path / "sheet.png"
+    arguments = ["layouts", "--family", "rooms", "--count", "8", "--split", "train", "--out", str(sheet)]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    wanted = generate_layouts("rooms", 0, 8, split="train")
+    lines = result.output.splitlines()
+    assert [line.split()[:2] for line in lines[:-1]] == [[one.name, "train"] for one in wanted]
+    assert lines[-1].startswith("wrote ")
+    with Image.open(sheet) as picture:
+        assert picture.width > 6 * 4 * 22 and picture.height > 2 * 4 * 22
+    refused = CliRunner().invoke(cli, arguments)
+    assert refused.exit_code == 1 and "--overwrite" in str(refused.exception)
+    result = CliRunner().invoke(cli, [*arguments, "--overwrite", "--json"])
+    found = json.loads(result.stdout)
+    assert [(one["name"], tuple(one["rows"]), one["split"]) for one in found] == [
+        (one.name, one.rows, "train") for one in wanted
+    ]
+
+
+def test_a_sheet_needs_pillow(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    result = CliRunner().invoke(cli, ["layouts", "--family", "rooms", "--count", "1", "--out", str(tmp_path / "a.png")])
+    assert result.exit_code == 1 and install_command("plot") in str(result.exception) and not any(tmp_path.iterdir())
+
+
+def test_the_command_refuses_more_layouts_than_there_are(monkeypatch):
+    monkeypatch.setitem(LAYOUT_FAMILIES, "rooms", lambda seed: iter(()))
+    result = CliRunner().invoke(cli, ["layouts", "--family", "rooms"])
+    assert result.exit_code == 1 and "it has 0 layouts, expected 24" in str(result.exception)
+
+
+@pytest.mark.slow  # compiles a program for each layout
+@EVERY_FAMILY
+def test_oracles_deliver(family, drawn):
+    idle = Layout("idle", "idle", ("WWWWWW", "WA  WW", "WAW0PB", "WWWWXW"), recipes=((0, 0, 0),))
+    assert layouts_delivered([*drawn[family][:2], idle]).tolist() == [True, True, False]

@@ -1,0 +1,67 @@
+"""Kitchens in which a recipe cannot be delivered are refused with the reason, and others are not."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from icrl4aht_generation.layouts import check_solvable
+from icrl4aht_generation.layouts.grids import agent_rooms, grid_of
+from icrl4aht_generation.layouts.solvable import delivery_fault, faced_cells
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
+
+ZERO, MIXED = ((0, 0, 0),), ((0, 0, 0), (0, 1, 1))
+HANDOVER = ("W01WPWWW", "WA W  XW", "W  W A W", "WBWWWWWW")
+TWO_FILL = ("W0WPW1WW", "WA P AXW", "W  W  BW", "WWWWWWWW")
+
+
+def kitchen(rows: tuple[str, ...], recipes=ZERO) -> Layout:
+    return Layout("mine", "mine", rows, recipes)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_published_layouts_are_solvable(layout):
+    check_solvable(layout)
+
+
+@pytest.mark.parametrize(
+    ("rows", "recipes"),
+    [
+        (("W0WPW", "BA AX", "WWWWW"), ZERO),
+        (HANDOVER, MIXED),  # onion and plate go over the counter between the rooms
+        (TWO_FILL, MIXED),  # each agent has an ingredient, and the pot is between them
+    ],
+)
+def test_solvable(rows, recipes):
+    check_solvable(kitchen(rows, recipes))
+
+
+@pytest.mark.parametrize(
+    ("rows", "recipes", "reason"),
+    [
+        (("W0WPW", "BA AW", "WWWWW"), ZERO, "no agent can face a goal"),
+        (("W0WWW", "BA AX", "WWWWP"), ZERO, "no agent can face a pot"),
+        (("W0WPW", "WA AX", "WWWWB"), ZERO, "no agent can face a plate pile"),
+        (("0BWPW", "WA AX", "WWWWW"), ZERO, "ingredient 0 cannot reach a pot whose soup can be delivered"),
+        (("W0B1WPWW", "WA L AXW", "WWWWWWWW"), ZERO, "no soup can reach a goal on a plate"),
+        (("W0WWPBXW", "WA 1A  W", "WWWWWWWW"), ZERO, "ingredient 0 cannot reach a pot whose soup can be delivered"),
+        (("W0PW1PW", "BA L AB", "WXWWWXW"), MIXED, "the ingredients of recipe (0, 1, 1) cannot reach the same pot"),
+    ],
+)
+def test_unsolvable(rows, recipes, reason):
+    with pytest.raises(OptionError, match=re.escape(f"layout mine: {reason}; change the map or the recipes")):
+        check_solvable(kitchen(rows, recipes))
+
+
+@pytest.mark.parametrize(
+    ("rows", "fault"),
+    [
+        (HANDOVER, "no soup can reach a goal on a plate"),
+        (TWO_FILL, "the ingredients of recipe (0, 1, 1) cannot reach the same pot"),
+    ],
+)
+def test_generated_layouts_need_no_handover(rows, fault):
+    layout = kitchen(rows, MIXED)
+    assert delivery_fault(grid_of(layout), faced_cells(agent_rooms(layout)), MIXED, handover=False) == fault
