@@ -66,8 +66,8 @@ def _structure_faults(shard: Shard, file: h5py.File) -> list[str]:
         return faults
     for group, entry in {entry.h5_group: entry for entry in shard.entries.values()}.items():
         names = sorted(field.name for field in entry.stored_fields(shard.kind))
-        if sorted(safe_hdf5.member(file, group)) != names:
-            faults.append(f"{group}: expected {names}, found {sorted(safe_hdf5.member(file, group))}")
+        if sorted(safe_hdf5.find(file, group)) != names:
+            faults.append(f"{group}: expected {names}, found {sorted(safe_hdf5.find(file, group))}")
             return faults
     chunks: list[tuple[int, int, int]] = []
     for entry in shard.entries.values():
@@ -85,7 +85,7 @@ def _structure_faults(shard: Shard, file: h5py.File) -> list[str]:
 def _dataset_faults(shard: Shard, file: h5py.File, entry: Entry, field: Field, stacked: int) -> list[str]:
     """Return faults in filters, chunks, shape and dtype of a dataset in a group with `stacked` histories."""
     faults = []
-    dataset = safe_hdf5.member(file, f"{entry.h5_group}/{field.name}")
+    dataset = safe_hdf5.find(file, f"{entry.h5_group}/{field.name}")
     used, rows = safe_hdf5.filters(dataset), entry.rows(field)
     shape = (rows,) if entry.h5_row is None else (stacked, rows)
     element = field.element(shard.layout, shard.kind)

@@ -27,7 +27,7 @@ from icrl4aht_data.fetch import ReleaseLocation, Remote, open_root
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS, Entry
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
@@ -175,7 +175,10 @@ def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgr
 def _check_shards(index: Index, shards: list[str], report: Report, advance: NamedProgress) -> None:
     """Check shards and their histories."""
     local = ReleaseLocation(index.root)  # no remote, since files that could not be fetched are already reported
-    members = {name: [index.entries[row] for row in index.entries.shard_rows(name).tolist()] for name in shards}
+    members: dict[str, list[Entry]] = {name: [] for name in shards}
+    for entry in index.entries:
+        if entry.shard in members:
+            members[entry.shard].append(entry)
     total = sum(map(len, members.values()))
     for name, entries in members.items():
         try:

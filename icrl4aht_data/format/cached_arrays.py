@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, OptionError
-from icrl4aht_data.utils.files import NO_ROOM, add_filename, allocate
+from icrl4aht_data.utils.files import NO_ROOM, add_filename, allocate, describe_disk
 from icrl4aht_data.utils.system import CACHE_VARIABLES, cache_folder, cache_limit
 
 _CONTENTS = "contents.json"  # name -> [dtype, shape] of every array
@@ -123,7 +123,7 @@ def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> Arrays
     paths = sorted(new.glob("*.npy"))
     contents = {path.stem: _describe(np.lib.format.open_memmap(path, mode="r")) for path in paths}
     (new / _CONTENTS).write_text(json.dumps(contents), encoding="utf-8")
-    for _ in range(2):
+    for _ in range(3):
         arrays = _open(folder)
         if arrays is not None:
             return arrays
@@ -131,24 +131,16 @@ def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> Arrays
             folder.rename(scratch / "damaged")
         with suppress(OSError):  # another process has just renamed its own set
             new.rename(folder)
-    arrays = _open(folder)
-    if arrays is None:
-        raise CacheError(f"{folder}: arrays just written cannot be read: check the disk")
-    return arrays
+    raise CacheError(f"{folder}: arrays just written cannot be read: check the disk")
 
 
 def _unusable(folder: Path, size: int, error: OSError) -> CacheError:
     """Return a `CacheError` for a failed write to the cache folder."""
     if error.errno in NO_ROOM:
-        free = ""
-        with suppress(OSError):
-            free = f", {shutil.disk_usage(folder).free:,} bytes are free"
-        reason = f"has no room for arrays of {size:,} bytes ({error.strerror}{free}); free some space there"
-    elif os.path.lexists(folder) and not folder.is_dir():
-        reason = "is a file, expected a folder; move it away"
+        room = describe_disk(folder)
+        reason = f"has no room for arrays of {size:,} bytes ({error.strerror}; {room}); free some space there"
     else:
-        where = f" ({error.filename})" if error.filename not in (None, str(folder)) else ""
-        reason = f"cannot be used: {error.strerror or error}{where}; check its permissions and content"
+        reason = f"cannot be used: {error.strerror or error} ({error.filename}); check its permissions and content"
     return CacheError(
         f"{folder}: the cache folder {reason}, set {CACHE_VARIABLES[0]} to another folder, or "
         f'take cache="ram" or cache="stream"'

@@ -65,8 +65,6 @@ class Index:
     def query(self, **wanted: str | Sequence[str] | None) -> np.ndarray:
         """Return the ids of the histories with the wanted field values, int64 (N,), ascending.
 
-        The time depends on the number of combinations and of matching histories, not on the size of the release.
-
         Args:
             wanted: field of `QUERY_FIELDS` or `ALIASES` -> one value or several; None accepts any.
 
@@ -76,8 +74,7 @@ class Index:
             OptionError: if a value is a mapping.
         """
         filters = {name: value for name, value in wanted.items() if value is not None}
-        combinations = self.entries.combinations
-        matching = np.ones(len(combinations), bool)
+        matching = np.ones(len(self.entries), bool)
         for given, value in filters.items():
             name = ALIASES.get(given, given)
             if name not in QUERY_FIELDS:
@@ -85,48 +82,43 @@ class Index:
             if isinstance(value, Mapping):
                 raise OptionError(f"{given} = {value!r}: expected a name or a sequence of names")
             names = [value] if isinstance(value, str) or not isinstance(value, Iterable) else value
-            codes = [self._code(name, one, given) for one in names]
-            matching &= np.isin(combinations[:, QUERY_FIELDS.index(name)], codes)
+            matching &= self.entries.matches(name, {self._known_value(name, one, given) for one in names})
         if not matching.any():
             what = ", ".join(f"{name}={value!r}" for name, value in filters.items()) or "any"
             sources = ", ".join(self.values("source")) or "none"
             raise EmptySelectionError(
                 f"{self.root}: no history has {what}. This release has {self.summary()}; sources: {sources}"
             )
-        if matching.all():
-            return np.arange(len(self.entries))
-        ids = np.concatenate([self.entries.rows(c) for c in np.flatnonzero(matching).tolist()])
-        return ids if (np.diff(ids) > 0).all() else np.sort(ids)
+        return np.flatnonzero(matching)
 
-    def _code(self, name: str, value: str, given: str) -> int:
-        """Return the code of a field's value or a layout's alias; -1 if the value is valid but absent from the release.
+    def _known_value(self, name: str, value: str, given: str) -> str:
+        """Return a valid value of a field, for a layout its name; the release may not have the value.
 
         Args:
             name: the field, one of `QUERY_FIELDS`.
             value: the wanted value.
             given: name of the field in messages.
         """
-        canonical = get_layout(str(value)).name if name == "layout" else value
-        code = self.entries.code(name, canonical) if isinstance(canonical, str) else None
-        if code is not None:
-            return code
-        known = _KNOWN_VALUES[name]() if name in _KNOWN_VALUES else ()
-        if name != "layout" and canonical not in known:
-            raise unknown(given, value, (*known, *self.values(name)))
-        return -1
+        if name == "layout":
+            return get_layout(str(value)).name
+        known = (*_KNOWN_VALUES.get(name, tuple)(), *self.values(name))
+        if value not in known:
+            raise unknown(given, value, known)
+        return value
 
     def summary(self) -> str:
         """Return a line that lists the layouts and teammate families of each split."""
-        found: dict[str, dict[str, list[str]]] = {}
-        names = {name: self.values(name) for name in ("split", "layout", "teammate_family")}
-        for codes in self.entries.combinations.tolist():
-            split, layout, family = (names[name][codes[QUERY_FIELDS.index(name)]] for name in names)
-            parts = found.setdefault(split, {"layout": [], "family": []})
-            parts["layout"].append(layout)
-            parts["family"].append(family)
+        found: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
+        names = ("layout", "split", "track", "teammate_family")
+        values = [self.values(name) for name in names]
+        columns = np.stack([self.entries.column(name) for name in names], axis=-1)
+        for codes in np.unique(columns, axis=0).tolist():
+            layout, split, _, family = (known[code] for known, code in zip(values, codes, strict=True))
+            layouts, families = found.setdefault(split, ({}, {}))
+            layouts[layout] = families[family] = None
         texts = [
-            f"{split} on {', '.join(dict.fromkeys(parts['layout']))} with {', '.join(dict.fromkeys(parts['family']))}"
-            for split, parts in found.items()
+            f"{split} on {', '.join(layouts)} with {', '.join(families)}"
+            for split, (layouts, families) in found.items()
         ]
         return "; ".join(texts) or "no histories"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -190,15 +189,12 @@ class ReleaseInfo:
         """
         try:
             info = msgspec.convert(content, cls)
-        except msgspec.ValidationError as error:
-            raise IndexFormatError(str(error)) from error
-        try:
             check_version(info.data_version)  # the version becomes part of tags and folder names
             for task in info.left_out:
                 get_layout(task.layout)
                 for text in (task.task_id, task.teammate, task.source, task.reason):
                     check_name(text)
-        except Icrl4ahtError as error:
+        except (msgspec.ValidationError, Icrl4ahtError) as error:
             raise IndexFormatError(str(error)) from error
         return info
 
@@ -282,8 +278,3 @@ def describe(
         layouts=layouts,
         shards={},
     )
-
-
-def shard_sizes(root: Path, entries: Iterable[Entry]) -> dict[str, int]:
-    """Return shard path -> size in bytes, in the order of the index."""
-    return {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in entries)}

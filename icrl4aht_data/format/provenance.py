@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -201,11 +200,11 @@ class Provenance:
 
     def entry_fields(self) -> dict[str, Any]:
         """Return the fields of the task's index entries that describe its expert."""
-        expert = self.expert
+        expert = self.expert or ExpertLabels(None, "")
         return {
-            "expert_return": None if expert is None else expert.return_greedy,
-            "expert_return_sampled": None if expert is None else expert.return_sampled,
-            "expert_step": None if expert is None else expert.step,
+            "expert_return": expert.return_greedy,
+            "expert_return_sampled": expert.return_sampled,
+            "expert_step": expert.step,
         }
 
     def to_json(self) -> dict[str, Any]:
@@ -231,9 +230,11 @@ class Provenance:
         try:
             found = msgspec.convert({name: value for name, value in content.items() if name in known}, cls)
             msgspec.convert(found.ego, _EgoScale | None)
-            if found.teammate is not None:
-                msgspec.convert(found.teammate, _TeammateSetting)
-            _check_noise(msgspec.convert(found.noise, _NoiseSetting | None))
+            msgspec.convert(found.teammate, _TeammateSetting | None)
+            noise = msgspec.convert(found.noise or {}, _NoiseSetting)
+            for name, value in msgspec.structs.asdict(noise).items():
+                if isinstance(value, tuple) and value[0] > value[1]:
+                    raise IndexFormatError(f"noise.{name}: expected a range [least, most], found {list(value)}")
             for name in filter(None, (found.source, found.nearest_test and found.nearest_test.teammate)):
                 check_name(name)
         except msgspec.ValidationError as error:
@@ -265,17 +266,6 @@ class _NoiseSetting(msgspec.Struct):
     power: tuple[_Exponent, _Exponent] | None = None
 
 
-def _check_noise(noise: _NoiseSetting | None) -> None:
-    """Check that both ends of every range are in order.
-
-    Raises:
-        IndexFormatError: if a range is not of the form [least, most].
-    """
-    for name, value in () if noise is None else msgspec.structs.asdict(noise).items():
-        if isinstance(value, tuple) and value[0] > value[1]:
-            raise IndexFormatError(f"noise.{name}: expected a range [least, most], found {list(value)}")
-
-
 class _TeammateSetting(msgspec.Struct, forbid_unknown_fields=True):
     """Agent slot and noise source of a teammate. The task defines the teammate itself, so other fields are refused."""
 
@@ -283,45 +273,25 @@ class _TeammateSetting(msgspec.Struct, forbid_unknown_fields=True):
     noise: str | None = None
 
 
-class ProvenanceByTask(Mapping[str, Provenance]):
-    """Read-only mapping of task ids to their `Provenance`.
-
-    Args:
-        records: task id -> record.
-    """
-
-    def __init__(self, records: Mapping[str, Provenance]) -> None:
-        self._records = records
-
-    def __getitem__(self, task_id: str) -> Provenance:
-        return self._records[task_id]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._records)
-
-    def __len__(self) -> int:
-        return len(self._records)
+class ProvenanceByTask(dict[str, Provenance]):
+    """Mapping of task ids to their `Provenance`, with a short repr."""
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({counted_noun(len(self), 'task')})"
 
 
-def read_provenance(path: Path) -> dict[str, Provenance]:
+def read_provenance(path: Path) -> ProvenanceByTask:
     """Read meta/provenance.json: task_id -> provenance.
 
     Raises:
         IndexFormatError: if the file or the object of a task is malformed.
     """
-    text = read_text(path)
+    text, found, where = read_text(path), ProvenanceByTask(), ""
     try:
         content = parse_json(text)
-    except IndexFormatError as error:
-        raise IndexFormatError(f"{path}: {error}") from error
-    tasks = content if isinstance(content, dict) else {"": content}
-    found = {}
-    for task_id, of_task in tasks.items():
-        try:
+        for task_id, of_task in (content if isinstance(content, dict) else {"": content}).items():
+            where = f"not as `generation` writes it: {task_id[:100]!r}: "
             found[task_id] = Provenance.from_json(of_task)
-        except IndexFormatError as error:
-            raise IndexFormatError(f"{path}: not as `generation` writes it: {task_id[:100]!r}: {error}") from error
+    except IndexFormatError as error:
+        raise IndexFormatError(f"{path}: {where}{error}") from error
     return found

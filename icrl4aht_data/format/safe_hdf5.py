@@ -29,29 +29,12 @@ _ELEMENT_BYTES = 2**16
 _ATTRIBUTES = 16
 
 
-def exists(group: Any, path: str) -> bool:
-    """Return whether the file has a group or dataset at a path.
+def find(group: Any, path: str) -> Any:
+    """Return the group or dataset at a path; None if there is none.
 
     Raises:
         ValueError: if a link on the path may lead out of the file.
     """
-    return _find(group, path) is not None
-
-
-def member(group: Any, path: str) -> Any:
-    """Return the group or dataset at a path.
-
-    Raises:
-        ValueError: if a link on the path may lead out of the file.
-        KeyError: if the path does not exist.
-    """
-    found = _find(group, path)
-    if found is None:
-        raise KeyError(f"{path} is missing")
-    return found
-
-
-def _find(group: Any, path: str) -> Any:
     for part in path.strip("/").split("/"):
         name = part.encode()
         if part in ("", ".") or not isinstance(group, h5py.Group) or not group.id.links.exists(name):

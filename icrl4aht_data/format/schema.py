@@ -253,36 +253,6 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
 ENTRY_HINTS: dict[str, Any] = get_type_hints(Entry)
 """Field of an index line -> type without bounds."""
 
-JSON_TYPES: dict[str, set[type]] = {
-    name: {
-        int: {int},
-        str: {str},
-        bool: {bool},
-        float: {float, int},
-        int | None: {int, type(None)},
-        float | None: {float, int, type(None)},
-        tuple[int, int, int]: {list},
-    }[hint]
-    for name, hint in ENTRY_HINTS.items()
-}
-"""Field of an index line -> types that a JSON parser may return for it."""
-
-_BOUNDED = get_type_hints(Entry, include_extras=True)
-
-
-def check_value(name: str, value: Any) -> None:
-    """Check the type and bounds of an index field, and that a name is printable.
-
-    Raises:
-        IndexFormatError: if the value is invalid; with the field's name.
-    """
-    try:
-        msgspec.convert(value, _BOUNDED[name])
-        if isinstance(value, str):
-            check_name(value)
-    except (msgspec.ValidationError, IndexFormatError) as error:
-        raise IndexFormatError(f"field {name!r}: {error}, found {value!r:.200}") from error
-
 
 def check_name(text: str) -> None:
     """Check that a name is short and printable.

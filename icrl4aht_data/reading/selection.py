@@ -168,7 +168,7 @@ class Selection:
     @cached_property
     def provenance(self) -> ProvenanceByTask:
         """Origin of each task's histories, as in meta/provenance.json: task id -> record."""
-        return ProvenanceByTask(read_provenance(self.origin.file(PROVENANCE)))
+        return read_provenance(self.origin.file(PROVENANCE))
 
     @property
     def has_states(self) -> bool:

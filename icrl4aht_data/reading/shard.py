@@ -262,7 +262,7 @@ class Shards:
         """Return the shard with a path in the release; it is fetched if the release is remote."""
         if name not in self._open:
             entries = self._index.entries
-            members = [entries[row] for row in entries.shard_rows(name).tolist()]
+            members = [entries[row] for row in np.flatnonzero(entries.matches("shard", [name])).tolist()]
             self._open[name] = Shard(self._location, name, self._index.info, members, self.cache)
         return self._open[name]
 

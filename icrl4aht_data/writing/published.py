@@ -28,7 +28,7 @@ from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks, write_ta
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.safe_hdf5 import exists, member, read_dataset
+from icrl4aht_data.format.safe_hdf5 import find, read_dataset
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
     FIELDS,
@@ -266,8 +266,8 @@ def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenanc
 def _stored_kind(file: h5py.File, lines: list[dict[str, Any]]) -> Kind:
     """Return "lite" if all groups have states, "observations" if none has."""
     with _wrap_errors(f"{file.filename}: cannot be read"):
-        groups = [line["h5_group"] for line in lines if exists(file, line["h5_group"])]
-        without = [group for group in groups if not exists(file, f"{group}/state")]
+        groups = [line["h5_group"] for line in lines if find(file, line["h5_group"])]
+        without = [group for group in groups if not find(file, f"{group}/state")]
     if 0 < len(without) < len(groups):
         raise PublishedFormatError(
             f"{file.filename}, group {without[0]}: missing state, which other groups have; convert without states by "
@@ -343,8 +343,8 @@ class _PublishedHistory:
         """
         name = self.line["h5_group"]
         with _wrap_errors(f"{self.where}: cannot be read"):
-            group = member(self.file, name) if exists(self.file, name) else None
-            present = set() if group is None else {name for name in ("obs", *FIELDS) if exists(group, name)}
+            group = find(self.file, name)
+            present = {name for name in ("obs", *FIELDS) if find(group, name)}
         if not hasattr(group, "keys"):
             raise PublishedFormatError(f"{self.where}: missing, but the index names it")
         missing = [name for name in dict.fromkeys(("obs", *self.field_names())) if name not in present]
@@ -391,7 +391,7 @@ class _PublishedHistory:
         rows = steps if field.axis == "T" else steps // self.kept_steps
         shape = self.line["obs_shape"] if name == "obs" and self.short else field.held(layout).shape
         with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
-            found = read_dataset(member(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
+            found = read_dataset(find(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
         return self._compact(name, found)
 
     def _compact(self, name: str, found: np.ndarray) -> np.ndarray:

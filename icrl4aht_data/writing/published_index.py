@@ -9,16 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
+
+import msgspec
 
 from icrl4aht_data.benchmark.facts import FAMILIES, HEURISTIC_KINDS, KIND_FAMILIES
 from icrl4aht_data.benchmark.tasks import named_task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError, unknown
-from icrl4aht_data.format.schema import ENTRY_HINTS, check_value
+from icrl4aht_data.format.schema import ENTRY_HINTS, Entry, check_name
 from icrl4aht_data.utils.files import parse_json, read_lines
 
 PUBLISHED_FIELDS = tuple(ENTRY_HINTS)[:14]
 """Fields of an index line (paper, App. D.3)."""
+
+_HINTS = get_type_hints(Entry, include_extras=True)
+_Line = msgspec.defstruct("_Line", [(name, _HINTS[name]) for name in PUBLISHED_FIELDS])
 
 _KINDS = {"ippo": "rl"} | KIND_FAMILIES
 """Name of an algorithm or heuristic -> family."""
@@ -68,7 +73,11 @@ def read_published_index(path: Path, family_map: Mapping[str, str] | None = None
     seen: dict[Any, int] = {}
     for number, text in enumerate(read_lines(path), start=1):
         try:
-            line = _translate(_parse(text), FAMILY_MAP | dict(family_map or {}))
+            line = parse_json(text)
+            msgspec.convert(line, _Line)
+            for name in PUBLISHED_FIELDS:
+                check_name(str(line[name]))
+            line = _translate(line, FAMILY_MAP | dict(family_map or {}))
             named_task(line)
             for key, what in (
                 (line["h5_group"].strip("/"), f"group {line['h5_group']!r}"),
@@ -76,22 +85,12 @@ def read_published_index(path: Path, family_map: Mapping[str, str] | None = None
             ):
                 if (first := seen.setdefault(key, number)) != number:
                     raise PublishedFormatError(f"{what} is already that of line {first}; every history has its own")
-        except Icrl4ahtError as error:
+        except (msgspec.ValidationError, Icrl4ahtError) as error:
             raise PublishedFormatError(f"{path}, line {number}: {error}") from error
         lines.append(line)
     if not lines:
         raise PublishedFormatError(f"{path}: no histories")
     return lines
-
-
-def _parse(text: str) -> dict[str, Any]:
-    line = parse_json(text)
-    missing = set(PUBLISHED_FIELDS) - set(line) if isinstance(line, dict) else set(PUBLISHED_FIELDS)
-    if missing:
-        raise PublishedFormatError(f"missing the fields {sorted(missing)}")
-    for name in PUBLISHED_FIELDS:
-        check_value(name, line[name])
-    return line
 
 
 def _translate(line: dict[str, Any], family_map: Mapping[str, str]) -> dict[str, Any]:

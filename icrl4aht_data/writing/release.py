@@ -18,7 +18,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
 from icrl4aht_data.errors import OptionError, unknown
-from icrl4aht_data.format.info import LeftOutTask, check_version, describe, shard_sizes
+from icrl4aht_data.format.info import LeftOutTask, check_version, describe
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import (
@@ -186,7 +186,7 @@ def _write_meta(
     write_tasks(root / TASKS, tasks)
     provenance = {one.task.task_id: one.provenance for one in new}
     write_json(root / PROVENANCE, {task_id: of_task.to_json() for task_id, of_task in provenance.items()})
-    sizes = shard_sizes(root, entries)
+    sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in entries)}
     statistics = layout_statistics(entries, tasks, provenance, kept_steps, sizes)
     info = describe(kind, data_version, kept_steps, entries)
     info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))

@@ -28,7 +28,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.commands.cli import all_verbs, cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.schema import FIELDS, JSON_TYPES, Field, Kind
+from icrl4aht_data.format.schema import FIELDS, ENTRY_HINTS, Field, Kind
 from icrl4aht_data.overcooked import state
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_positions
 from icrl4aht_data.overcooked.layouts import LAYOUTS
@@ -232,7 +232,7 @@ class TestFormat:
             for field in FIELDS.values()
         ]
         fields = [(name, cells[1]) for cells in rows("format", "field") for name in cells[0].split(", ")]
-        assert fields == [(name, JSON_NAMES[frozenset(types)]) for name, types in JSON_TYPES.items()]
+        assert fields == [(name, JSON_NAMES[hint]) for name, hint in ENTRY_HINTS.items()]
         keys = {name for cells in rows("format", "key") for name in cells[0].split(", ")}
         assert keys == {field.name for field in dataclasses.fields(ReleaseInfo)}
 
@@ -248,13 +248,13 @@ class TestFormat:
 
 
 JSON_NAMES = {
-    frozenset({int}): "int",
-    frozenset({str}): "string",
-    frozenset({bool}): "bool",
-    frozenset({list}): "3 ints",
-    frozenset({int, type(None)}): "int or null",
-    frozenset({float, int}): "number",
-    frozenset({float, int, type(None)}): "number or null",
+    int: "int",
+    str: "string",
+    bool: "bool",
+    tuple[int, int, int]: "3 ints",
+    int | None: "int or null",
+    float: "number",
+    float | None: "number or null",
 }
 TYPE_NAMES = {"int32": "i4", "int8": "i1", "float32": "f4", "bool": "bool"}
 

@@ -144,7 +144,7 @@ def test_a_limit_of_file_size_is_an_error_that_leaves_nothing(folder):
 def test_a_full_disk_is_an_error_that_leaves_nothing(folder, announced):
     with small_disk(folder, 2**20):
         with pytest.raises(
-            CacheError, match=r"has no room for .*No space left on device, [\d,]+ bytes are free\); free"
+            CacheError, match=r"has no room for .*No space left on device; [\d,]+ of [\d,]+ bytes are free.*\); free"
         ):
             cached_arrays(KEY, announced, build)
         assert not list(folder.iterdir())

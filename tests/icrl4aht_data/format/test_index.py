@@ -119,14 +119,6 @@ def test_queries_find_what_a_scan_finds(long, folder):
         index.query(task_id=entries[0].task_id[:-1] + "x" * 99)
 
 
-def test_rows_of_a_shard(long):
-    root, entries = long
-    index = read_index(root)
-    for shard in {entry.shard for entry in entries}:
-        assert index.entries.shard_rows(shard).tolist() == [e.history_id for e in entries if e.shard == shard]
-    assert len(index.entries.shard_rows("data/none.h5")) == 0
-
-
 def test_a_changed_index_is_parsed_again(tmp_path, folder):
     root = tmp_path / "release"
     entries = long_index(root)

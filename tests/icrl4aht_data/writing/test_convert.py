@@ -94,7 +94,7 @@ def test_published_files_with_faults(published, tmp_path):
     fails("cannot be opened as HDF5")
     index = tmp_path / "files" / "histories_index.jsonl"
     index.write_text(index.read_text().replace('"track"', '"trick"', 1))
-    fails(r"histories_index\.jsonl, line 1: missing the fields \['track'\]")
+    fails(r"histories_index\.jsonl, line 1: Object missing required field `track`")
     (tmp_path / "files" / "tasks.jsonl").unlink()
     for name in ("histories.h5", "histories_index.jsonl"):
         shutil.copy(published / name, tmp_path / "files")

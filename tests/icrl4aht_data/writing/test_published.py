@@ -150,7 +150,7 @@ def test_duplicates_and_contradictions_are_refused(published_folder, tmp_path):
     cases = {
         "line 2: group '0' is already that of line 1": {1: {"h5_group": "0"}},
         "line 2: stream 10 of task 'task_a' is already that of line 1": {1: {"env_idx": 10}},
-        "line 2: field 'env_idx'": {1: {"env_idx": -1}},
+        r"line 2: Expected `int` >= 0 - at `\$\.env_idx`": {1: {"env_idx": -1}},
         "line 3: teammate_kind 'heuristic', but teammate_family 'ippo'": {
             2: {"teammate_family": "ippo", "teammate_kind": "heuristic"}
         },
