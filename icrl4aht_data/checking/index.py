@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from itertools import islice
+from operator import attrgetter
 
 from icrl4aht_data.benchmark.facts import kind_family
 from icrl4aht_data.benchmark.tasks import Task
@@ -23,6 +24,7 @@ _OF_A_TASK = (
     *("expert_return", "expert_return_sampled", "expert_step"),
 )
 """Index fields that are equal for all histories of a task."""
+_described = attrgetter("track", "split", "teammate_kind", "teammate_family", "seed")
 
 
 def check_index(index: Index, tasks: list[Task], provenance: Mapping[str, Provenance] | None, report: Report) -> None:
@@ -44,8 +46,8 @@ def check_index(index: Index, tasks: list[Task], provenance: Mapping[str, Proven
     _check_info(index, tasks, provenance, report)
     shards = {entry.shard for entry in index.entries}
     for shard in shards:
-        stem, count = shard.removesuffix(".h5").split("-")[0], int(shard.removesuffix(".h5").split("-")[-1])
-        names = (f"{stem}-{number:05}-of-{count:05}.h5" for number in range(count))
+        stem, _, _, count = shard.removesuffix(".h5").rsplit("-", 3)
+        names = (f"{stem}-{number:05}-of-{count}.h5" for number in range(int(count)))
         for name in islice((name for name in names if name not in shards), _NAMED):
             report.add(name, f"the name of {shard} implies this shard, but no history of the index is in it")
 
@@ -56,34 +58,25 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
     streams: set[tuple[str, int, int]] = set()
     first: dict[str, Entry] = {}
     for entry in index.entries:
+        where, stream = f"history {entry.history_id}:", (entry.task_id, entry.learner, entry.env_idx)
         task, other = by_id.get(entry.task_id), first.setdefault(entry.task_id, entry)
-        unlike = [name for name in _OF_A_TASK if getattr(entry, name) != getattr(other, name)]
-        if unlike:
+        if unlike := [name for name in _OF_A_TASK if getattr(entry, name) != getattr(other, name)]:
             report.add(HISTORIES, f"histories {other.history_id} and {entry.history_id}, of one task: unlike {unlike}")
         if not has_tasks and entry.seed != -1:
-            report.add(HISTORIES, f"history {entry.history_id}: seed: expected -1 without tasks, found {entry.seed}")
+            report.add(HISTORIES, f"{where} seed: expected -1 without tasks, found {entry.seed}")
         if kind_family(entry.teammate_kind) not in (None, entry.teammate_family):
-            report.add(
-                HISTORIES,
-                f"history {entry.history_id}: teammate_kind {entry.teammate_kind!r} is of another family than "
-                f"{entry.teammate_family}",
-            )
+            problem = f"teammate_kind {entry.teammate_kind!r} is of another family than {entry.teammate_family}"
+            report.add(HISTORIES, f"{where} {problem}")
         if task is None and has_tasks:
-            report.add(TASKS, f"history {entry.history_id}: its task {entry.task_id!r} is missing")
-        elif task is not None and not _describes(task, entry):
-            report.add(TASKS, f"history {entry.history_id}: index and task {entry.task_id!r} disagree")
-        stream = entry.task_id, entry.learner, entry.env_idx
+            report.add(TASKS, f"{where} its task {entry.task_id!r} is missing")
+        elif task is not None and (task.layout.name, *_described(task)) != (entry.layout, *_described(entry)):
+            report.add(TASKS, f"{where} index and task {entry.task_id!r} disagree")
         if stream in streams:
             of = f"learner {entry.learner} of " if entry.learner else ""
-            report.add(HISTORIES, f"history {entry.history_id}: stream {entry.env_idx} of {of}its task appears twice")
+            report.add(HISTORIES, f"{where} stream {entry.env_idx} of {of}its task appears twice")
         streams.add(stream)
     for task_id in by_id.keys() - first.keys():
         report.add(TASKS, f"task {task_id!r} has no history")
-
-
-def _describes(task: Task, entry: Entry) -> bool:
-    names = ("track", "split", "teammate_kind", "teammate_family", "seed")
-    return task.layout.name == entry.layout and all(getattr(task, name) == getattr(entry, name) for name in names)
 
 
 def _check_disjoint_teammates(tasks: list[Task], report: Report) -> None:

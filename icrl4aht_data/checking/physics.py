@@ -10,16 +10,15 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.rules import step
-from icrl4aht_data.overcooked.state import columns, record_size, start
+from icrl4aht_data.overcooked.state import columns, start
 from icrl4aht_data.reading.history import History
+from icrl4aht_data.writing.published_views import empty_views
 
 
 def observation_faults(layout: Layout, history: History) -> Iterator[str]:
     """Yield a problem if an observation does not match the layout's fixed cells; needs no state records."""
     fixed = fixed_channels(layout)
-    records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
-    records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
-    views = {view.tobytes() for view in observe(layout, records, EGO)[..., fixed]}
+    views = {view.tobytes() for view in empty_views(layout)[..., fixed]}
     wrong = [t for t, seen in enumerate(history.read("obs")[..., fixed]) if seen.tobytes() not in views]
     if wrong:
         yield f"obs: {len(wrong)} steps do not show {layout.name} from any cell of the ego's, first step {wrong[0]}"

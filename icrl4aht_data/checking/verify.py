@@ -5,7 +5,7 @@ A release of observations cannot be replayed: level "deep" checks only that each
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import get_args
@@ -18,7 +18,7 @@ from icrl4aht_data.checking.histories import check_chunks, check_history
 from icrl4aht_data.checking.index import check_index
 from icrl4aht_data.checking.provenance import check_provenance
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
-from icrl4aht_data.checking.structure import check_bytes_between, check_structure, has_grown
+from icrl4aht_data.checking.structure import check_structure
 from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.download import chosen_files
@@ -34,12 +34,11 @@ from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.files import resolve_inside
 
 _NOT_RECOMPUTED = {
-    "oracle_actions": "oracle actions of {count} histories: only their range was checked, not the script's choices",
-    "references": "returns of reference egos, of {count} tasks: taken from meta/provenance.json, not measured again",
-    "nearest_test": "nearest test teammates, of {count} tasks: taken from meta/provenance.json, not measured again",
-    "noise": "noise schedules, of {count} tasks: taken from meta/provenance.json, not compared with the actions",
+    "references": "returns of reference egos, of {} tasks: taken from meta/provenance.json, not measured again",
+    "nearest_test": "nearest test teammates, of {} tasks: taken from meta/provenance.json, not measured again",
+    "noise": "noise schedules, of {} tasks: taken from meta/provenance.json, not compared with the actions",
 }
-"""Value that verification cannot recompute -> note in the report."""
+"""Field of a provenance that verification cannot recompute -> note in the report."""
 
 
 def verify_release(
@@ -115,10 +114,15 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     report.replayed = report.level == "deep" and index.info.kind in KINDS
     if report.level == "deep" and not report.replayed:
         report.notes.append("nothing was replayed: without state records, steps cannot be compared with the rules")
-    provenance = _read_provenance(origin, report)
+    provenance = None
+    try:
+        provenance = read_provenance(resolve_inside(origin.folder, PROVENANCE))
+    except Icrl4ahtError as error:
+        if PROVENANCE not in report.files_at_fault:
+            report.add(PROVENANCE, str(error))
     check_references(listed, index, tasks, provenance, report)
     if report.level == "deep":
-        _note_unchecked_values(index, provenance or {}, report)
+        report.notes += _unchecked_values(index, provenance or {})
     if provenance is not None:
         check_provenance(index, tasks, provenance, report)
     check_index(index, tasks, provenance, report)
@@ -132,25 +136,13 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         _check_shards(index, shards, report, advance)
 
 
-def _note_unchecked_values(index: Index, provenance: Mapping[str, Provenance], report: Report) -> None:
-    """Add notes about the values that verification cannot recompute."""
+def _unchecked_values(index: Index, provenance: Mapping[str, Provenance]) -> Iterator[str]:
+    """Yield notes about the values that verification cannot recompute."""
+    if count := np.count_nonzero(index.entries.column("has_oracle_actions")):
+        yield f"oracle actions of {count} histories: only their range was checked, not the script's choices"
     for name, note in _NOT_RECOMPUTED.items():
-        if name == "oracle_actions":
-            count = np.count_nonzero(index.entries.column("has_oracle_actions"))
-        else:
-            count = sum(getattr(of_task, name, None) is not None for of_task in provenance.values())
-        if count:
-            report.notes.append(note.format(count=count))
-
-
-def _read_provenance(origin: ReleaseLocation, report: Report) -> dict[str, Provenance] | None:
-    """Return the content of meta/provenance.json; if it cannot be read, report a problem and return None."""
-    try:
-        return read_provenance(resolve_inside(origin.folder, PROVENANCE))
-    except Icrl4ahtError as error:
-        if PROVENANCE not in report.files_at_fault:
-            report.add(PROVENANCE, str(error))
-        return None
+        if count := sum(getattr(of_task, name) is not None for of_task in provenance.values()):
+            yield note.format(count)
 
 
 def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgress) -> None:
@@ -186,10 +178,7 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Name
         except Icrl4ahtError as error:
             report.add(name, str(error))
             continue
-        faults = check_bytes_between(shard)
-        if not has_grown(shard):  # libhdf5 must not open a sparse file of a terabyte
-            faults += check_structure(shard, values=report.level == "deep")
-        for fault in faults:
+        for fault in check_structure(shard, values=report.level == "deep"):
             report.add(name, fault)
         damaged = check_chunks(shard, report)
         contents: dict[tuple[str, bytes], int] = {}

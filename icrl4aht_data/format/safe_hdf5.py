@@ -7,7 +7,10 @@ any error of h5py. Callers add the file's name.
 from __future__ import annotations
 
 import math
+import mmap
+import re
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -24,9 +27,27 @@ OLDEST_HDF5 = (1, 10, 5)
 
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
+_SUPERBLOCKS = tuple(b"\x89HDF\r\n\x1a\n" + bytes([version, 8, 8]) for version in (2, 3))  # with addresses of 8 bytes
+_LOCAL_HEAP = re.compile(rb"HEAP\0.{8}\0{3}", re.DOTALL)  # with a size below a terabyte, others are refused by libhdf5
+
 _CHUNK_BYTES = 256 * 2**20
 _ELEMENT_BYTES = 2**16
 _ATTRIBUTES = 16
+
+
+def check_no_local_heap(path: Path) -> None:
+    """Check that libhdf5 can open a shard without a local heap, whose free list may be forged to be endless.
+
+    The writer's shards have no local heap, since groups do not need one from HDF5 1.8 on.
+
+    Raises:
+        ValueError: if the file has a local heap, or is of an older HDF5 version.
+    """
+    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        if not data[:11].startswith(_SUPERBLOCKS):
+            raise ValueError("expected a superblock of version 2 or 3")
+        if found := _LOCAL_HEAP.search(data):
+            raise ValueError(f"a local heap at byte {found.start()}, which shards do not have")
 
 
 def find(group: Any, path: str) -> Any:
@@ -46,7 +67,9 @@ def find(group: Any, path: str) -> Any:
 
 
 def attributes(file: h5py.File) -> dict[str, Any]:
-    """Return the file's attributes.
+    """Return the file's attributes: a number itself, for a text `str`.
+
+    Texts are not read, because they are in a global heap, which may be forged to be endless.
 
     Raises:
         ValueError: if there are too many, or one is not a single number or text.
@@ -56,7 +79,7 @@ def attributes(file: h5py.File) -> dict[str, Any]:
         attribute = file.attrs.get_id(name)
         if number == _ATTRIBUTES or attribute.shape or _type_class(attribute) not in (h5t.INTEGER, h5t.STRING):
             raise ValueError(f"attribute {name!r}: expected few attributes, single numbers and texts")
-        found[name] = file.attrs[name]
+        found[name] = file.attrs[name] if _type_class(attribute) == h5t.INTEGER else str
     return found
 
 

@@ -28,6 +28,13 @@ def is_short(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
     return layout.height < WINDOW and tuple(obs_shape) == (layout.height, *layout.obs_shape[1:])
 
 
+def empty_views(layout: Layout) -> np.ndarray:
+    """Return the views from each cell of the ego's room in a layout without items, uint8 (cells, 5, 5, C)."""
+    records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
+    records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
+    return np.asarray(observe(layout, records, EGO))
+
+
 def complete_views(layout: Layout, short: np.ndarray) -> np.ndarray:
     """Pad short views to five rows.
 
@@ -42,11 +49,7 @@ def complete_views(layout: Layout, short: np.ndarray) -> np.ndarray:
         PublishedFormatError: if a view does not match the layout from any cell of the ego's room; without file and
             group, which the caller adds.
     """
-    rows = short.shape[1]
-    fixed = fixed_channels(layout)
-    records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
-    records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
-    known = np.asarray(observe(layout, records, EGO))
+    rows, fixed, known = short.shape[1], fixed_channels(layout), empty_views(layout)
     cells = {view[:rows, :, fixed].tobytes(): cell for cell, view in enumerate(known)}
     at = np.array([cells.get(view.tobytes(), -1) for view in np.ascontiguousarray(short[..., fixed])], np.int64)
     if (at < 0).any():

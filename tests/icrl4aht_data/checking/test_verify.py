@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
+import subprocess
+import sys
 
+import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -23,6 +27,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing import release
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from icrl4aht_data.writing.shard_writer import metadata_lines
 from tests.helpers.random_releases import SHARD, make_tasks, random_history, random_release
 
 
@@ -318,13 +323,41 @@ def test_chunk_offsets_beyond_any_file(damaged):
 
 
 def test_a_group_where_a_dataset_should_be(damaged):
-    import h5py
-
     with h5py.File(damaged / SHARD, "r+") as file:
         del file["0/actions"]
         file.create_group("0/actions")
-    write_manifest(damaged)
+    cover_again(damaged)
     assert any("hdf5" in problem.lower() for problem in problems(damaged)), problems(damaged)
+
+
+def cover_again(root):
+    """Correct the chunk table's rows of the bytes between the chunks, and the manifest."""
+    path = chunk_table_path(root, SHARD)
+    table = np.load(path)
+    chunks = table[table["rows"] > 0]
+    np.save(path, np.concatenate([chunks, metadata_lines((root / SHARD).read_bytes(), chunks)]))
+    write_manifest(root)
+
+
+@pytest.mark.parametrize("heap", ["local", "global"])
+def test_an_endless_heap_in_a_shard(damaged, heap):
+    """Regression: libhdf5 follows a free list or an object that points to itself for ever."""
+    path = damaged / SHARD
+    if heap == "local":
+        with h5py.File(path, "r+", libver="earliest") as file:
+            file.create_group("old").create_group("group")
+    data = bytearray(path.read_bytes())
+    at = data.find(b"HEAP\0" if heap == "local" else b"GCOL\1")
+    if heap == "local":
+        free, address = struct.unpack_from("<QQ", data, at + 16)
+        struct.pack_into("<QQ", data, address + free, free, 16)
+    else:
+        struct.pack_into("<HHIQ", data, at + 16, 0, 0, 0, 0)
+    path.write_bytes(data)
+    cover_again(damaged)
+    command = [sys.executable, "-m", "icrl4aht_data", "verify", str(damaged)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert ("a local heap at byte" in done.stdout) == (heap == "local"), done
 
 
 class TestCommand:

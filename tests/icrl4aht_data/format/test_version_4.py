@@ -131,10 +131,14 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        (HISTORIES, lambda c: c[5].update(learner=2), "history 5: learner 2, but learners are 2"),
+        (HISTORIES, lambda c: c[5].update(learner=2), "history 5: learner: expected less than the 2 learners, found 2"),
         (HISTORIES, lambda c: c[4].update(learner=0), "history 4: stream 0 of its task appears twice"),
         (HISTORIES, lambda c: c[5].update(env_idx=0), "history 5: stream 0 of learner 1 of its task appears twice"),
-        (HISTORIES, lambda c: c[5].update(env_idx=2), "history 5: env_idx 2, but a learner has 2 environments"),
+        (
+            HISTORIES,
+            lambda c: c[5].update(env_idx=2),
+            "5: env_idx: expected less than the 2 environments",
+        ),
         (HISTORIES, lambda c: c[0].update(learner=-1), "Expected `int` >= 0"),
         (HISTORIES, lambda c: c[1].update(source="ppo"), "histories 0 and 1, of one task: unlike ['source']"),
         (
@@ -144,7 +148,11 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
         ),
         (HISTORIES, lambda c: c[0].update(has_oracle_actions=False), "the index implies"),
         (PROVENANCE, lambda c: last(c).update(learners=0), "Expected `int` >= 1"),
-        (PROVENANCE, lambda c: last(c).update(streams_recorded=2), "expected 2 of each of 2 learners' environments"),
+        (
+            PROVENANCE,
+            lambda c: last(c).update(streams_recorded=2),
+            "expected 4, 2 of each of 2 learners, found 2",
+        ),
         (PROVENANCE, lambda c: first(c)["noise"].update(histories=1), "noise.histories: expected at least the 2"),
         (PROVENANCE, lambda c: first(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history 0"),
         (PROVENANCE, lambda c: first(c)["noise"].update(start=[0.9, 1.1]), "Expected `float` <= 1"),
