@@ -49,7 +49,7 @@ from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_publish
 from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, as_path, atomic_folder, check_target
-from icrl4aht_data.writing.stored import HistoryProgress, LazyArrays, with_source
+from icrl4aht_data.writing.stored import HistoryProgress, with_source
 
 PUBLISHED_CHUNK = 4096
 """Steps per chunk in the published files."""
@@ -208,7 +208,7 @@ def from_published(
             learner, stream = 0, group.line["env_idx"]
             if (made.learners or 1) > 1:
                 learner, stream = divmod(stream, _streams_each(made))
-            yield NewHistory(stream, LazyArrays(group.field_names(), group.read), learner)
+            yield NewHistory(stream, {name: group.read(name) for name in group.field_names()}, learner)
             _check_content(group, seen)
             advance(next(numbers), len(lines))
 

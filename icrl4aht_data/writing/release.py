@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -59,7 +58,7 @@ class NewHistory:
     Args:
         env_idx: environment stream within the learner's parallel rollout, or number of a noise history.
         arrays: field name -> array, for the fields `schema.held_fields` of the release's kind; a full release renders
-            `obs` from the states. May be a lazy mapping, to keep few arrays in memory.
+            `obs` from the states.
         learner: number of the independent learner that made the history, from 0.
     """
 
@@ -68,9 +67,14 @@ class NewHistory:
     learner: int = 0
 
     @classmethod
-    def from_history(cls, history: History) -> NewHistory:
-        """Return a history to write, with the fields of a lite release, from one of any release with states."""
-        names = [field.name for field in history.entry.stored_fields("lite")]
+    def from_history(cls, history: History, kind: Kind = "lite") -> NewHistory:
+        """Return a history to write from one of any release, with the fields that a kind of release needs.
+
+        Args:
+            history: the history.
+            kind: kind of the release to write; a full one needs no observations, because it renders them.
+        """
+        names = [field.name for field in history.entry.stored_fields("lite" if kind in KINDS else kind)]
         return cls(history.entry.env_idx, {name: history.read(name) for name in names}, history.entry.learner)
 
 
@@ -193,20 +197,6 @@ def _write_meta(
     write_json(root / INFO, info.to_json())
 
 
-class _LoadedHistory(NamedTuple):
-    """One history with its index entry.
-
-    Attributes:
-        task: the task of the history.
-        entry: the index entry, without id and position in a shard.
-        arrays: field -> array (T, ...), or (E, S) for `episode_end_state`.
-    """
-
-    task: Task
-    entry: Entry
-    arrays: Mapping[str, np.ndarray]
-
-
 @dataclass
 class _ShardWriter:
     """Writer of a release's shards; `entries` are the index entries of the histories written so far."""
@@ -224,35 +214,30 @@ class _ShardWriter:
         histories = (history for new in tasks for history in self._load(new))
         total = sum(new.streams for new in tasks)
         first = list(islice(histories, 1))
-        encoded = [self._encode(history) for history in first]
-        size = sum(len(chunk.data) for chunks in encoded for chunk in chunks)
+        size = sum(len(chunk.data) for _, chunks in first for chunk in chunks)
         shards = max(1, -(-total // self.shard_histories), min(total, round(total * size / self.shard_bytes)))
         histories = chain(first, histories)
         for number in range(shards):
             part = list(islice(histories, total * (number + 1) // shards - total * number // shards))
             name = f"{stem}-{number:05}-of-{shards:05}.h5"
-            entries = self._with_positions([history.entry for history in part], name)
-            chunks = chain(encoded, (self._encode(history) for history in part[len(encoded) :]))
-            write_shard(self.root, name, self.kind, entries, chunks)
+            entries = self._with_positions([entry for entry, _ in part], name)
+            write_shard(self.root, name, self.kind, entries, [chunks for _, chunks in part])
             self.entries += entries
-            encoded = []
         for _ in histories:  # exhaust the generator, so that `_load` checks the count and reports the last task
             pass
 
-    def _load(self, new: NewTask) -> Iterator[_LoadedHistory]:
+    def _load(self, new: NewTask) -> Iterator[tuple[Entry, list[EncodedChunk]]]:
+        """Yield the entry and the chunks of each history of a task; only one history's arrays are in memory."""
         given = 0
         for history in new.load():
-            yield _LoadedHistory(new.task, self._entry(new, history), history.arrays)
+            entry, arrays = self._entry(new, history), history.arrays
+            if self.kind == "full":
+                arrays = {**arrays, "obs": observe(new.task.layout, arrays["state"], EGO)}
+            yield entry, encode_history(self.kind, entry, arrays)
             given += 1
         if given != new.streams:
             raise OptionError(f"task {new.task.task_id}: {given} histories, but {new.streams} were announced")
         self.done(new.task)
-
-    def _encode(self, history: _LoadedHistory) -> list[EncodedChunk]:
-        arrays = history.arrays
-        if self.kind == "full":
-            arrays = {**arrays, "obs": observe(history.task.layout, arrays["state"], EGO)}
-        return encode_history(self.kind, history.entry, arrays)
 
     def _entry(self, new: NewTask, history: NewHistory) -> Entry:
         """Return the index entry of a history, without its id and its position in a shard."""
@@ -306,16 +291,13 @@ class _ShardWriter:
 
     def _with_positions(self, entries: list[Entry], shard: str) -> list[Entry]:
         """Return entries with ids and positions in a shard; a lite shard stacks histories of equal shape in a group."""
-        rows: dict[tuple, int] = defaultdict(int)  # shape of a group -> number of rows so far
+        rows: dict[tuple, int] = {}  # shape of a group -> number of rows so far
         placed: list[Entry] = []
         for number, entry in enumerate(entries):
             stacked = self.kind == "lite"
-            labels = entry.has_expert_actions, entry.has_oracle_actions
-            shape = (entry.T, entry.episodes, labels) if stacked else (number,)
-            row = rows[shape]
-            rows[shape] += 1
-            group, history_id = f"/{list(rows).index(shape)}", len(self.entries) + number
-            row = row if stacked else None
-            position = {"shard": shard, "history_id": history_id, "h5_group": group, "h5_row": row}
-            placed.append(msgspec.structs.replace(entry, **position))
+            shape = (entry.T, entry.episodes, entry.has_expert_actions, entry.has_oracle_actions)
+            key = shape if stacked else (number,)
+            row = rows[key] = rows.get(key, -1) + 1
+            position = {"h5_group": f"/{list(rows).index(key)}", "h5_row": row if stacked else None, "shard": shard}
+            placed.append(msgspec.structs.replace(entry, history_id=len(self.entries) + number, **position))
         return placed

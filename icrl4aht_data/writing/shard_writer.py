@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -23,7 +25,7 @@ from icrl4aht_data.format.chunks import (
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import add_filename
-from icrl4aht_data.utils.system import in_slices, usable_cores
+from icrl4aht_data.utils.system import usable_cores
 
 _BLOCK = 2000  # steps; the length of one chunk of scalars or two chunks of records
 
@@ -43,7 +45,7 @@ class EncodedChunk(NamedTuple):
 
 
 def write_shard(
-    root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Iterable[Sequence[EncodedChunk]]
+    root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Sequence[Sequence[EncodedChunk]]
 ) -> None:
     """Write a shard and its chunk table into a release folder that no reader has opened yet.
 
@@ -65,14 +67,11 @@ def write_shard(
         file.attrs["layout"] = layout.name
         for group in dict.fromkeys(entry.h5_group for entry in entries):
             _create_datasets(file, layout, kind, [entry for entry in entries if entry.h5_group == group])
-        opened: dict[str, Any] = {}  # cached, since opening a dataset takes as long as writing a chunk
+        open_dataset = cache(lambda name: file[name])  # opening a dataset takes as long as writing a chunk
         for entry, chunks in zip(entries, histories, strict=True):
             for field, start, data in sorted(chunks, key=lambda chunk: file_order(chunk.field, chunk.start)):
                 position = (start,) if entry.h5_row is None else (entry.h5_row, start)
-                name = f"{entry.h5_group}/{field.name}"
-                if name not in opened:
-                    opened[name] = file[name]
-                opened[name].id.write_direct_chunk(position, data)
+                open_dataset(f"{entry.h5_group}/{field.name}").id.write_direct_chunk(position, data)
             checksums += [_checksums(chunk.data) for chunk in chunks]
         table = np.zeros(len(checksums), CHUNK_DTYPE)
         table["crc32"] = [crc32 for crc32, _ in checksums]
@@ -163,13 +162,6 @@ def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -
         parts += [
             (field, start, stored[start : start + length], length, element.itemsize) for start in range(0, rows, length)
         ]
-    encoded = [b""] * len(parts)
-    threads = min(usable_cores(), len(parts))
-
-    def encode(first: int, stop: int) -> None:
-        for thread in range(first, stop):  # strided, since some fields take longer to encode
-            for number in range(thread, len(parts), threads):
-                encoded[number] = encode_chunk(*parts[number][2:])
-
-    in_slices(encode, threads, threads)
-    return [EncodedChunk(field, start, data) for (field, start, *_), data in zip(parts, encoded, strict=True)]
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        encoded = pool.map(lambda part: encode_chunk(*part[2:]), parts)
+        return [EncodedChunk(field, start, data) for (field, start, *_), data in zip(parts, encoded, strict=True)]

@@ -1,47 +1,19 @@
-"""Input of `write_release` from existing releases, read one array at a time."""
+"""Input of `write_release` from existing releases, read one history at a time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-
-import numpy as np
 
 from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files, expert_folder
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import TASKS, TEAMMATES, Kind, held_fields
+from icrl4aht_data.format.schema import TASKS, TEAMMATES, Kind
 from icrl4aht_data.writing.release import NewHistory, NewTask
 
 HistoryProgress = Callable[[int, int], None]
 """Callback that receives the number of histories done and their total."""
-
-
-class LazyArrays(Mapping[str, np.ndarray]):
-    """Arrays of one history, each read on access, so that a shard's arrays need not fit in memory.
-
-    Args:
-        names: names of the fields.
-        read: function that returns the array of a field.
-    """
-
-    def __init__(self, names: Sequence[str], read: Callable[[str], np.ndarray]) -> None:
-        self._names, self._read = names, read
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self._names:
-            raise KeyError(name)
-        return self._read(name)
-
-    def __contains__(self, name: object) -> bool:  # the inherited method would read the array
-        return name in self._names
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
 
 
 def release_tasks(dataset: Dataset) -> list[Task]:
@@ -66,9 +38,7 @@ def stored_task(
 
     def load() -> Iterator[NewHistory]:
         for history in dataset:
-            stored = history.entry.stored_fields(kind)
-            names = [field.name for field in held_fields(kind) if field in stored]
-            yield NewHistory(history.entry.env_idx, LazyArrays(names, history.read), history.entry.learner)
+            yield NewHistory.from_history(history, kind)
             done()
 
     if task.teammate.get("kind") == "rl":
