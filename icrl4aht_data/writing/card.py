@@ -176,9 +176,10 @@ def facts(root: Path) -> dict[str, Any]:
         _TaskFacts(own[0], own, by_id.get(name), provenance.get(name, Provenance())) for name, own in members.items()
     ]
     teammates = _teammates(tasks, list(info.layouts))
-    headroom: dict[str, bool] = {}
+    matters = defaultdict[str, list[bool]](list)
     for row in (row for row in teammates if row["matters"] is not None):
-        headroom[row["layout"]] = headroom.get(row["layout"], False) or row["matters"]
+        matters[row["layout"]].append(row["matters"])
+    headroom = {layout: any(found) for layout, found in matters.items()}
     first = min(entries, key=lambda entry: (entry.split != "train", entry.history_id))
     length = min(500, *(entry.T for entry in entries if (entry.split, entry.layout) == (first.split, first.layout)))
     tested = evaluated_on(info.layouts)
@@ -195,7 +196,7 @@ def facts(root: Path) -> dict[str, Any]:
         "algorithms": [name for name in ALGORITHMS if name in {entry.teammate_kind for entry in entries}],
         "labelled": {name: sum(e.has(FIELDS[f"{name}_actions"]) for e in entries) for name in ("expert", "oracle")},
         "example": {"split": first.split, "layout": first.layout, "length": length},
-        "layouts": _layouts(info, teammates),
+        "layouts": _layouts(info, matters),
         "learning": _learning(tasks, "layout", "source", "split"),
         "learning_by_layout": _learning(tasks, "layout", "source"),
         "learning_totals": {
@@ -255,17 +256,11 @@ def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str,
 
 def _grouped(tasks: Iterable[_TaskFacts], *names: str) -> dict[tuple[str, ...], list[_TaskFacts]]:
     """Group tasks by the values of some index fields, in the usual order of sources and splits."""
-    groups: dict[tuple[str, ...], list[_TaskFacts]] = {}
+    groups = defaultdict[tuple[str, ...], list[_TaskFacts]](list)
     for task in tasks:
-        groups.setdefault(tuple(getattr(task.first, name) for name in names), []).append(task)
-    orders: list[dict[str, int]] = []
-    for name, values in zip(names, zip(*groups, strict=True), strict=True):
-        known = {"source": SOURCES, "split": SPLITS}.get(name, ())  # other fields are ordered by first appearance
-        orders.append({value: number for number, value in enumerate(dict.fromkeys([*known, *values]))})
-    return {
-        key: groups[key]
-        for key in sorted(groups, key=lambda key: [order[value] for order, value in zip(orders, key, strict=True)])
-    }
+        groups[tuple(getattr(task.first, name) for name in names)].append(task)
+    order = [*SOURCES, *SPLITS, *(value for key in groups for value in key)]  # others by first appearance
+    return {key: groups[key] for key in sorted(groups, key=lambda key: list(map(order.index, key)))}
 
 
 def _learning(tasks: Iterable[_TaskFacts], *names: str) -> list[dict[str, Any]]:
@@ -323,11 +318,10 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
 
 def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the numbers of teammates with known behaviour and of distinct behaviours, by split."""
-    found: dict[str, list[tuple[Any, ...]]] = {}
+    found = defaultdict[str, list[tuple[Any, ...]]](list)
     for row in teammates:
         if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None:
-            behaviour = row["layout"], row["family"], row["nearest_test"]["behaviour"]
-            found.setdefault(row["split"], []).append(behaviour)
+            found[row["split"]].append((row["layout"], row["family"], row["nearest_test"]["behaviour"]))
     counts = {split: (len(found[split]), len(set(found[split]))) for split in SPLITS if split in found}
     shared = set(found.get("train", ())) & set(found.get("validation", ()))
     return {"behaviours": counts, "shared_behaviours": len(shared)}
@@ -356,9 +350,8 @@ def _test_headroom(layouts: Sequence[str]) -> list[list[str]]:
     cells, rows = read_headroom(HEADROOM_PROTOCOL), []
     for family in HEURISTICS:
         known = [cells.get((layout, family)) for layout in layouts]
-        gains = ["" if found is None else f"{found['oracle'] - found['stay']:z.1f}" for found in known]
-        bold = [found is not None and has_headroom(found) for found in known]
-        rows.append([family, *(f"**{gain}**" if has else gain for gain, has in zip(gains, bold, strict=True))])
+        gains = [found and (f"{found['oracle'] - found['stay']:z.1f}", has_headroom(found)) for found in known]
+        rows.append([family, *(f"**{gain[0]}**" if gain and gain[1] else gain[0] if gain else "" for gain in gains)])
     return rows
 
 
@@ -377,19 +370,14 @@ def _counts(tasks: Iterable[_TaskFacts]) -> dict[tuple[str, str], int]:
     return Counter((task.first.layout, task.first.source) for task in tasks)
 
 
-def _layouts(info: ReleaseInfo, teammates: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the rows of the card's table of layouts."""
+def _layouts(info: ReleaseInfo, matters: Mapping[str, Sequence[bool]]) -> list[list[str]]:
+    """Return the rows of the card's table of layouts; `matters` says of each teammate whether the ego matters."""
     rows = []
     for name, found in info.layouts.items():
-        layout, own = get_layout(name), [row for row in teammates if row["layout"] == name]
-        known = [row["matters"] for row in own if row["matters"] is not None]
-        rows.append(
-            [
-                *(name, f"`{layout.alias}`", f"{layout.width} x {layout.height}", str(layout.obs_shape[-1])),
-                *(f"{found.histories:,}", f"{found.transitions:,}", f"{found.mean_final_return:z.1f}"),
-                f"{sum(known)} of {len(known)}" if known else "unknown",
-            ]
-        )
+        layout, known = get_layout(name), matters.get(name)
+        row = [name, f"`{layout.alias}`", f"{layout.width} x {layout.height}", str(layout.obs_shape[-1])]
+        row += [f"{found.histories:,}", f"{found.transitions:,}", f"{found.mean_final_return:z.1f}"]
+        rows.append([*row, f"{sum(known)} of {len(known)}" if known else "unknown"])
     return rows
 
 

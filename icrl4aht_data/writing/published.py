@@ -213,10 +213,11 @@ def from_published(
             advance(next(numbers), len(lines))
 
     with file:
-        found: Kind = kind or _stored_kind(file, lines)
+        present = [_stored_names(file, line["h5_group"]) for line in lines]
+        found: Kind = kind or _stored_kind(file, lines, present)
         histories = [_PublishedHistory(file, line, found, kept_steps) for line in lines]
-        for history in histories:
-            history.check_arrays()
+        for history, names in zip(histories, present, strict=True):
+            history.check_arrays(names)
         new = [
             NewTask(
                 task,
@@ -263,17 +264,25 @@ def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenanc
     return replace(provenance, other={**provenance.other, "published": notes}) if notes else provenance
 
 
-def _stored_kind(file: h5py.File, lines: list[dict[str, Any]]) -> Kind:
+def _stored_names(file: h5py.File, group: str) -> set[str] | None:
+    """Return the names of the known arrays in a group; None if the group is missing."""
+    with _wrap_errors(f"{file.filename}, group {group}: cannot be read"):
+        found = find(file, group)
+        return {name for name in FIELDS if find(found, name)} if isinstance(found, h5py.Group) else None
+
+
+def _stored_kind(file: h5py.File, lines: list[dict[str, Any]], present: list[set[str] | None]) -> Kind:
     """Return "lite" if all groups have states, "observations" if none has."""
-    with _wrap_errors(f"{file.filename}: cannot be read"):
-        groups = [line["h5_group"] for line in lines if find(file, line["h5_group"])]
-        without = [group for group in groups if not find(file, f"{group}/state")]
-    if 0 < len(without) < len(groups):
+    groups = {
+        line["h5_group"]: "state" in names for line, names in zip(lines, present, strict=True) if names is not None
+    }
+    if len(set(groups.values())) == 2:
+        without = next(group for group, has_state in groups.items() if not has_state)
         raise PublishedFormatError(
-            f"{file.filename}, group {without[0]}: missing state, which other groups have; convert without states by "
+            f"{file.filename}, group {without}: missing state, which other groups have; convert without states by "
             f"`convert --to observations`"
         )
-    return OBSERVATIONS if without else "lite"
+    return "lite" if all(groups.values()) else OBSERVATIONS
 
 
 def _tasks(
@@ -335,17 +344,16 @@ class _PublishedHistory:
         fields = held_fields(self.kind)
         return [f.name for f in fields if self.kind not in f.optional or self.line.get(f"has_{f.name}")]
 
-    def check_arrays(self) -> None:
+    def check_arrays(self, present: set[str] | None) -> None:
         """Check that the group has the arrays to convert, and observations.
+
+        Args:
+            present: the names of its arrays; None if the group is missing.
 
         Raises:
             PublishedFormatError: if arrays are missing; with the group and their names.
         """
-        name = self.line["h5_group"]
-        with _wrap_errors(f"{self.where}: cannot be read"):
-            group = find(self.file, name)
-            present = {name for name in ("obs", *FIELDS) if find(group, name)}
-        if not hasattr(group, "keys"):
+        if present is None:
             raise PublishedFormatError(f"{self.where}: missing, but the index names it")
         missing = [name for name in dict.fromkeys(("obs", *self.field_names())) if name not in present]
         if missing:

@@ -8,16 +8,15 @@ from operator import mul
 from typing import Any
 
 import numpy as np
-from rich import box, filesize
+from rich import filesize
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LayoutStatistics, ReleaseInfo
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import Entry
 from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.utils.templates import markdown_table
 
 _ROWS = {
     "original_transitions": "Original transitions",
@@ -84,12 +83,12 @@ def _policy(task: Task) -> str:
 
 def print_statistics(info: ReleaseInfo, console: Console) -> None:
     """Print the statistics in a release's info, one row per property and one column per layout."""
-    table = Table("property", box=box.MARKDOWN, title=escape(f"{info.kind} release {info.data_version}"))
-    for layout in info.statistics:
-        table.add_column(layout, justify="right")
-    for name, label in _ROWS.items():
-        table.add_row(label, *(_in_words(name, getattr(found, name)) for found in info.statistics.values()))
-    console.print(table, width=max(console.width, 30 + 16 * len(info.statistics)), crop=False)
+    rows = [
+        [label, *(_in_words(name, getattr(found, name)) for found in info.statistics.values())]
+        for name, label in _ROWS.items()
+    ]
+    _print(f"{info.kind} release {info.data_version}", console)
+    _print(markdown_table(["property", *info.statistics], rows, right=len(info.statistics)), console)
 
 
 def print_learning(content: Mapping[str, Any], console: Console) -> None:
@@ -103,16 +102,16 @@ def print_learning(content: Mapping[str, Any], console: Console) -> None:
     totals = [
         row | {"layout": title, "split": "all"} for title, own in content["learning_totals"].items() for row in own
     ]
-    lines = [list(learning[0]), *([_cell(row[name]) for name in learning[0]] for row in (*learning, *totals))]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    console.print("Learning, by layout and source:")
-    for line in lines:
-        text = "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+    _print("Learning, by layout and source:", console)
+    rows = [[_cell(row[name]) for name in learning[0]] for row in (*learning, *totals)]
+    _print(markdown_table(list(learning[0]), rows), console)
     for task in content["left_out"]:
         source = f" ({task['source']})" if task["source"] else ""
-        text = f"left out: {task['layout']} with {task['teammate']}{source}: {task['reason']}"
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        _print(f"left out: {task['layout']} with {task['teammate']}{source}: {task['reason']}", console)
+
+
+def _print(text: str, console: Console) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _cell(value: Any) -> str:

@@ -192,7 +192,7 @@ def test_how_histories_were_made(write):
 def test_learning_is_printed(write):
     output = StringIO()
     print_learning(write(), Console(file=output, width=80))
-    lines = [line.split() for line in output.getvalue().splitlines()]
+    lines = [line.replace("|", "").split() for line in output.getvalue().splitlines()]
     assert ["demo_wide", "noise", "train", "H3", "1", "2", "240", "0.50", "43.00", "1.00"] in lines
     assert ["with", "headroom", "ppo", "all", "H3", "1", "2", "2", "240", "0.00", "12.00", "0.50"] in lines
     assert "left out: demo_wide with H1/t3 (ppo): the learners did not learn" in output.getvalue()
