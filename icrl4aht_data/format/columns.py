@@ -115,11 +115,14 @@ def _parse(path: Path) -> dict[str, np.ndarray]:
     parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
     entries = _entries(path)
     while block := list(islice(entries, _BLOCK)):
+        columns = zip(*map(msgspec.structs.astuple, block), strict=True)
+        values: dict[str, Sequence[Any]] = dict(zip(ENTRY_HINTS, columns, strict=True))
+        for name, absent in _ABSENT.items():
+            values[name] = [absent if value is None else value for value in values[name]]
         for name, dtype in _NUMBERS.items():
-            values = [getattr(entry, name) for entry in block]
-            parts[name].append(np.array([_ABSENT[name] if value is None else value for value in values], dtype))
+            parts[name].append(np.array(values[name], dtype))
         for name, known in codes.items():
-            parts[name].append(np.array([known[getattr(entry, name)] for entry in block], np.int32))
+            parts[name].append(np.fromiter(map(known.__getitem__, values[name]), np.int32, len(block)))
     arrays = {
         name: np.concatenate([np.zeros(0, _NUMBERS.get(name, np.int32)), *blocks]) for name, blocks in parts.items()
     }

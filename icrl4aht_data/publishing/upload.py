@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -94,6 +94,7 @@ def upload_release(
             belong to no release, or its content differs from the manifest after the upload.
     """
     from huggingface_hub import HfApi
+    from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
 
     found, folder = re.fullmatch(r"hf://datasets/([\w.-]+/[\w.-]+)/?", str(address)), Path(folder)
     if found is None:
@@ -103,7 +104,10 @@ def upload_release(
     api, repo, version = HfApi(), found[1], read_info(folder).data_version
     sizes = {name: (folder / name).stat().st_size for name in sorted(hashes)}
     plan = Upload(repo, f"v{version}", f"{api.endpoint}/datasets/{repo}", sizes)
-    with _progress_bars(show):
+    with ExitStack() as stack:
+        if not show and not are_progress_bars_disabled():
+            disable_progress_bars()
+            stack.callback(enable_progress_bars)
         with _wrap_hub_errors(plan, api, _NOTHING_SENT):
             plan = _plan(api, plan, folder, hashes, private)
         if dry_run or plan.done == "already there":
@@ -174,34 +178,22 @@ def _differences(tree: Mapping[str, RepoFile], folder: Path, hashes: Mapping[str
 
     The Hub knows large files by SHA-256, and others by Git's hash.
     """
-    found = [f"{name}: not in the release" for name in sorted(tree.keys() - hashes.keys())]
-    found += [f"{name}: missing" for name in hashes if name not in tree]
-    for name, file in ((name, tree[name]) for name in hashes if name in tree):
-        sha256 = None if file.lfs is None else file.lfs.sha256
-        expected = git_hash((folder / name).read_bytes()) if sha256 is None else hashes[name]
-        if (there := sha256 or file.blob_id) != expected:
-            found.append(f"{name}: expected hash {expected}, found {there}")
-    return found
+    differences = [f"{name}: not in the release" for name in sorted(tree.keys() - hashes.keys())]
+    differences += [f"{name}: missing" for name in hashes if name not in tree]
+    for name in hashes.keys() & tree.keys():
+        large, expected, found = tree[name].lfs, hashes[name], tree[name].blob_id
+        if large is None:
+            expected = git_hash((folder / name).read_bytes())
+        else:
+            found = large.sha256
+        if found != expected:
+            differences.append(f"{name}: expected hash {expected}, found {found}")
+    return differences
 
 
 def _some(differences: list[str]) -> str:
     more = f"; and {len(differences) - 3} more" if len(differences) > 3 else ""
     return "; ".join(differences[:3]) + more
-
-
-@contextmanager
-def _progress_bars(show: bool) -> Iterator[None]:
-    """Show progress bars of huggingface_hub only if `show`."""
-    from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
-
-    if show or are_progress_bars_disabled():
-        yield
-        return
-    disable_progress_bars()
-    try:
-        yield
-    finally:
-        enable_progress_bars()
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 
 from icrl4aht_data.benchmark.tasks import Task
@@ -69,17 +70,13 @@ def combine_releases(
 
 def _check_compatible(datasets: Sequence[Dataset]) -> None:
     first, *others = datasets
-    expected = first.info.to_json()
-    for other in others:
-        found = other.info.to_json()
-        for name, remedy in (
-            ("kind", "combine releases of one kind"),
-            ("environment", "they cannot be combined"),
-        ):
-            if found[name] != expected[name]:
-                raise OptionError(
-                    f"{other.root}: {name} {found[name]!r}, but {first.root} has {expected[name]!r}; {remedy}"
-                )
+    for other, name in product(others, ("kind", "environment")):
+        found, expected = getattr(other.info, name), getattr(first.info, name)
+        if found != expected:
+            raise OptionError(
+                f"{other.root}: {name} {found!r}, but {first.root} has {expected!r}; combine releases of one kind and "
+                f"environment"
+            )
 
 
 def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:

@@ -273,16 +273,15 @@ def _stored_names(file: h5py.File, group: str) -> set[str] | None:
 
 def _stored_kind(file: h5py.File, lines: list[dict[str, Any]], present: list[set[str] | None]) -> Kind:
     """Return "lite" if all groups have states, "observations" if none has."""
-    groups = {
-        line["h5_group"]: "state" in names for line, names in zip(lines, present, strict=True) if names is not None
-    }
-    if len(set(groups.values())) == 2:
-        without = next(group for group, has_state in groups.items() if not has_state)
+    named = zip((line["h5_group"] for line in lines), present, strict=True)
+    has_state = {group: "state" in names for group, names in named if names is not None}
+    if len(set(has_state.values())) == 2:
+        without = next(group for group, has in has_state.items() if not has)
         raise PublishedFormatError(
             f"{file.filename}, group {without}: missing state, which other groups have; convert without states by "
             f"`convert --to observations`"
         )
-    return "lite" if all(groups.values()) else OBSERVATIONS
+    return "lite" if all(has_state.values()) else OBSERVATIONS
 
 
 def _tasks(
