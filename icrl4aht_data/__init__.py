@@ -58,31 +58,24 @@ __all__ = [
     "verify_release",
 ]
 
-_MODULES = {
-    "FAMILIES": "benchmark.facts",
-    "SOURCES": "benchmark.facts",
-    "SPLITS": "benchmark.facts",
-    "TRACKS": "benchmark.facts",
-    "Report": "checking.report",
-    "verify_release": "checking.verify",
-    "Dataset": "dataset",
-    "load_icrl4aht": "dataset",
-    "Icrl4ahtError": "errors",
-    "ACTIONS": "overcooked.actions",
-    "LAYOUTS": "overcooked.layouts",
-    "Layout": "overcooked.layouts",
-    "get_layout": "overcooked.layouts",
-    "Episode": "reading.episodes",
-    "Episodes": "reading.episodes",
-    "History": "reading.history",
-    "ADBatch": "sampling.ad",
-    "ADSampler": "sampling.ad",
-    "Batches": "sampling.batches",
-    "DPTBatch": "sampling.dpt",
-    "DPTSampler": "sampling.dpt",
-    "Curriculum": "sampling.draws",
+_NAMES = {
+    "benchmark.facts": ("FAMILIES", "SOURCES", "SPLITS", "TRACKS"),
+    "checking.report": ("Report",),
+    "checking.verify": ("verify_release",),
+    "dataset": ("Dataset", "load_icrl4aht"),
+    "errors": ("Icrl4ahtError",),
+    "overcooked.actions": ("ACTIONS",),
+    "overcooked.layouts": ("LAYOUTS", "Layout", "get_layout"),
+    "reading.episodes": ("Episode", "Episodes"),
+    "reading.history": ("History",),
+    "sampling.ad": ("ADBatch", "ADSampler"),
+    "sampling.batches": ("Batches",),
+    "sampling.dpt": ("DPTBatch", "DPTSampler"),
+    "sampling.draws": ("Curriculum",),
 }
-"""Public name -> module that defines it."""
+"""Module -> the public names that it defines."""
+
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:

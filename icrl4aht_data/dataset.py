@@ -26,7 +26,7 @@ from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.plotting import Picture, curve_svg, plot_layout_curves
 from icrl4aht_data.reading.episodes import Episode
 from icrl4aht_data.reading.history import Labels, Obs
-from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
+from icrl4aht_data.reading.selection import COUNTED, FilterValues, ReadOptions, Selection
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.reading.splitting import SPLIT_BY, SplitBy, choose_histories, choose_teammates
@@ -34,7 +34,7 @@ from icrl4aht_data.sampling.ad import ADSampler
 from icrl4aht_data.sampling.base import SamplerOptions, warn_of_mixed_splits
 from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 from icrl4aht_data.sampling.draws import draw_subset
-from icrl4aht_data.utils.options import check_int
+from icrl4aht_data.utils.options import check_int, check_number
 from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.utils.text import counted_histories, counted_noun, facts_html
 
@@ -193,17 +193,11 @@ class Dataset(Selection):
         """
         if by not in SPLIT_BY:
             raise unknown("split by", by, SPLIT_BY)
-        is_number = isinstance(validation, (int, float, np.integer, np.floating)) and not isinstance(validation, bool)
-        if not is_number or not 0 < validation < 1:
-            raise OptionError(
-                f"validation = {validation!r}: expected the share that is held out, a number between 0 and 1, such as "
-                f"0.1"
-            )
-        seed = check_int("seed", seed, 0)
+        share, seed = check_number("validation", validation, 0, 1), check_int("seed", seed, 0)
         if by == "history":
-            held = choose_histories(self, validation, seed)
+            held = choose_histories(self, share, seed)
         else:
-            held = choose_teammates(teammate_names(self), validation, seed)
+            held = choose_teammates(teammate_names(self), share, seed)
             if not held.any():
                 raise OptionError(
                     f'by = "teammate": {self!r} has one teammate, so none can be held out; take by="history", or '
@@ -250,14 +244,12 @@ class Dataset(Selection):
 
     def _repr_html_(self) -> str:
         """Return the selection's counts and learning curve as HTML, for notebooks."""
-        named = ("split", "source", "layout", "teammate_family", "teammate_kind", "labels")
-        counts = {name: ", ".join(f"{value} ({n})" for value, n in self.counts(name).items()) for name in named}
         tasks = len(self.counts("task_id"))
         steps, episodes = (int(self.column(name).sum()) for name in ("T", "episodes"))
         lengths = f"{counted_noun(steps, 'step')}, {counted_noun(episodes, 'episode')}"
         facts = {
             "transitions": lengths,
-            **{name.replace("_", " "): text or "none" for name, text in counts.items()},
+            **{name.replace("_", " "): self.counts_text(name) for name in COUNTED},
             "observations": f"{self.obs}, {self.channels} channels",
             "release": f"{self.info.kind} {self.info.data_version} at {self.origin}",
         }
@@ -337,12 +329,11 @@ class Dataset(Selection):
         history = self.history(history_id)
         if check_int("episode", episode, 0) >= history.entry.episodes:
             raise OptionError(f"episode = {episode}: history {history_id} has episodes 0..{history.entry.episodes - 1}")
-        steps = self.info.environment.kept_steps
-        states = history.read("state", episode * steps, (episode + 1) * steps)
-        after = np.concatenate([states[1:], history.read("episode_end_state", episode, episode + 1)])
+        recorded = history.episodes[episode]
+        after = np.concatenate([recorded.state[1:], recorded.episode_end_state[None]])
         return {
-            "state": states[0],
-            "teammate_actions": history.read("teammate_actions", episode * steps, (episode + 1) * steps),
+            "state": recorded.state[0],
+            "teammate_actions": recorded.teammate_actions,
             "recipes": after[:, columns(get_layout(history.entry.layout)).recipe],
         }
 

@@ -22,7 +22,7 @@ Rows of episodes have state records, also rows from `datasets.load_dataset(relea
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -33,17 +33,18 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.arrow_tables import episode_schema, episode_table, index_schema, record_width
 from icrl4aht_data.reading.selection import Selection
-from icrl4aht_data.sampling.ad import ADBatch, ADSampler
+from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.base import Sampler
-from icrl4aht_data.sampling.dpt import DPTBatch, DPTSampler
-from icrl4aht_data.utils.install_hints import install_command
+from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.system import new_array
 
 if TYPE_CHECKING:
     import datasets
-    import torch
     from torch.utils.data import DataLoader
+
+T = TypeVar("T", bound=tuple)
+"""A batch of PyTorch tensors."""
 
 Rendered = Literal["float32", "uint8"]
 RENDERED: tuple[Rendered, ...] = ("float32", "uint8")
@@ -53,39 +54,15 @@ IGNORED = -100
 """Target of padding in `torch_loader` and `hf_windows`; PyTorch's cross entropy ignores it."""
 
 
-@overload
 def torch_loader(
-    sampler: ADSampler,
+    sampler: Sampler[Any, Any, T],
     *,
     start: int = 0,
     stop: int | None = None,
     workers: int = 0,
     context: str = "spawn",
     **options: Any,
-) -> DataLoader[ADBatch[torch.Tensor]]: ...
-
-
-@overload
-def torch_loader(
-    sampler: DPTSampler,
-    *,
-    start: int = 0,
-    stop: int | None = None,
-    workers: int = 0,
-    context: str = "spawn",
-    **options: Any,
-) -> DataLoader[DPTBatch[torch.Tensor]]: ...
-
-
-def torch_loader(
-    sampler: Sampler,
-    *,
-    start: int = 0,
-    stop: int | None = None,
-    workers: int = 0,
-    context: str = "spawn",
-    **options: Any,
-) -> DataLoader[Any]:
+) -> DataLoader[T]:
     """Return a DataLoader over a sampler's batches as named tuples of tensors, in order for any number of workers.
 
     Tensors fit PyTorch's losses and embeddings: integers are int64 (observations keep their dtype), and
@@ -110,22 +87,19 @@ def torch_loader(
     Raises:
         OptionError: if PyTorch is not installed, for anything but a sampler, or for impossible numbers.
     """
-    try:
-        from torch.utils.data import DataLoader
-    except ImportError as error:
-        raise OptionError(f"a DataLoader needs PyTorch: {install_command('torch')}") from error
+    loader = import_optional("torch.utils.data", "a DataLoader").DataLoader
     numbers, per_pass = _numbers(sampler, start, stop), len(sampler)
     if stop is None:
         numbers = range(numbers.start, (numbers.start // per_pass + 1) * per_pass)
     if workers and sampler.dataset.cache.cache != "stream":
         _ = sampler.dataset.storage  # decode once in this process; workers map the files or inherit the arrays
     processes = {"multiprocessing_context": context, "persistent_workers": True} if workers else {}
-    return DataLoader(
-        _TorchBatches(sampler),  # type: ignore[arg-type]
+    return loader(
+        _TorchBatches(sampler),
         batch_size=None,
         sampler=_Passes(numbers, per_pass if stop is None else len(numbers)),
         num_workers=check_int("workers", workers, 0),
-        **processes,  # type: ignore[arg-type]
+        **processes,
         **options,
     )
 
@@ -315,8 +289,4 @@ def _windows(sampler: Sampler, numbers: list[int]) -> Iterator[dict[str, np.ndar
 
 
 def _datasets() -> Any:
-    try:
-        import datasets
-    except ImportError as error:
-        raise OptionError(f"Hugging Face datasets are needed: {install_command('hf')}") from error
-    return datasets
+    return import_optional("datasets", "a data set of Hugging Face")

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.schema import ACTION_FIELDS, ENTRY_HINTS, FIELDS
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import Selection
-from icrl4aht_data.utils.install_hints import install_command
+from icrl4aht_data.utils.install_hints import import_optional
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -140,8 +140,4 @@ def import_pyarrow() -> Any:
     Raises:
         OptionError: if it is not installed; names the command that installs it.
     """
-    try:
-        import pyarrow
-    except ImportError as error:
-        raise OptionError(f"Parquet needs pyarrow: {install_command('hf')}") from error
-    return pyarrow
+    return import_optional("pyarrow", "Parquet")

@@ -16,7 +16,76 @@ if TYPE_CHECKING:
     from icrl4aht_data.reading.history import History
 
 
-class Episode:
+class FieldArrays:
+    """Fields of a history, or of one of its episodes, as NumPy arrays: `x.actions` is the same as `x["actions"]`.
+
+    T is the number of steps, E that of episodes.
+    """
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        raise NotImplementedError
+
+    __iter__ = None
+    """Disabled, since Python would otherwise iterate over items 0, 1, .., which do not exist."""
+
+    @property
+    def obs(self) -> np.ndarray:
+        """(T, 5, 5, C) float32 or uint8: observations; or (T, S) uint8: state records, if the dataset's obs="state".
+
+        With channels="canonical", C is 46 on every layout.
+        """
+        return self["obs"]
+
+    @property
+    def state(self) -> np.ndarray:
+        """(T, S) uint8: the state record before each step; see `overcooked.state`."""
+        return self["state"]
+
+    @property
+    def actions(self) -> np.ndarray:
+        """(T,) int32: the ego's actions, 0..5."""
+        return self["actions"]
+
+    @property
+    def rewards(self) -> np.ndarray:
+        """(T,) float32: the team's reward of each step, without shaping."""
+        return self["rewards"]
+
+    @property
+    def dones(self) -> np.ndarray:
+        """(T,) bool: True at the last kept step of each episode."""
+        return self["dones"]
+
+    @property
+    def teammate_actions(self) -> np.ndarray:
+        """(T,) int32: the teammate's actions, 0..5."""
+        return self["teammate_actions"]
+
+    @property
+    def expert_actions(self) -> np.ndarray:
+        """(T,) int32: greedy actions of one policy at the same steps, 0..5; its return is `entry.expert_return`.
+
+        The policy is the learner's last checkpoint, as in the paper (App. D.1), or an earlier one that earns more: see
+        `entry.expert_step`.
+        """
+        return self["expert_actions"]
+
+    @property
+    def oracle_actions(self) -> np.ndarray:
+        """(T,) int32: actions of the scripted oracle at the same steps, 0..5; it knows the full state.
+
+        In a history of source "noise" these are the ego's actions without the noise. They equal `expert_actions`, so a
+        release need not store them.
+        """
+        return self["oracle_actions"]
+
+    @property
+    def episode_end_state(self) -> np.ndarray:
+        """(E, S) uint8, or (S,) for one episode: the state after each episode's last kept step."""
+        return self["episode_end_state"]
+
+
+class Episode(FieldArrays):
     """One episode of a history: T consecutive steps, the last one with done = True.
 
     `episode.actions`, `.rewards`, `.obs` and so on are NumPy arrays, read from the release at each access;
@@ -64,54 +133,6 @@ class Episode:
         if name == "episode_end_state":
             return self._history.rows(name, self.number, self.number + 1)[0]
         return self._history.rows(name, self.start, self.stop)
-
-    __iter__ = None
-    """Disabled, since Python would otherwise iterate over `episode[0]`, `episode[1]`, which do not exist."""
-
-    @property
-    def obs(self) -> np.ndarray:
-        """(T, 5, 5, C) float32 or uint8: observations; or (T, S) uint8: state records, if the dataset's obs="state"."""
-        return self["obs"]
-
-    @property
-    def state(self) -> np.ndarray:
-        """(T, S) uint8: the state record before each step; see `overcooked.state`."""
-        return self["state"]
-
-    @property
-    def actions(self) -> np.ndarray:
-        """(T,) int32: the ego's actions, 0..5."""
-        return self["actions"]
-
-    @property
-    def rewards(self) -> np.ndarray:
-        """(T,) float32: the team's reward of each step, without shaping."""
-        return self["rewards"]
-
-    @property
-    def dones(self) -> np.ndarray:
-        """(T,) bool: True at the last step."""
-        return self["dones"]
-
-    @property
-    def teammate_actions(self) -> np.ndarray:
-        """(T,) int32: the teammate's actions, 0..5."""
-        return self["teammate_actions"]
-
-    @property
-    def expert_actions(self) -> np.ndarray:
-        """(T,) int32: greedy actions of one policy at the same steps, 0..5; see `History.expert_actions`."""
-        return self["expert_actions"]
-
-    @property
-    def oracle_actions(self) -> np.ndarray:
-        """(T,) int32: actions of the scripted oracle at the same steps, 0..5; see `History.oracle_actions`."""
-        return self["oracle_actions"]
-
-    @property
-    def episode_end_state(self) -> np.ndarray:
-        """(S,) uint8: the state after the last step."""
-        return self["episode_end_state"]
 
     @property
     def total_return(self) -> float:

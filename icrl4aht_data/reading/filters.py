@@ -1,4 +1,4 @@
-"""Checks of the arguments of `Selection.filter`: functions, learners and returns."""
+"""Checks of the arguments of `Selection.filter`: functions and learners."""
 
 from __future__ import annotations
 
@@ -22,22 +22,21 @@ def passing(predicate: Callable[[Entry], bool], entries: Iterable[Entry]) -> np.
             f"filter: expected a function of an index entry, such as lambda entry: entry.return_end > 30, found "
             f"{predicate!r}; values have names: filter(layout={str(predicate)!r})"
         )
-    return np.array([_passes(predicate, entry) for entry in entries], bool)
-
-
-def _passes(predicate: Callable[[Entry], bool], entry: Entry) -> bool:
-    try:
-        found = predicate(entry)
-    except AttributeError as error:
-        if error.obj is not entry:
-            raise
-        raise unknown("field of an index entry", error.name, ENTRY_HINTS) from error
-    if not isinstance(found, bool | np.bool_):
-        raise OptionError(
-            f"filter: expected the function to return True or False, such as lambda entry: entry.return_end > 30, "
-            f"found {found!r} for history {entry.history_id}"
-        )
-    return bool(found)
+    results = []
+    for entry in entries:
+        try:
+            found = predicate(entry)
+        except AttributeError as error:
+            if error.obj is not entry:
+                raise
+            raise unknown("field of an index entry", error.name, ENTRY_HINTS) from error
+        if not isinstance(found, bool | np.bool_):
+            raise OptionError(
+                f"filter: expected the function to return True or False, such as lambda entry: entry.return_end > 30, "
+                f"found {found!r} for history {entry.history_id}"
+            )
+        results.append(found)
+    return np.array(results, bool)
 
 
 def learner_numbers(wanted: int | Sequence[int]) -> np.ndarray:
@@ -50,13 +49,3 @@ def learner_numbers(wanted: int | Sequence[int]) -> np.ndarray:
     if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
         raise OptionError(f"learner = {wanted!r}: expected the number of a task's learner, from 0, or several")
     return numbers
-
-
-def check_return(least: float) -> None:
-    """Check that the option `min_expert_return` is a number.
-
-    Raises:
-        OptionError: for anything but a number.
-    """
-    if isinstance(least, bool) or not isinstance(least, (int, float, np.integer, np.floating)) or np.isnan(least):
-        raise OptionError(f"min_expert_return = {least!r}: expected a number, the return of an episode")

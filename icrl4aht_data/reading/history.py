@@ -14,8 +14,9 @@ from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_retu
 from icrl4aht_data.overcooked.channels import Channels, observation_shape, to_canonical
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.plotting import Picture, animate_episode, curve_svg, plot_history
-from icrl4aht_data.reading.episodes import Episodes
+from icrl4aht_data.reading.episodes import Episodes, FieldArrays
 from icrl4aht_data.reading.shard import Shard
+from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.system import new_array
 from icrl4aht_data.utils.text import counted_noun, facts_html
 
@@ -31,7 +32,7 @@ policy with return `Entry.expert_return`, or "oracle" (field `oracle_actions`), 
 knows the full state."""
 
 
-class History:
+class History(FieldArrays):
     """One learning history: an ego that learns with one fixed teammate, T steps in E episodes.
 
     `history.actions`, `.rewards`, `.obs` and so on are read-only NumPy arrays, read on first access and kept;
@@ -91,9 +92,6 @@ class History:
             array.flags.writeable = False  # every later access returns the same array
             self._arrays[name] = array
         return self._arrays[name]
-
-    __iter__ = None
-    """Disabled, since Python would otherwise iterate over `history[0]`, `history[1]`, which do not exist."""
 
     @property
     def kind(self) -> Kind:
@@ -162,62 +160,6 @@ class History:
             )
         return field
 
-    @property
-    def obs(self) -> np.ndarray:
-        """(T, 5, 5, C) float32 or uint8: observations; or (T, S) uint8: state records, if the dataset's obs="state".
-
-        With channels="canonical", C is 46 on every layout.
-        """
-        return self["obs"]
-
-    @property
-    def state(self) -> np.ndarray:
-        """(T, S) uint8: the state record before each step; see `overcooked.state`."""
-        return self["state"]
-
-    @property
-    def actions(self) -> np.ndarray:
-        """(T,) int32: the ego's actions, 0..5."""
-        return self["actions"]
-
-    @property
-    def rewards(self) -> np.ndarray:
-        """(T,) float32: the team's reward of each step, without shaping."""
-        return self["rewards"]
-
-    @property
-    def dones(self) -> np.ndarray:
-        """(T,) bool: True at the last kept step of each episode."""
-        return self["dones"]
-
-    @property
-    def teammate_actions(self) -> np.ndarray:
-        """(T,) int32: the teammate's actions, 0..5."""
-        return self["teammate_actions"]
-
-    @property
-    def expert_actions(self) -> np.ndarray:
-        """(T,) int32: greedy actions of one policy at the same steps, 0..5; its return is `entry.expert_return`.
-
-        The policy is the learner's last checkpoint, as in the paper (App. D.1), or an earlier one that earns more: see
-        `entry.expert_step`.
-        """
-        return self["expert_actions"]
-
-    @property
-    def oracle_actions(self) -> np.ndarray:
-        """(T,) int32: actions of the scripted oracle at the same steps, 0..5; it knows the full state.
-
-        In a history of source "noise" these are the ego's actions without the noise. They equal `expert_actions`, so a
-        release need not store them.
-        """
-        return self["oracle_actions"]
-
-    @property
-    def episode_end_state(self) -> np.ndarray:
-        """(E, S) uint8: the state after each episode's last kept step."""
-        return self["episode_end_state"]
-
     def returns(self) -> np.ndarray:
         """Return the learning curve, float64 (E,): each episode's return over its kept steps."""
         return episode_returns(self.read("rewards"), self.read("dones"))
@@ -251,15 +193,10 @@ class History:
             fps: frames per second, 1 to 50.
 
         Raises:
-            OptionError: for an episode that the history does not have, an impossible `cell` or `fps`, or if Pillow is
-                not installed.
+            PositionError: for an episode that the history does not have.
+            OptionError: for an episode that is not an integer, an impossible `cell` or `fps`, or if Pillow is not
+                installed.
             NotStoredError: for a release without state records.
         """
-        count = self.entry.episodes
-        if isinstance(episode, bool) or not isinstance(episode, (int, np.integer)) or not -count <= episode < count:
-            raise OptionError(
-                f"episode = {episode!r}: history {self.entry.history_id} has {counted_noun(count, 'episode')}; "
-                f"expected a number from {-count} to {count - 1}"
-            )
-        chosen = self.episodes[int(episode)]
+        chosen = self.episodes[check_int("episode", episode, -(2**63))]
         return animate_episode(self._shard.layout, chosen.state, chosen.rewards, repr(chosen), cell=cell, fps=fps)

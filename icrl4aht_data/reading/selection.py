@@ -25,7 +25,7 @@ from icrl4aht_data.format.provenance import ProvenanceByTask, read_provenance
 from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, PROVENANCE, Entry
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.reading.filters import check_return, learner_numbers, passing
+from icrl4aht_data.reading.filters import learner_numbers, passing
 from icrl4aht_data.reading.history import LABELS, OBS, History, Labels, Obs
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import (
@@ -37,13 +37,16 @@ from icrl4aht_data.reading.sources import (
     decoded_size,
     open_source,
 )
-from icrl4aht_data.utils.install_hints import install_command
-from icrl4aht_data.utils.options import check_int, check_position
+from icrl4aht_data.utils.install_hints import import_optional
+from icrl4aht_data.utils.options import check_int, check_number, check_position
 from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 if TYPE_CHECKING:
     import pandas
+
+COUNTED = ("split", "source", "layout", "teammate_family", "teammate_kind", "labels")
+"""Fields whose values `Selection.describe` counts; see `Selection.counts`."""
 
 FilterValues = str | Sequence[str] | None
 """Filter on an index field: one value, several values, or None for any."""
@@ -209,9 +212,11 @@ class Selection:
     def named_counts(self, name: str) -> str:
         """Return the values of an index field as text, such as "source ppo" or "sources ppo (120), noise (64)"."""
         counts = self.counts(name)
-        if len(counts) == 1:
-            return f"{name} {next(iter(counts))}"
-        return f"{name}s " + ", ".join(f"{value} ({number})" for value, number in counts.items())
+        return f"{name} {next(iter(counts))}" if len(counts) == 1 else f"{name}s {self.counts_text(name)}"
+
+    def counts_text(self, name: str) -> str:
+        """Return the result of `counts` as text, such as "ppo (120), noise (64)"; "none" without values."""
+        return ", ".join(f"{value} ({number})" for value, number in self.counts(name).items()) or "none"
 
     def counts(self, name: str) -> dict[str, int]:
         """Return the number of histories for each value of a text field of the index, such as "split" or "source".
@@ -245,9 +250,7 @@ class Selection:
 
     def describe(self) -> str:
         """Return the selection as text, one fact per line: numbers of histories by split, source, layout and others."""
-        fields = ("split", "source", "layout", "teammate_family", "teammate_kind", "labels")
-        counts = {name: ", ".join(f"{value} ({n})" for value, n in self.counts(name).items()) for name in fields}
-        return "\n".join([repr(self), *(f"{name}: {text or 'none'}" for name, text in counts.items())])
+        return "\n".join([repr(self), *(f"{name}: {self.counts_text(name)}" for name in COUNTED)])
 
     def history(self, history_id: int) -> History:
         """Return one history of the release, whether selected or not.
@@ -294,16 +297,12 @@ class Selection:
         Raises:
             OptionError: if pandas is not installed.
         """
-        try:
-            import pandas
-        except ImportError as error:
-            raise OptionError(f"a data frame needs pandas: {install_command('pandas')}") from error
+        pandas = import_optional("pandas", "a data frame")
         columns: dict[str, Any] = {}
         for name, hint in ENTRY_HINTS.items():
             if hint is str:
-                names = pandas.Index(self.index.values(name))
-                named = pandas.Categorical.from_codes(self.column_codes(name), names)
-                columns[name] = named.remove_unused_categories()
+                codes, names = self.column_codes(name), pandas.Index(self.index.values(name))
+                columns[name] = pandas.Categorical.from_codes(codes, names).remove_unused_categories()
             elif hint == int | None:
                 numbers = self.column(name)
                 columns[name] = pandas.arrays.IntegerArray(numbers, numbers == -1)
@@ -405,39 +404,35 @@ class Selection:
                 `learner` not an integer or several.
             NotStoredError: for `min_expert_return`, if the expert return of a remaining history is unknown.
         """
-        matching = self.index.query(**wanted)
-        ids = self.ids[np.isin(self.ids, matching)]
-        if not len(ids):
-            raise EmptySelectionError(f"{self.root}: no history of this selection has {wanted}; it is {self!r}")
-        found = type(self)(self.origin, self.index, self._shards, self.options, ids)
+        found = self._keep(np.isin(self.ids, self.index.query(**wanted)), f"has {wanted}")
         if learner is not None:
-            found = found._of_learners(learner)
-        if min_expert_return is not None:
-            found = found._earning(min_expert_return)
-        return found if predicate is None else found._passing(predicate)
-
-    def _passing(self, predicate: Callable[[Entry], bool]) -> Self:
-        """Return the histories whose index entries satisfy a function; see `filter`."""
-        kept = passing(predicate, map(self.index.entry, self.ids.tolist()))
-        if not kept.any():
-            raise EmptySelectionError(f"{self.root}: no history of this selection passes the function; it is {self!r}")
-        return self.select(kept)
-
-    def _of_learners(self, wanted: int | Sequence[int]) -> Self:
-        """Return the histories of some learners; see `filter`."""
-        learners = self.column("learner")
-        kept = np.isin(learners, learner_numbers(wanted))
-        if not kept.any():
+            learners, numbers = found.column("learner"), learner_numbers(learner)
             known = ", ".join(map(str, np.unique(learners).tolist()))
-            raise EmptySelectionError(
-                f"{self.root}: no history of this selection has learner = {wanted!r}; its learners: {known}; it is "
-                f"{self!r}"
-            )
+            found = found._keep(np.isin(learners, numbers), f"has learner = {learner!r}; its learners: {known}")
+        if min_expert_return is not None:
+            least, returns = check_number("min_expert_return", min_expert_return), found._expert_returns()
+            found = found._keep(returns >= least, f"has expert_return >= {least:g}; the highest is {returns.max():g}")
+        if predicate is not None:
+            kept = passing(predicate, map(self.index.entry, found.ids.tolist()))
+            found = found._keep(kept, "passes the function")
+        return found
+
+    def _keep(self, kept: np.ndarray, condition: str) -> Self:
+        """Return the histories of this selection for which `kept`, bool (H,), is True.
+
+        Raises:
+            EmptySelectionError: if there are none; with the condition in words.
+        """
+        if not kept.any():
+            raise EmptySelectionError(f"{self.root}: no history of this selection {condition}; it is {self!r}")
         return self.select(kept)
 
-    def _earning(self, least: float) -> Self:
-        """Return the histories with an expert return of at least `least`; see `filter`."""
-        check_return(least)
+    def _expert_returns(self) -> np.ndarray:
+        """Return the expert return of each history, float64 (H,).
+
+        Raises:
+            NotStoredError: if some of them are unknown.
+        """
         returns = self.column("expert_return")
         absent = np.isnan(returns)
         if absent.any():
@@ -449,13 +444,7 @@ class Selection:
                 f"converted from published files. Leave out min_expert_return"
                 + ("" if absent.all() else f", or take the histories where it is known: {known}")
             )
-        kept = returns >= least
-        if not kept.any():
-            raise EmptySelectionError(
-                f"{self.root}: no history of this selection has expert_return >= {least:g}; the highest is "
-                f"{returns.max():g}; it is {self!r}"
-            )
-        return self.select(kept)
+        return returns
 
     def select(self, ids: Sequence[int] | np.ndarray) -> Self:
         """Return the histories of this selection with these ids, in this order.

@@ -143,33 +143,33 @@ class Shard:
         self.read_into(history_id, field, start, rows)
         return rows
 
-    def read_into(self, history_id: int, field: Field, start: int, out: np.ndarray) -> None:
-        """Fill `out` with rows from `start` on, cast to its dtype; see `read`."""
-        first, length = self._first_chunk(history_id, field), self._chunk_rows(history_id, field)
-        stop = start + len(out)
-        for number in range(start // length, -(-stop // length)):
-            key = self.name, first + number
-            rows = self._cache.get(key)
-            if rows is None:
-                rows = self.decode(first + number, history_id, field)
-                self._cache.put(key, rows)
-            begin = number * length
-            low, high = max(start, begin), min(stop, begin + length)
-            out[low - start : high - start] = rows[low - begin : high - begin]
+    def read_into(self, history_id: int, field: Field, start: int, out: np.ndarray, *, keep: bool = True) -> None:
+        """Fill `out` with rows from `start` on, cast to its dtype; see `read`.
 
-    def decode_into(self, history_id: int, field: Field, out: np.ndarray) -> None:
-        """Read all rows of a history's field into `out` without adding them to the cache.
+        Args:
+            history_id, field, start: the rows.
+            out: (rows, ...) of any dtype.
+            keep: add decoded chunks to the cache; False for rows that are read once.
 
         Raises:
             ShardCorruptError: names the chunk whose hash or size is wrong.
             ShardMismatchError: if the dtype of `out` cannot represent a value.
         """
-        first, length = self._first_chunk(history_id, field), self._chunk_rows(history_id, field)
-        for number in range(-(-len(out) // length)):
-            part = out[number * length : (number + 1) * length]
-            rows = self.decode(first + number, history_id, field)[: len(part)]
-            part[...] = rows
-            if part.dtype != rows.dtype and not np.array_equal(part, rows):
+        stored, length = self.entries[history_id].stored_field(field), self._chunk_rows(history_id, field)
+        first, stop = self._first[history_id, stored.name], start + len(out)
+        for number in range(start // length, -(-stop // length)):
+            key = self.name, first + number
+            rows = self._cache.get(key)
+            if rows is None:
+                rows = self.decode(first + number, history_id, field)
+                if keep:
+                    self._cache.put(key, rows)
+            begin = number * length
+            low, high = max(start, begin), min(stop, begin + length)
+            part, wanted = out[low - start : high - start], rows[low - begin : high - begin]
+            part[...] = wanted
+            # A forged release may have 300 as an action, which fits into its own int32 but not into the samplers' int8.
+            if not np.can_cast(rows.dtype, part.dtype) and not np.array_equal(part, wanted):
                 raise ShardMismatchError(
                     f"{self.path}: {self.describe(first + number)} has values that {part.dtype} cannot hold; "
                     f"run `icrl4aht-data verify`"
@@ -212,10 +212,6 @@ class Shard:
                 f"fetches it again"
             ) from error
         return data
-
-    def _first_chunk(self, history_id: int, field: Field) -> int:
-        """Return the chunk table's row of the first chunk of a field."""
-        return self._first[history_id, self.entries[history_id].stored_field(field).name]
 
     def _chunk_rows(self, history_id: int, field: Field) -> int:
         return min(field.chunk, self.entries[history_id].rows(field))

@@ -159,7 +159,8 @@ def _decode(
             for name, array in arrays.items():
                 if entry.has(FIELDS[name]):
                     first = firsts[FIELDS[name].axis][number]
-                    shard.decode_into(entry.history_id, FIELDS[name], array[first : first + entry.rows(FIELDS[name])])
+                    out = array[first : first + entry.rows(FIELDS[name])]
+                    shard.read_into(entry.history_id, FIELDS[name], 0, out, keep=False)
 
     in_slices(decode, len(entries), threads)
     return arrays

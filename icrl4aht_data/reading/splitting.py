@@ -24,16 +24,12 @@ def choose_teammates(teammates: np.ndarray, share: float, seed: int) -> np.ndarr
 
     Args:
         teammates: strings (H,), the name of each history's teammate.
-        share: share of the teammates.
+        share: share of the teammates, between 0 and 1.
         seed: seed of the choice.
 
     Returns:
         bool (H,): True for the histories with a chosen teammate.
-
-    Raises:
-        OptionError: if the share is not between 0 and 1.
     """
-    _check_share(share)
     names = sorted(set(teammates.tolist()), key=lambda name: _rank(seed, name))
     return np.isin(teammates, names[: _count(share, len(names)) if len(names) > 1 else 0])
 
@@ -43,23 +39,23 @@ def choose_histories(selection: Selection, share: float, seed: int) -> np.ndarra
 
     Args:
         selection: the histories to divide.
-        share: share of the histories.
+        share: share of the histories, between 0 and 1.
         seed: seed of the choice.
 
     Returns:
         bool (H,): True for the chosen histories.
 
     Raises:
-        OptionError: if the share is not between 0 and 1, or every task has only one history.
+        OptionError: if every task has only one history.
     """
-    _check_share(share)
     names, of_task = selection.index.values("task_id"), defaultdict(list)
-    streams = _stream_names(selection)
-    for row, code in enumerate(selection.column_codes("task_id").tolist()):
-        of_task[code].append((_rank(seed, names[code], *streams[row]), row))
-    candidates = sorted(
-        one for ranked in of_task.values() for one in sorted(ranked)[:-1]
-    )  # one history per task stays in training
+    columns = [selection.column_codes("task_id"), selection.column("env_idx"), selection.column("learner")]
+    for row, (code, stream, learner) in enumerate(np.stack(columns, axis=1).tolist()):
+        # The rank depends on the learner only if it is not 0, as before releases had several.
+        name = (names[code], stream, learner) if learner else (names[code], stream)
+        of_task[code].append((_rank(seed, *name), row))
+    # One history per task stays in training.
+    candidates = sorted(one for ranked in of_task.values() for one in sorted(ranked)[:-1])
     if not candidates:
         raise OptionError(
             f"every task of {selection!r} has one history: expected a task with two or more, one to train on and one "
@@ -68,17 +64,6 @@ def choose_histories(selection: Selection, share: float, seed: int) -> np.ndarra
     chosen = np.zeros(len(selection), bool)
     chosen[[row for _, row in candidates[: _count(share, len(selection))]]] = True
     return chosen
-
-
-def _check_share(share: float) -> None:
-    if not 0 < share < 1:
-        raise OptionError(f"share = {share}: expected a number between 0 and 1")
-
-
-def _stream_names(selection: Selection) -> list[tuple[int, ...]]:
-    """Return a key of each history within its task: its stream, and its learner unless that is 0."""
-    pairs = zip(selection.column("env_idx").tolist(), selection.column("learner").tolist(), strict=True)
-    return [(stream, learner) if learner else (stream,) for stream, learner in pairs]
 
 
 def _count(share: float, total: int) -> int:

@@ -19,6 +19,7 @@ from icrl4aht_data.utils.options import check_int
 
 if TYPE_CHECKING:
     import jax  # noqa: F401 - in the sampler's base class
+    import torch  # noqa: F401
 
 A = TypeVar("A")
 """Type of the arrays of a batch: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
@@ -81,7 +82,7 @@ class _Windows(NamedTuple):
     valid: np.ndarray
 
 
-class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]"]):
+class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torch.Tensor]"]):
     """A sequence of batches for Algorithm Distillation, each a pure function of (selection, options, seed, i).
 
     A history is drawn uniformly from the selection (or by `weights`), a start uniformly from 0..T - L. Windows cross

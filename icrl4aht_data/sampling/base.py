@@ -26,6 +26,9 @@ B = TypeVar("B", bound=tuple)
 D = TypeVar("D", bound=tuple)
 """A batch on a device: a named tuple of JAX arrays."""
 
+T = TypeVar("T", bound=tuple)
+"""A batch for PyTorch: a named tuple of tensors; see `interop.torch_loader`."""
+
 
 class SamplerOptions(TypedDict, total=False):
     """Options that both samplers share; see `ADSampler` and `DPTSampler`."""
@@ -39,7 +42,7 @@ class SamplerOptions(TypedDict, total=False):
     process_count: int
 
 
-class Sampler(Generic[B, D]):
+class Sampler(Generic[B, D, T]):
     """A sequence of batches, each a pure function of its number; see `ADSampler` and `DPTSampler` for the options.
 
     `len(sampler)` batches have as many steps as the selection; larger batch numbers are valid too.

@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Generic, Protocol, TypeVar
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.install_hints import install_command
+from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.options import check_int
 
 B = TypeVar("B")
@@ -200,17 +200,13 @@ def _make(sampler: BatchSource[B], i: int, buffer: B | None, put: Callable[[B], 
 
 def _device_put(device: Any) -> Callable[[Any], Any]:
     """Return a function that copies a batch to a device."""
-    try:
-        import jax
-        import jax.numpy as jnp
-    except ImportError as error:
-        raise OptionError(f"a device needs JAX: {install_command('jax')}") from error
+    jax = import_optional("jax", "a device")
     if not isinstance(device, (jax.Device, jax.sharding.Sharding)):
         raise OptionError(f"device = {device!r}: expected a device or a sharding of JAX, such as jax.devices()[0]")
 
     def one(x: Any) -> Any:
         if getattr(device, "is_fully_addressable", True):
-            return jnp.array(x, copy=True, device=device)
+            return jax.numpy.array(x, copy=True, device=device)
         return jax.make_array_from_process_local_data(device, x.copy())
 
     def put(batch: Any) -> Any:

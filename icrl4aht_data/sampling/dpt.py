@@ -19,6 +19,7 @@ from icrl4aht_data.utils.options import check_int
 
 if TYPE_CHECKING:
     import jax  # noqa: F401 - in the sampler's base class
+    import torch  # noqa: F401
 
 A = TypeVar("A")
 """Type of the arrays of a batch: NumPy arrays, JAX arrays on a device, or PyTorch tensors."""
@@ -76,7 +77,7 @@ class _Contexts(NamedTuple):
     steps: np.ndarray
 
 
-class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]"]):
+class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[torch.Tensor]"]):
     """A sequence of batches of queries with contexts, each a pure function of (selection, options, seed, i).
 
     For each row a task is drawn uniformly, then two of its histories independently (uniformly or by `weights`): one for

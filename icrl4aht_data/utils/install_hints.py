@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import Any
+
+from icrl4aht_data.errors import OptionError
+
 PACKAGE = "icrl4aht-data"
 """Name of the distribution that contains icrl4aht_data, icrl4aht_generation and icrl4aht_baselines."""
 
@@ -24,6 +29,23 @@ RESTORE = f"pip install --force-reinstall --no-deps {PACKAGE}, or in a checkout 
 def install_command(*extras: str) -> str:
     """Return the shell command that installs extras, such as "plot"."""
     return f"pip install '{PACKAGE}[{','.join(extras)}]'"
+
+
+def import_optional(module: str, purpose: str) -> Any:
+    """Return an optional module, imported on first use.
+
+    Args:
+        module: name of the module, such as "pyarrow.parquet".
+        purpose: what needs it, in words, for the message.
+
+    Raises:
+        OptionError: if it is not installed; with the command that installs it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        raise OptionError(f"{purpose} needs {package}: {install_command(EXTRAS[package])}") from error
 
 
 def missing_library(module: str) -> str | None:

