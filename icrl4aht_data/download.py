@@ -90,7 +90,7 @@ def plan_download(
     sizes = present | sizes | remote.sizes(unknown)
     total, done, changed = sum(sizes[name] for name in present), 0, []
     for name in present:
-        if not remote.is_unchanged(name):
+        if not remote.is_here(name, by_hash=True):
             changed.append(name)
         done += sizes[name]
         advance("compare", done, total)

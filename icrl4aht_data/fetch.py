@@ -180,21 +180,20 @@ class Remote:
             path.replace(target)
         return size
 
-    def is_here(self, name: str) -> bool:
+    def is_here(self, name: str, by_hash: bool = False) -> bool:
         """Return whether a file needs no fetching: it has the manifest's hash, or as a shard the right size.
 
-        A shard's content is checked chunk by chunk when it is read.
+        Args:
+            name: file of the release.
+            by_hash: compare the hash of a shard, too, whose content is otherwise checked chunk by chunk on reading.
         """
-        path = self.path(name)
-        if name.startswith("data/"):
-            return path.is_file() and path.stat().st_size == self._shard_sizes.get(name)
-        return self.is_unchanged(name)
-
-    def is_unchanged(self, name: str) -> bool:
-        """Return whether a file in the folder has the hash that the manifest lists."""
-        path = self.path(name)
-        most = self._shard_sizes.get(name, 0) if name.startswith("data/") else disk.LARGEST
-        return path.is_file() and path.stat().st_size <= most and file_hash(path) == self.manifest[name]
+        path, is_shard = self.path(name), name.startswith("data/")
+        if not path.is_file() or (is_shard and path.stat().st_size != self._shard_sizes.get(name)):
+            return False
+        if is_shard and not by_hash:
+            return True
+        is_hashable = is_shard or path.stat().st_size <= disk.LARGEST  # a sparse file may have a terabyte
+        return is_hashable and file_hash(path) == self.manifest[name]
 
     def path(self, name: str) -> Path:
         """Return the path of a file in the folder; it need not exist."""

@@ -16,7 +16,7 @@ from io import BytesIO
 from itertools import product
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from icrl4aht_data.overcooked.render import draw_frame, encode_episode
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
-from icrl4aht_data.utils.install_hints import install_command
+from icrl4aht_data.utils.install_hints import import_optional, install_command
 from icrl4aht_data.utils.text import counted_noun
 
 if TYPE_CHECKING:
@@ -42,9 +42,8 @@ PICTURES = (".png", ".svg", ".pdf")
 _CURVE_PARTS = 25  # most points of a history's curve
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _MARGIN = 420, 130, 44, 18, 8  # pixels of an SVG
-_MOST_POINTS = (
-    60  # points of an SVG curve, each the mean of several episodes, whose returns scatter too much to show a trend
-)
+# Points of an SVG curve: each is the mean of several episodes, whose returns scatter too much to show a trend.
+_MOST_POINTS = 60
 _COLOURS = ("#1f77b4", "#d9730d", "#2ca02c", "#9467bd")  # readable on white and on black
 
 MOST_PANELS = 12
@@ -293,29 +292,18 @@ def plot_source_curves(curves: SourceCurves, path: Path | None = None) -> Figure
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
-    labels = sorted({label for of_layout in curves.values() for label in of_layout}, key=_curve_order)
-    size = (2.6, 1.9) if len(curves) > 2 else (4.2, 2.8)
-    figure, grid = _panels(path, len(curves), size, columns=min(4, len(curves)))
-    ends: list[float] = []
-    for axes, (layout, of_layout) in zip(grid, curves.items(), strict=True):
-        for label in (label for label in labels if label in of_layout):
+    panels: list[_Panel] = []
+    for layout, of_layout in curves.items():
+        bands = {}
+        for label in sorted(of_layout, key=_curve_order):
             parts = min(_CURVE_PARTS, *map(len, of_layout[label]))
             means = np.stack([[part.mean() for part in np.array_split(own, parts)] for own in of_layout[label]])
-            share, (low, high) = (np.arange(parts) + 0.5) / parts, np.percentile(means, (10, 90), axis=0)
-            color = f"C{labels.index(label)}"
-            axes.plot(share, means.mean(axis=0), label=label, color=color, linewidth=1.2)
-            axes.fill_between(share, low, high, alpha=0.2, linewidth=0, color=color)
-            ends += [float(low.min()), float(high.max())]
-        axes.set_title(layout, fontsize=8)
-        axes.set_xlim(0, 1)
-        axes.tick_params(labelsize=7)
-        axes.grid(alpha=0.3)
-    for axes in grid:
-        axes.set_ylim(*return_limits(ends))
+            bands[label] = _Band((np.arange(parts) + 0.5) / parts, means.mean(axis=0), means)
+        panels.append((layout, bands))
+    labels = sorted({label for of_layout in curves.values() for label in of_layout}, key=_curve_order)
     what = "Return of the kept steps over the course of a history, 0 to 1 (band: 10th to 90th percentile of histories)"
-    figure.suptitle(fill(what, int(16 * figure.get_figwidth())), fontsize=8)
-    legend_below(figure)
-    return _saved(figure, path, dpi=80)
+    size = (2.6, 1.9) if len(curves) > 2 else (4.2, 2.8)
+    return _plot_bands(path, panels, labels, what, size, columns=min(4, len(curves)))
 
 
 def plot_curves(path: Path | None, panels: Sequence[tuple[str, dict[str, np.ndarray]]]) -> Figure:
@@ -331,27 +319,61 @@ def plot_curves(path: Path | None, panels: Sequence[tuple[str, dict[str, np.ndar
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
-    figure, grid = _panels(path, len(panels), (4.2, 2.7))
+
+    def band(returns: np.ndarray) -> _Band:
+        episodes = returns.shape[1]
+        return _Band(np.arange(1, episodes + 1), running_mean(returns.mean(axis=0), episodes // 20), returns)
+
+    shown = [(title, {label: band(returns) for label, returns in curves.items()}) for title, curves in panels]
     labels = list(dict.fromkeys(label for _, curves in panels for label in curves))
+    what = "Return of the kept steps by episode (lines: running means of the mean; bands: 10th to 90th percentile)"
+    return _plot_bands(path, shown, labels, what, (4.2, 2.7))
+
+
+class _Band(NamedTuple):
+    """A line with a band around it.
+
+    Attributes:
+        x: (N,), horizontal positions.
+        line: (N,), heights of the line.
+        samples: (M, N), whose 10th and 90th percentiles are the band.
+    """
+
+    x: np.ndarray
+    line: np.ndarray
+    samples: np.ndarray
+
+
+_Panel = tuple[str, dict[str, _Band]]
+"""Title, and label -> band."""
+
+
+def _plot_bands(
+    path: Path | None,
+    panels: Sequence[_Panel],
+    labels: Sequence[str],
+    caption: str,
+    size: tuple[float, float],
+    columns: int | None = None,
+) -> Figure:
+    """Plot panels of bands with equal limits and one legend; a label has one colour in all panels."""
+    figure, grid = _panels(path, len(panels), size, columns)
     ends: list[float] = []
-    for axes, (title, curves) in zip(grid, panels, strict=True):
-        for label, returns in curves.items():
-            episodes, color = np.arange(1, returns.shape[1] + 1), f"C{labels.index(label)}"
-            low, high = np.percentile(returns, (10, 90), axis=0)
+    for axes, (title, bands) in zip(grid, panels, strict=True):
+        for label, (x, line, samples) in bands.items():
+            color, (low, high) = f"C{labels.index(label)}", np.percentile(samples, (10, 90), axis=0)
             ends += [float(low.min()), float(high.max())]
-            mean = running_mean(returns.mean(axis=0), len(episodes) // 20)
-            axes.plot(episodes, mean, label=label, color=color, linewidth=1.4)
-            axes.fill_between(episodes, low, high, alpha=0.2, linewidth=0, color=color)
-        axes.set_title(title, fontsize=9)
-        axes.set_xlabel("episode", fontsize=8)
+            axes.plot(x, line, label=label, color=color, linewidth=1.3)
+            axes.fill_between(x, low, high, alpha=0.2, linewidth=0, color=color)
+        axes.set_title(title, fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.margins(x=0.02)
         axes.grid(alpha=0.3)
     for axes in grid:
         axes.set_ylim(*return_limits(ends))
-    figure.supylabel("return of the kept steps", fontsize=9)
-    what = "Lines: running means of the mean; bands: 10th to 90th percentile of streams"
-    figure.suptitle(fill(what, int(14 * figure.get_figwidth())), fontsize=9)
+    figure.suptitle(fill(caption, int(15 * figure.get_figwidth())), fontsize=8)
     legend_below(figure)
-    return _saved(figure, path, dpi=120)
+    return _saved(figure, path, dpi=120 if columns is None else 80)
 
 
 def plot_layouts(layouts: Sequence[Layout], path: Path | None = None) -> Figure:
@@ -436,11 +458,7 @@ def new_figure(width: float, height: float) -> Figure:
     Raises:
         OptionError: if matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise OptionError(f"drawing needs matplotlib: {install_command('plot')}") from error
-    return Figure(figsize=(width, height), layout="constrained")
+    return import_optional("matplotlib.figure", "drawing").Figure(figsize=(width, height), layout="constrained")
 
 
 def legend_below(figure: Figure) -> None:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
@@ -33,7 +34,8 @@ from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import is_inside, json_hash, parse_json, read_lines
 
-_FIELDS = {"task_id": str, "track": str, "split": str, "layout_name": str, "seed": int, "teammate": dict}
+_S = TypeVar("_S", bound=msgspec.Struct)
+
 _HASHED = ("kind", "family", "theta_id", "base_seed", "theta")
 
 
@@ -185,6 +187,33 @@ def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
     path.write_text("".join(json.dumps(asdict(task)) + "\n" for task in tasks), encoding="utf-8")
 
 
+class _RlTheta(msgspec.Struct, forbid_unknown_fields=True):
+    """Field theta of a learned teammate."""
+
+    checkpoint: str
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
+
+
+class _Teammate(msgspec.Struct, forbid_unknown_fields=True):
+    """Field teammate of a task, see `Task`; manifests of the published code may have its agent slot, too."""
+
+    kind: Literal["heuristic", "rl"]
+    family: str
+    theta_id: Any
+    base_seed: Any
+    theta: dict[str, Any]
+    slot: Literal[1] = TEAMMATE
+
+
+class _TaskFields(msgspec.Struct, forbid_unknown_fields=True):
+    task_id: str
+    track: str
+    split: str
+    layout_name: str
+    seed: Annotated[int, Meta(gt=-(2**63), le=2**63 - 1)]
+    teammate: dict[str, Any]
+
+
 def parse_task(fields: Any) -> Task:
     """Parse the fields of a manifest line as a task; the inverse of `dataclasses.asdict`.
 
@@ -192,15 +221,7 @@ def parse_task(fields: Any) -> Task:
         TaskFormatError: for missing or unknown fields, or impossible values.
         UnknownNameError: for names that the benchmark does not know.
     """
-    if not isinstance(fields, dict) or fields.keys() != _FIELDS.keys():
-        found = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
-        raise TaskFormatError(f"expected the fields {sorted(_FIELDS)}, found {found}")
-    for name, kind in _FIELDS.items():
-        if not isinstance(fields[name], kind):
-            raise TaskFormatError(f"{name}: expected {kind.__name__}, found {fields[name]!r}")
-    if abs(fields["seed"]) >= 2**63:
-        raise TaskFormatError(f"seed: expected an integer of at most 64 bits, found {fields['seed']}")
-    task = Task(**fields)
+    task = Task(**msgspec.structs.asdict(_convert(fields, _TaskFields, "")))
     check_membership(task.track, task.split, task.layout.name)
     _check_teammate(task.teammate)
     expected = task_id(task.track, task.split, task.layout_name, task.teammate, task.seed)
@@ -210,29 +231,29 @@ def parse_task(fields: Any) -> Task:
 
 
 def _check_teammate(teammate: dict[str, Any]) -> None:
-    if teammate.get("kind") not in ("heuristic", "rl") or not isinstance(teammate.get("family"), str):
-        raise TaskFormatError(f"teammate: expected kind 'heuristic' or 'rl' and a family, found {teammate!r}")
-    family, is_heuristic = kind_family(teammate["family"]), teammate["kind"] == "heuristic"
+    found = _convert(teammate, _Teammate, "teammate: ")
+    family, is_heuristic = kind_family(found.family), found.kind == "heuristic"
     if family is None or (family == "rl") == is_heuristic:
         kinds = (*HEURISTIC_KINDS, *TEAMMATE_PLUGINS.names) if is_heuristic else ALGORITHMS
-        raise unknown(f"{teammate['kind']} family", teammate["family"], kinds)
-    if teammate.get("slot", TEAMMATE) != TEAMMATE:
-        raise TaskFormatError(
-            f"teammate.slot: expected {TEAMMATE}, the teammate's agent slot, found {teammate['slot']!r}"
-        )
-    fields = set(teammate) - {"slot"}
-    if fields != set(_HASHED):
-        raise TaskFormatError(f"teammate: expected the fields {sorted(_HASHED)}, found {sorted(fields)}")
-    theta = teammate["theta"]
-    if not isinstance(theta, dict):
-        raise TaskFormatError(f"teammate.theta: expected parameters by name, found {theta!r}")
-    if teammate["kind"] == "rl":
-        if set(theta) != {"checkpoint", "sha256"} or not all(isinstance(value, str) for value in theta.values()):
-            raise TaskFormatError(f"teammate.theta: expected the strings checkpoint and sha256, found {theta!r}")
-        checkpoint, digest = theta["checkpoint"], theta["sha256"]
+        raise unknown(f"{found.kind} family", found.family, kinds)
+    if not is_heuristic:
+        checkpoint = _convert(found.theta, _RlTheta, "teammate.theta: ").checkpoint
         if not is_inside(checkpoint):
             raise TaskFormatError(
                 f"teammate.theta.checkpoint: expected a path within the suite, found {checkpoint[:200]!r}"
             )
-        if not re.fullmatch("[0-9a-f]{64}", digest):
-            raise TaskFormatError(f"teammate.theta.sha256: expected 64 digits, found {digest[:200]!r}")
+
+
+def _convert(fields: Any, kind: type[_S], where: str) -> _S:
+    """Convert a JSON value to a struct.
+
+    Raises:
+        TaskFormatError: if a field is missing, unknown or has an impossible value; with the place in the task's line.
+    """
+    try:
+        return msgspec.convert(fields, kind)
+    except msgspec.ValidationError as error:
+        raise TaskFormatError(
+            f"{where}{str(error).replace('Expected', 'expected')}; expected the fields "
+            f"{', '.join(kind.__struct_fields__)}, found {fields!r:.300}"
+        ) from error

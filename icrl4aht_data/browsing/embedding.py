@@ -20,6 +20,8 @@ from icrl4aht_data.reading.history import History
 NO_ACTION = 255
 """Placeholder action of an episode's last frame, which shows the state after the last step."""
 
+_INDEX_FIELDS = ("history_id", "task_id", "layout", "source", "split", "track", "learner", "episodes", "expert_return")
+
 
 class EmbeddedHistory(NamedTuple):
     """One history in the form that a page embeds.
@@ -89,7 +91,8 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     # Column-major order compresses best, since columns change little over time.
     columns = np.vstack([records.T, *values.values()])
     facts = {
-        **_index_facts(entry),
+        **{name: getattr(entry, name) for name in _INDEX_FIELDS},
+        "steps": entry.T,
         "returns": episode_returns(rewards, dones).tolist(),
         "shown": shown.tolist(),
         "frames": np.diff(last, prepend=-1).tolist(),
@@ -111,8 +114,3 @@ def _embedded_actions(entry: Entry) -> list[str]:
     names = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
     twice = entry.source == "noise" and "expert_actions" in names
     return [name for name in names if not (twice and name == "oracle_actions")]
-
-
-def _index_facts(entry: Entry) -> dict[str, Any]:
-    names = ("history_id", "task_id", "layout", "source", "split", "track", "learner", "episodes", "expert_return")
-    return {name: getattr(entry, name) for name in names} | {"steps": entry.T}

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import numpy as np
 
@@ -115,34 +114,29 @@ def save_browser_page(page: BrowserPage, path: Path) -> None:
 
 
 def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
+    name, info = _release_name(dataset), dataset.info
     records: dict[str, list[np.ndarray]] = {}
     for one in embedded:
         records.setdefault(one.facts["layout"], []).append(one.records)
     index = {
-        "release": _release_facts(dataset),
+        "release": {"name": name, "kind": info.kind, "version": info.data_version, "histories": info.histories},
         "actions": ACTIONS,
         "no_action": NO_ACTION,
         "window": WINDOW,
-        "layouts": {name: layout_drawings(get_layout(name), np.concatenate(own)) for name, own in records.items()},
+        "layouts": {one: layout_drawings(get_layout(one), np.concatenate(own)) for one, own in records.items()},
         "histories": [one.facts | {"teammate": _teammate(dataset, one.facts["history_id"])} for one in embedded],
     }
     packed = zlib.compress(json.dumps(index, separators=(",", ":")).encode(), 9)
     data = {"index": _base64(packed), "histories": [_base64(one.data) for one in embedded]}
     colours = {"ego": AGENT_COLOURS[EGO], "teammate": AGENT_COLOURS[TEAMMATE]}
-    style = "".join(f"--{name}: {hex_colour(colour)}; " for name, colour in colours.items())
+    style = "".join(f"--{agent}: {hex_colour(colour)}; " for agent, colour in colours.items())
     text = Template(_source("page.html")).substitute(
-        release=escape(_release_name(dataset)),
+        release=escape(name),
         style=f":root {{ {style}}}\n{_source('page.css')}",
-        script="\n".join(_source(name) for name in ("state.js", "curve.js", "page.js")),
+        script="\n".join(map(_source, ("state.js", "curve.js", "page.js"))),
         data=json.dumps(data),  # base64 cannot contain a closing tag
     )
     return text.encode()
-
-
-def _release_facts(dataset: Dataset) -> dict[str, Any]:
-    info = dataset.info
-    name = _release_name(dataset)
-    return {"name": name, "kind": info.kind, "version": info.data_version, "histories": info.histories}
 
 
 def _teammate(dataset: Dataset, history_id: int) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -27,8 +27,8 @@ from icrl4aht_data.commands.options import (
     filter_options,
     json_option,
     overwrite_option,
+    print_result,
     quiet_option,
-    wanted_filters,
 )
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.utils.files import check_output
@@ -81,7 +81,7 @@ def browse(
     port: int | None,
     quiet: bool,
     as_json: bool,
-    **filters: tuple[str, ...],
+    **filters: Any,
 ) -> None:
     """Write an HTML page on which to look at histories.
 
@@ -100,7 +100,7 @@ def browse(
         with suppress(OSError), out.open("rb") as stream:  # a page written by this command may be replaced
             overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
         check_output(out, overwrite)
-    matching = load_icrl4aht(root, **wanted_filters(filters))
+    matching = load_icrl4aht(root, **filters)
     check_drawable(matching)
     chosen = matching.select(list(dict.fromkeys(wanted)) or spread_histories(matching, histories))
     with progress_bars(quiet) as show:
@@ -111,26 +111,15 @@ def browse(
         save_browser_page(page, out)
     server = page_server(page.html, port or 0) if serve else None
     address = f"http://{LOOPBACK}:{server.server_port}/" if server else None
-    if as_json:
-        facts = {
-            "page": str(out) if out else None,
-            "address": address,
-            "histories": page.histories,
-            "episodes": page.episodes,
-            "shown_episodes": page.shown_episodes,
-        }
-        click.echo(json.dumps(facts | {"bytes": len(page.html)}, indent=2))
-    elif not quiet:
-        shown = "all" if page.shown_episodes == page.episodes else f"{page.shown_episodes:,} of"
-        click.echo(
-            f"{out or 'page'}: {page.histories} of {counted_histories(len(matching))}, {shown} "
-            f"{counted_noun(page.episodes, 'episode')} to watch, {len(page.html):,} bytes"
-        )
+    facts = {"page": str(out) if out else None, "address": address, "histories": page.histories}
+    facts |= {"episodes": page.episodes, "shown_episodes": page.shown_episodes, "bytes": len(page.html)}
+    shown = "all" if page.shown_episodes == page.episodes else f"{page.shown_episodes:,} of"
+    text = f"{out or 'page'}: {page.histories} of {counted_histories(len(matching))}, {shown} "
+    text += f"{counted_noun(page.episodes, 'episode')} to watch, {len(page.html):,} bytes"
+    print_result(facts, text, as_json, quiet)
     if server:
         with server:
             if not as_json:
                 click.echo(f"{address} until Ctrl-C")
-            try:
+            with suppress(KeyboardInterrupt):
                 server.serve_forever()
-            except KeyboardInterrupt:
-                return

@@ -72,15 +72,8 @@ def diagnose() -> dict[str, Any]:
         A JSON object: "ok", then a mapping of findings per section (sizes in bytes), then "problems".
     """
     problems: list[Problem] = []
-    checks = {
-        "packages": _packages,
-        "plugins": _plugins,
-        "devices": _devices,
-        "folders": _folders,
-        "network": _network,
-        "bundled": _bundled,
-    }
-    sections = {name: check(problems) for name, check in checks.items()}
+    checks = (_packages, _plugins, _devices, _folders, _network, _bundled)
+    sections = {check.__name__.removeprefix("_"): check(problems) for check in checks}
     return {"ok": not problems, **sections, "problems": [problem._asdict() for problem in problems]}
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +42,8 @@ class Names(click.ParamType):
 
 
 LAYOUT = Names("layout", all_layout_names, offered=lambda: [*LAYOUTS, *LAYOUT_PLUGINS.names])
-TRACK, SPLIT, FAMILY = (
-    Names("track", lambda: TRACKS),
-    Names("split", lambda: SPLITS),
-    Names("family", all_families),
-)
+TRACK, SPLIT = Names("track", lambda: TRACKS), Names("split", lambda: SPLITS)
+FAMILY = Names("family", all_families)
 
 
 class Root(click.ParamType):
@@ -134,30 +132,31 @@ family_map_option = click.option(
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
 
 
+_FILTERS: dict[str, tuple[click.ParamType, str | None, str]] = {
+    "layout": (LAYOUT, None, "Only this layout; repeat it for more."),
+    "split": (SPLIT, None, "Only this split: train, validation, test or heldout."),
+    "track": (TRACK, None, "Only this track: teammate or layout."),
+    "teammate-family": (FAMILY, None, "Only this family: rl (learned), H1, H2, H3 or H4."),
+    "teammate-kind": (click.STRING, "KIND", "Only this kind, such as utility_greedy or fcp."),
+    "source": (click.STRING, "NAME", "Only histories of this source: ppo, noise or student."),
+}
+"""Option -> type, placeholder and help text."""
+
+
 def filter_options(command: Any) -> Any:
-    """Add the options that select histories."""
-    options = [
-        click.option("--layout", multiple=True, type=LAYOUT, help="Only this layout; repeat it for more."),
-        click.option("--split", multiple=True, type=SPLIT, help="Only this split: train, validation, test or heldout."),
-        click.option("--track", multiple=True, type=TRACK, help="Only this track: teammate or layout."),
-        click.option(
-            "--teammate-family", multiple=True, type=FAMILY, help="Only this family: rl (learned), H1, H2, H3 or H4."
-        ),
-        click.option(
-            "--teammate-kind", multiple=True, metavar="KIND", help="Only this kind, such as utility_greedy or fcp."
-        ),
-        click.option(
-            "--source", multiple=True, metavar="NAME", help="Only histories of this source: ppo, noise or student."
-        ),
-    ]
-    for option in reversed(options):
-        command = option(command)
+    """Add the options that select histories, with values as `load_icrl4aht` takes them: lists, or None for any."""
+    for name, (kind, metavar, about) in reversed(_FILTERS.items()):
+        settings: dict[str, Any] = {"type": kind, "metavar": metavar, "help": about, "multiple": True}
+        command = click.option(f"--{name}", callback=lambda ctx, param, value: list(value) or None, **settings)(command)
     return command
 
 
-def wanted_filters(filters: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
-    """Return the arguments of `load_icrl4aht` for the values of `filter_options`."""
-    return {name: list(values) or None for name, values in filters.items()}
+def print_result(facts: Any, text: str, as_json: bool, quiet: bool = False) -> None:
+    """Print a command's result as JSON, as text, or with `quiet` as nothing."""
+    if as_json:
+        click.echo(json.dumps(facts, indent=2))
+    elif not quiet:
+        click.echo(text)
 
 
 def is_terminal() -> bool:

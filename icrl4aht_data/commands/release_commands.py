@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
@@ -26,8 +26,8 @@ from icrl4aht_data.commands.options import (
     is_terminal,
     json_option,
     overwrite_option,
+    print_result,
     quiet_option,
-    wanted_filters,
 )
 from icrl4aht_data.commands.summaries import (
     facts_table,
@@ -37,7 +37,7 @@ from icrl4aht_data.commands.summaries import (
     tab_separated,
     task_table,
 )
-from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
+from icrl4aht_data.dataset import MINI, load_icrl4aht
 from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.download import repair as repair_files
 from icrl4aht_data.errors import OptionError
@@ -64,15 +64,11 @@ _FORMS = (*ALL_KINDS, "published", "parquet", "minari")
 _root = click.argument("root", required=False, type=Root())
 
 
-def _load(root: str | Path | None, filters: dict[str, tuple[str, ...]]) -> Dataset:
-    return load_icrl4aht(root, **wanted_filters(filters))
-
-
 @click.command("list")
 @_root
 @filter_options
 @json_option
-def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) -> None:
+def list_(root: str | Path | None, as_json: bool, **filters: Any) -> None:
     """List the tasks of a release.
 
     Prints for each task layout, split, teammate, source, histories, steps, the mean return of an episode at the start
@@ -80,12 +76,9 @@ def list_(root: str | Path | None, as_json: bool, **filters: tuple[str, ...]) ->
     it was measured), and oracle; the end of the task's id, and the ids of its histories, if they are short. Where the
     output is not a terminal, prints all facts of a task on one line, separated by tabs, below a line with their names.
     """
-    tasks = summarize_tasks(_load(root, filters).entries)
-    if as_json:
-        click.echo(json.dumps(tasks, indent=2))
-        return
-    if not is_terminal():
-        click.echo(tab_separated([tasks[0], *(task.values() for task in tasks)]))
+    tasks = summarize_tasks(load_icrl4aht(root, **filters).entries)
+    if as_json or not is_terminal():
+        print_result(tasks, tab_separated([tasks[0], *(task.values() for task in tasks)]), as_json)
         return
     Console(markup=False).print(task_table(tasks))
 
@@ -110,7 +103,7 @@ def show(
     history_id: int | None,
     plot: Path | None,
     overwrite: bool,
-    **filters: tuple[str, ...],
+    **filters: Any,
 ) -> None:
     """Show a release, a part of it or one history.
 
@@ -124,25 +117,19 @@ def show(
         check_output(plot, overwrite)
     if isinstance(root, Path) and str(root).isdecimal() and not root.exists():
         raise click.UsageError(f"{root}: no such folder; give a history's id as --history {root}")
-    dataset = _load(root, filters)
+    dataset = load_icrl4aht(root, **filters)
     if history_id is None:
         facts = summarize_selection(dataset)
     else:
         dataset = dataset.select([history_id])
-        facts = {
-            **dataset[0].entry.to_json(),
-            "environment": dataset.environment_parameters(history_id),
-        }
+        facts = dataset[0].entry.to_json() | {"environment": dataset.environment_parameters(history_id)}
         if dataset.knows_tasks:
             facts["teammate"] = dataset.recover_teammate(history_id)
     if plot is not None:
         plot_learning_curves(dataset, plot)
         facts["plot"] = str(plot)
-    if as_json:
-        click.echo(json.dumps(facts, indent=2))
-        return
-    if not is_terminal():
-        click.echo(tab_separated(facts.items()))
+    if as_json or not is_terminal():
+        print_result(facts, tab_separated(facts.items()), as_json)
         return
     console = Console(markup=False, highlight=False)
     if history_id is None:
@@ -166,7 +153,7 @@ def show(
 @quiet_option
 @json_option
 def download(
-    root: str | Path | None, to: Path | None, dry_run: bool, quiet: bool, as_json: bool, **filters: tuple[str, ...]
+    root: str | Path | None, to: Path | None, dry_run: bool, quiet: bool, as_json: bool, **filters: Any
 ) -> None:
     """Download a release, or a part of it.
 
@@ -179,23 +166,17 @@ def download(
     if root is None:
         raise click.UsageError("give the ADDRESS of a release, or set ICRL4AHT_REMOTE")
     with progress_bars(quiet, of_bytes=True) as show:
-        plan = plan_download(str(root), to=to, advance=show, **wanted_filters(filters))
+        plan = plan_download(str(root), to=to, advance=show, **filters)
         facts = plan.to_json()
         if not dry_run:
             facts["fetched_bytes"] = fetch_planned(plan, counted(show, "download", plan.size))
-    if as_json:
-        click.echo(json.dumps(facts, indent=2))
-    elif not quiet:
-        if dry_run:
-            for name in sorted((*plan.absent, *plan.changed)):
-                click.echo(f"{plan.files[name]:>15,}  {name}")
-        for name in plan.changed:
-            click.echo(f"{name}: had changed{'' if dry_run else ', was fetched again'}")
-        verb = "to download" if dry_run else "downloaded"
-        fetched = len(plan.absent) + len(plan.changed)
-        here = f"{counted_noun(len(plan.files) - fetched, 'file')} present already, with the right hashes"
-        click.echo(f"{plan.root}: {counted_noun(fetched, 'file')}, {plan.size:,} bytes {verb}; {here}")
-        click.echo(f"folder: {plan.root.folder}")
+    absent = sorted((*plan.absent, *plan.changed))
+    lines = [f"{plan.files[name]:>15,}  {name}" for name in absent if dry_run]
+    lines += [f"{name}: had changed{'' if dry_run else ', was fetched again'}" for name in plan.changed]
+    verb = "to download" if dry_run else "downloaded"
+    here = f"{counted_noun(len(plan.files) - len(absent), 'file')} present already, with the right hashes"
+    lines.append(f"{plan.root}: {counted_noun(len(absent), 'file')}, {plan.size:,} bytes {verb}; {here}")
+    print_result(facts, "\n".join([*lines, f"folder: {plan.root.folder}"]), as_json, quiet)
 
 
 @click.command()
@@ -221,7 +202,7 @@ def verify(
     origin: str | None,
     quiet: bool,
     as_json: bool,
-    **filters: tuple[str, ...],
+    **filters: Any,
 ) -> None:
     """Verify a release: every byte, count and range.
 
@@ -233,27 +214,21 @@ def verify(
     level = "quick" if quick else "deep" if deep else "full"
     if origin and not repair:
         raise click.UsageError("--from is the source of a repair: give --repair with it")
-    wanted = wanted_filters(filters)
     with progress_bars(quiet) as advance:
-        report = verify_release(root, level=level, advance=advance, **wanted)
+        report = verify_release(root, level=level, advance=advance, **filters)
         if repair and not report.ok:
             if root is None and origin is None:
                 raise OptionError("the bundled release is repaired by installing the package again")
             first = report
             outcome, fetched = repair_files(MINI if root is None else root, first.files_at_fault, source=origin)
-            report = verify_release(root, level=level, advance=advance, **wanted)
+            report = verify_release(root, level=level, advance=advance, **filters)
             report.repaired = [name for name, error in outcome.items() if error is None]
             report.notes += [f"{name}: not repaired: {error}" for name, error in outcome.items() if error is not None]
             report.fetched_bytes += first.fetched_bytes + fetched
-    if as_json:
-        click.echo(json.dumps(report.to_json(), indent=2))
-    else:
-        for name in report.repaired:
-            click.echo(f"{name}: repaired")
-        for finding in report.findings:
-            click.echo(finding.problem if finding.file == "." else f"{finding.file}: {finding.problem}")
-        if not quiet:
-            click.echo("\n".join([f"{report.root}: {verdict_in_words(report)}", *report.notes]))
+    lines = [f"{name}: repaired" for name in report.repaired]
+    lines += [one.problem if one.file == "." else f"{one.file}: {one.problem}" for one in report.findings]
+    lines += [f"{report.root}: {verdict_in_words(report)}", *report.notes] if not quiet else []
+    print_result(report.to_json(), "\n".join(lines), as_json, quiet=not lines)
     sys.exit(0 if report.ok else 1)
 
 
@@ -274,9 +249,7 @@ def verify(
     help="Write the release, the folder of published files, the Minari dataset or the Parquet file here.",
 )
 @overwrite_option
-@click.option(
-    "--to", "form", type=click.Choice([*ALL_KINDS, "published", "parquet", "minari"]), help="Format to convert to."
-)
+@click.option("--to", "form", type=click.Choice(_FORMS), help="Format to convert to.")
 @click.option(
     "--tasks",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
@@ -297,7 +270,7 @@ def convert(
     family_map: tuple[str, ...],
     kept_steps: int,
     quiet: bool,
-    **filters: tuple[str, ...],
+    **filters: Any,
 ) -> None:
     """Convert a release or published files.
 
@@ -324,23 +297,20 @@ def convert(
                 advance=advance,
             )
         else:
-            dataset = _load(root, filters)
+            dataset = load_icrl4aht(root, **filters)
             if form is None:
-                raise click.UsageError(
-                    "give the form to convert to: --to full, lite, observations, published, minari, parquet"
-                )
+                raise click.UsageError(f"give the form to convert to: --to {', '.join(_FORMS)}")
             if tasks or family_map or kept_steps != KEPT_STEPS:
                 raise click.UsageError(
                     f"{dataset.root} is a release: --tasks, --family-map and --kept-steps are for published files"
                 )
             if form in ALL_KINDS:
                 to_release(dataset, target, form, overwrite=overwrite, advance=advance)
-            elif form == "published":
-                to_published(dataset, target, overwrite=overwrite, advance=advance)
-            elif form == "minari":
-                to_minari(dataset, target, overwrite=overwrite, advance=advance)
-            else:
+            elif form == "parquet":
                 to_parquet(dataset, target, overwrite=overwrite)
+            else:
+                write = to_published if form == "published" else to_minari
+                write(dataset, target, overwrite=overwrite, advance=advance)
     limit = ", no state records: nothing can be replayed or drawn" if form == OBSERVATIONS else ""
     if not quiet:
         click.echo(f"{target}: {form}{limit}")
@@ -390,10 +360,8 @@ def build(source: Path | None, out: Path, overwrite: bool, link: bool, quiet: bo
         build_release(source, out, link=link, overwrite=overwrite, advance=advance)
     files = list(read_manifest(out))
     size = sum((out / name).stat().st_size for name in files)
-    if as_json:
-        click.echo(json.dumps({"release": str(out), "files": files, "bytes": size}, indent=2))
-    elif not quiet:
-        click.echo(f"release: {out}, {len(files)} files, {size:,} bytes; its card is {out / 'README.md'}")
+    text = f"release: {out}, {len(files)} files, {size:,} bytes; its card is {out / 'README.md'}"
+    print_result({"release": str(out), "files": files, "bytes": size}, text, as_json, quiet)
 
 
 @click.command(epilog=examples("icrl4aht-data upload build/release hf://datasets/you/icrl4aht --dry-run"))
@@ -415,10 +383,7 @@ def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool
         done = upload_release(
             folder, address, private=private, dry_run=dry_run, show=not quiet and sys.stderr.isatty(), advance=advance
         )
-    if as_json:
-        click.echo(json.dumps(done.to_json(), indent=2))
-    elif not quiet:
-        click.echo("\n".join(done.in_words()))
+    print_result(done.to_json(), "\n".join(done.in_words()), as_json, quiet)
 
 
 @click.command()
@@ -431,5 +396,5 @@ def doctor(as_json: bool) -> None:
     not use the network. Exits with 1 and a next step for each problem if there is one.
     """
     found = diagnose()
-    click.echo(json.dumps(found, indent=2) if as_json else "\n".join(in_words(found)))
+    print_result(found, "\n".join(in_words(found)), as_json)
     sys.exit(0 if found["ok"] else 1)

@@ -14,7 +14,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.info import describe
 from icrl4aht_data.format.schema import FIELDS, Entry
 from icrl4aht_data.reading.history import LABELS
-from icrl4aht_data.utils.text import counted_histories, counted_noun
+from icrl4aht_data.utils.text import counted_noun
 
 _IDS_SHOWN = 11  # maximum characters of a task's history ids in the table
 
@@ -145,30 +145,6 @@ def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
     return "\n".join("\t".join(row) for row in texts)
 
 
-def describe_selection(dataset: Dataset) -> str:
-    """Return a paragraph on a selection: content, counts, and the rise of returns."""
-    info, (start, end) = dataset.info, (dataset.column(name).mean() for name in ("return_start", "return_end"))
-    sizes = ", ".join(
-        (
-            counted_histories(len(dataset)),
-            counted_noun(int(dataset.column("episodes").sum()), "episode"),
-            counted_noun(int(dataset.column("T").sum()), "step"),
-        )
-    )
-    tasks, layouts, kinds = (
-        len(np.unique(dataset.column_codes(name))) for name in ("task_id", "layout", "teammate_kind")
-    )
-    spans = f"{counted_noun(tasks, 'task')} on {counted_noun(layouts, 'layout')}"
-    spans += f" with {counted_noun(kinds, 'kind of teammate', 'kinds of teammates')}"
-    labels = [f"{name} actions ({n:,})" for name, n in dataset.counts("labels").items()]
-    return (
-        f"{sizes} of a {info.kind} release, data version {info.data_version}, format {info.format_version}: "
-        f"{spans}; {dataset.named_counts('split')}; {dataset.named_counts('source')}. "
-        f"The mean return of an episode rises from {start:.1f} at the start of a history to {end:.1f} at its end. "
-        f"Labels: {' and '.join(labels) or 'none'}."
-    )
-
-
 def summarize_selection(dataset: Dataset) -> dict[str, Any]:
     """Return a JSON object with the location, kind, versions and counts of a selection."""
     info, remote, missing = dataset.info, dataset.origin.remote, _missing(dataset)
@@ -176,7 +152,7 @@ def summarize_selection(dataset: Dataset) -> dict[str, Any]:
         info.kind, info.data_version, info.environment.kept_steps, dataset.entries, info.format_version
     ).to_json()
     return {
-        "summary": describe_selection(dataset),
+        "summary": repr(dataset),
         "root": str(dataset.origin),
         **({"revision": remote.revision, "folder": str(dataset.root)} if remote else {}),
         **content,

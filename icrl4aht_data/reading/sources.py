@@ -109,17 +109,13 @@ def open_source(cache: CacheMode, entries: Sequence[Entry], shards: Shards, thre
     if cache == "stream":
         return StreamedSource(entries, shards, threads)
     shards.fetch(entry.shard for entry in entries)
-    hold = _arrays_in_memory if cache == "ram" else _mapped_arrays
     source = FlatSource(entries, threads)
     for name in dict.fromkeys(entry.layout for entry in entries):
         by_id = {entry.history_id: entry for entry in entries if entry.layout == name}
         members = [by_id[history_id] for history_id in sorted(by_id)]
-        source.add(members, hold(members, [shards.open(entry.shard) for entry in members], threads))
+        opened = [shards.open(entry.shard) for entry in members]
+        source.add(members, (_decode if cache == "ram" else _mapped_arrays)(members, opened, threads))
     return source
-
-
-def _arrays_in_memory(entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> dict[str, np.ndarray]:
-    return _decode(entries, shards, threads, lambda shape, dtype, name: np.zeros(shape, dtype))
 
 
 def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: int) -> dict[str, np.ndarray]:
@@ -142,7 +138,10 @@ def _mapped_arrays(entries: Sequence[Entry], shards: Sequence[Shard], threads: i
 
 
 def _decode(
-    entries: Sequence[Entry], shards: Sequence[Shard], threads: int, make: Callable[..., np.ndarray]
+    entries: Sequence[Entry],
+    shards: Sequence[Shard],
+    threads: int,
+    make: Callable[..., np.ndarray] = lambda shape, dtype, name: np.zeros(shape, dtype),
 ) -> dict[str, np.ndarray]:
     """Return field -> array (rows, ...) with one layout's histories; `make(shape, dtype, name)` allocates zeros."""
     arrays = {}

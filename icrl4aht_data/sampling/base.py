@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from textwrap import indent
 from typing import Any, Generic, SupportsIndex, TypedDict, TypeVar, overload
@@ -104,13 +104,11 @@ class Sampler(Generic[B, D, T]):
 
     def __repr__(self) -> str:
         layouts = ", ".join(layout.name for layout in self.layouts)
-        width = max(map(len, self.specs))
-        arrays = [f"{name:<{width}}  {spec.dtype:<8} {spec.shape}" for name, spec in self.specs.items()]
         return (
             f"{type(self).__name__}({counted_noun(len(self), 'batch', 'batches')}, batch_size {self.batch_size}, "
             f"{self.length_option} {self.length}, seed {self.seed}, of {counted_histories(len(self.dataset))} on "
             f"{layouts}; each has\n"
-            f"{indent(chr(10).join(arrays), '    ')}\n)"
+            f"{indent(_array_lines(self.specs), '    ')}\n)"
         )
 
     def __iter__(self) -> Iterator[B]:
@@ -232,10 +230,10 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
     """Warn if training histories are sampled together with validation or test histories."""
     counts = dataset.counts("split")
     if "train" in counts and len(counts) > 1:
-        found = ", ".join(f"{split} ({number})" for split, number in counts.items())
         warnings.warn(
-            f"the histories are of several splits, {found}: a model trained on them all has seen the teammates that it "
-            f'is judged with. Choose the training histories: load_icrl4aht(split="train"), or ds.filter(split="train")',
+            f"the histories are of several splits, {dataset.counts_text('split')}: a model trained on them has seen "
+            f'the teammates that it is judged with. Choose the training histories: load_icrl4aht(split="train"), or '
+            f'ds.filter(split="train")',
             MixedSplitsWarning,
             stacklevel=3,  # the line that called Dataset.ad or Dataset.dpt
         )
@@ -243,17 +241,17 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
 
 def describe_batch(self: Any) -> str:
     """Return the dtype and shape of each field as text, one field per line."""
-    present = {name: array for name, array in self._asdict().items() if array is not None}
-    width = max(map(len, present), default=0)
-    return "\n".join(f"{name:<{width}}  {_describe_array(array)}" for name, array in present.items())
+    return _array_lines({name: array for name, array in self._asdict().items() if array is not None})
 
 
-def _describe_array(array: Any) -> str:
-    if not hasattr(array, "dtype") or not hasattr(
-        array, "shape"
-    ):  # a batch type that contains other objects, such as shardings
-        return repr(array)
-    return f"{str(array.dtype).removeprefix('torch.'):<8} {tuple(array.shape)}"
+def _array_lines(arrays: Mapping[str, Any]) -> str:
+    """Return name, dtype and shape of each array, one per line; other objects, such as shardings, as text."""
+    width = max(map(len, arrays), default=0)
+    shown = {
+        name: f"{str(array.dtype).removeprefix('torch.'):<8} {tuple(array.shape)}" if hasattr(array, "dtype") else array
+        for name, array in arrays.items()
+    }
+    return "\n".join(f"{name:<{width}}  {text}" for name, text in shown.items())
 
 
 def batch_repr(self: Any) -> str:

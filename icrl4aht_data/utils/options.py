@@ -139,18 +139,22 @@ def replace_options(options: Options, values: Mapping[str, Any], where: str = ""
         raise OptionError(f"{where}{error}") from error
 
 
+def _as_int(value: Any) -> int | None:
+    """Return an integer of any library as an int; None for bools and other types."""
+    try:
+        return None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        return None
+
+
 def check_int(name: str, value: Any, least: int) -> int:
     """Return the value as an int after checking that it is an integer from `least` to 2**63 - 1.
 
     Raises:
         OptionError: if it is not; with the option's name.
     """
-    try:
-        if isinstance(value, bool):
-            raise TypeError
-        number = operator.index(value)
-    except TypeError as error:
-        raise OptionError(f"{name} = {value!r}: expected an integer") from error
+    if (number := _as_int(value)) is None:
+        raise OptionError(f"{name} = {value!r}: expected an integer")
     if not least <= number < 2**63:
         raise OptionError(f"{name} = {number}: expected at least {least} and below 2**63")
     return number
@@ -184,12 +188,8 @@ def check_position(sequence: str, position: Any, count: int) -> int:
         PositionTypeError: if the position is not an integer.
         PositionError: if the position is out of range.
     """
-    try:
-        if isinstance(position, bool):
-            raise TypeError
-        number = operator.index(position)
-    except TypeError as error:
-        raise PositionTypeError(f"position {position!r} of {sequence}: expected an integer or a slice") from error
+    if (number := _as_int(position)) is None:
+        raise PositionTypeError(f"position {position!r} of {sequence}: expected an integer or a slice")
     if not -count <= number < count:
         within = f"a number from {-count} to {count - 1}" if count else "no position, as it is empty"
         raise PositionError(f"position {number} of {sequence}: expected {within}")

@@ -102,8 +102,8 @@ def test_list_and_show_fit_a_terminal_of_80_columns(two_sources, on_terminal):
     assert all(" 5.0" in line for line in listed if line.startswith(("coord_simple", "demo_wide")) and "noise" in line)
     shown = on_terminal("show", root)
     paragraph = " ".join(" ".join(shown[: shown.index("")]).split())
-    assert paragraph.startswith("40 histories, 240 episodes, 4,800 steps of a lite release, data version ")
-    assert "12 tasks on 2 layouts with " in paragraph and "sources ppo (16), noise (24)" in paragraph
+    assert paragraph.startswith("Dataset(40 histories of 12 tasks on demo_wide, coord_simple; ")
+    assert "sources ppo (16), noise (24)" in paragraph and "lite release" in paragraph
     (total,) = [line.split() for line in shown if line.startswith("total")]
     assert total[1:5] == [str(len(tasks)), "40", "240", "4,800"]
     one = on_terminal("show", root, "--history", "3")

@@ -96,9 +96,9 @@ def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     ("change", "message"),
     [
         ({"family": "utility"}, r"line 1: unknown heuristic family 'utility'.*Did you mean 'utility_greedy'"),
-        ({"slot": 0}, r"line 1: teammate\.slot: expected 1, the teammate's agent slot, found 0"),
-        ({"colour": "red"}, r"line 1: teammate: expected the fields .*found .*'colour'"),
-        ({"theta": [1]}, r"line 1: teammate\.theta: expected parameters by name, found \[1\]"),
+        ({"slot": 0}, r"line 1: teammate: Invalid enum value 0 - at `\$\.slot`"),
+        ({"colour": "red"}, r"line 1: teammate: .*unknown field `colour`; expected the fields "),
+        ({"theta": [1]}, r"line 1: teammate: expected `object`, got `array` - at `\$\.theta`"),
     ],
 )
 def test_wrong_teammates_are_named_with_their_line(tmp_path, change, message):

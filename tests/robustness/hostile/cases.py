@@ -149,7 +149,7 @@ def _terminal_codes(root: Path) -> None:
 
 add("release", r"\\x1b\]0;owned.*not listed", {"name with terminal codes": _terminal_codes})
 
-add_hashed("expected 64 digits", {"checkpoint's hash": theta(sha256="../../outside")})
+add_hashed("matching regex", {"checkpoint's hash": theta(sha256="../../outside")})
 _paths = {"above": "../../outside", "absolute": "/etc", "backslash": "..\\..\\outside", "surrogate": "\ud800"}
 add_hashed(
     "expected a path within", {f"checkpoint's path: {name}": theta(checkpoint=path) for name, path in _paths.items()}
