@@ -121,6 +121,7 @@ class Selection:
                 f'obs = "state": {location} has observations only, no state records; take float32 or uint8'
             )
 
+    # Workers of a data loader get a pickle without the decoded arrays, and open their own source.
     def __getstate__(self) -> tuple:
         return self.origin, self.index, self._shards, self.options, self.ids
 
@@ -144,6 +145,7 @@ class Selection:
         Raises:
             OptionError: if the selection's layouts have different numbers of own channels.
         """
+        # Layouts may share a shape, so the first layout of each shape is enough for the message.
         shapes = {observation_shape(layout, self.channels == "canonical"): layout for layout in self.layouts}
         if len(shapes) > 1:
             raise OptionError(
@@ -236,6 +238,7 @@ class Selection:
         field = ALIASES.get(name, name)
         if ENTRY_HINTS.get(field) is not str:
             raise unknown("field of names", name, ("labels", *(one for one, of in ENTRY_HINTS.items() if of is str)))
+        # Codes are positions in the values of the whole release, so some of them may be absent from this selection.
         numbers = np.bincount(self.column_codes(field), minlength=1).tolist()
         return {value: number for value, number in zip(self.index.values(field), numbers, strict=False) if number}
 
@@ -245,6 +248,7 @@ class Selection:
         For noise histories the oracle labels are the expert actions, even if `has_oracle_actions` is False because they
         are not stored twice; see `Entry.stored_field`.
         """
+        # The index says what is stored, and noise histories store their two equal columns of labels once.
         has = self.column(f"has_{labels}_actions")
         return has if labels == "expert" else has | ((self.column("source") == "noise") & self.has_labels("expert"))
 
@@ -277,11 +281,13 @@ class Selection:
         name = ALIASES.get(name, name) if isinstance(name, str) else name
         if not isinstance(name, str) or name not in ENTRY_HINTS:
             raise unknown("column", name, (*ENTRY_HINTS, *ALIASES))
+        # Ids and shapes are functions of the position and the layout, so the index has no columns of them.
         if name == "history_id":
             return self.ids.astype(np.int64)
         if name == "obs_shape":
             return np.array([layout.obs_shape for layout in self.layouts])[self.layout_numbers]
         if ENTRY_HINTS[name] is str:
+            # An empty array would be of floats; a release without histories has no values.
             return np.array(self.index.values(name) or [""])[self.column_codes(name)]
         return self.index.entries.column(name)[self.ids]
 
@@ -304,7 +310,7 @@ class Selection:
                 codes, names = self.column_codes(name), pandas.Index(self.index.values(name))
                 columns[name] = pandas.Categorical.from_codes(codes, names).remove_unused_categories()
             elif hint == int | None:
-                numbers = self.column(name)
+                numbers = self.column(name)  # columns are of int64, in which -1 stands for None
                 columns[name] = pandas.arrays.IntegerArray(numbers, numbers == -1)
             elif name == "obs_shape":
                 columns[name] = list(map(tuple, self.column(name).tolist()))
@@ -315,6 +321,7 @@ class Selection:
     @cached_property
     def layouts(self) -> list[Layout]:
         """The layouts of the selection, in order of appearance."""
+        # np.unique sorts by code, that is by first appearance in the release, not in the selection.
         codes, first = np.unique(self.column_codes("layout"), return_index=True)
         names = self.index.values("layout")
         return [get_layout(names[code]) for code in codes[np.argsort(first)].tolist()]
@@ -323,6 +330,7 @@ class Selection:
     def layout_numbers(self) -> np.ndarray:
         """int32 (H,): the index of each history's layout in `layouts`."""
         names = self.index.values("layout")
+        # A table from the release's codes to the selection's numbers: one lookup per history, and no comparison.
         number = np.zeros(len(names), np.int32)
         number[[names.index(layout.name) for layout in self.layouts]] = np.arange(len(self.layouts))
         return number[self.column_codes("layout")]
@@ -341,6 +349,7 @@ class Selection:
     @cached_property
     def cache(self) -> CacheChoice:
         """The cache mode that samplers use for this selection, and the reason; see `sources.CACHE_MODES`."""
+        # From columns, since an entry of each of 82,000 histories would take longer than opening the release.
         size = 0
         for number, layout in enumerate(self.layouts):
             members = self.layout_numbers == number
@@ -373,6 +382,7 @@ class Selection:
             UnknownNameError, OptionError: for impossible options, such as obs="state" for a release of observations.
         """
         changed: dict[str, Any] = {"obs": obs, "cache": cache, "threads": threads, "channels": channels}
+        # `replace` checks the new options as the class does.
         options = replace(self.options, **{name: value for name, value in changed.items() if value is not None})
         return type(self)(self.origin, self.index, self._shards, options, self.ids)
 
@@ -404,6 +414,7 @@ class Selection:
                 `learner` not an integer or several.
             NotStoredError: for `min_expert_return`, if the expert return of a remaining history is unknown.
         """
+        # The index answers for the release; isin keeps the order of this selection, and repeated histories.
         found = self._keep(np.isin(self.ids, self.index.query(**wanted)), f"has {wanted}")
         if learner is not None:
             learners, numbers = found.column("learner"), learner_numbers(learner)
@@ -458,10 +469,10 @@ class Selection:
             OptionError: for anything but integers, and for a bool array of another length.
         """
         try:
-            given = np.asarray(ids)
+            given = np.asarray(ids)  # also of a list of bools, as a comprehension over histories gives
         except (TypeError, ValueError) as error:  # nested lists of unequal length
             raise OptionError(f"select: expected a list of history ids, found {ids!r:.200}") from error
-        if given.dtype == bool and given.ndim == 1:
+        if given.dtype == bool and given.ndim == 1:  # before the check for integers, since bools index like 0 and 1
             if len(given) != len(self):
                 raise OptionError(
                     f"select: expected a bool for each of {counted_histories(len(self))}, found {len(given)}"

@@ -86,6 +86,7 @@ class Sampler(Generic[B, D, T]):
                 f"expected an index below the count, and a batch that divides evenly among the processes"
             )
         self.dataset, self.layouts, self._observer = dataset, dataset.layouts, Observer(dataset)
+        # Here, not at the first batch: a training that fails after an hour of compiling is worse.
         if teammate_actions and not dataset.column("has_teammate_actions").all():
             raise LabelsMissingError("teammate_actions = True, but some histories have none")
         self.teammate_actions = teammate_actions
@@ -97,6 +98,7 @@ class Sampler(Generic[B, D, T]):
         raise NotImplementedError
 
     def __len__(self) -> int:
+        # A pass is defined by steps, since windows are drawn with replacement and visit no history exactly once.
         return max(1, int(self._draws.lengths.sum()) // (self.batch_size * self.length))
 
     def __getitem__(self, index: SupportsIndex) -> B:
@@ -157,6 +159,7 @@ class Sampler(Generic[B, D, T]):
         """Return the options that determine the batches, as JSON; `Batches` compares them on resuming."""
         return {
             "sampler": type(self).__name__,
+            # A hash, since the ids of 82,000 histories would fill every checkpoint.
             "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),
             "data_version": self.dataset.info.data_version,
             "obs": self.dataset.obs,
@@ -193,6 +196,7 @@ class Sampler(Generic[B, D, T]):
     def _too_large(self) -> OptionError:
         """Return the error for batches that do not fit into memory: the sizes, and the options that change them."""
         free, rows = free_memory(), self.local_size
+        # The largest array tells which option to change: observations in float32 nearly always.
         name, spec = max(self.specs.items(), key=lambda item: array_bytes(item[1].shape, item[1].dtype))
         most = free * rows // self._bytes // 2 * self.process_count  # half of it, because the next batch is prefetched
         advice = f"take batch_size = {most} or less" if most else f"take a smaller {self.length_option}"

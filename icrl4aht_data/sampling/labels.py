@@ -28,6 +28,7 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
     has = {name: dataset.has_labels(name) for name in LABELS}
     if has[labels].all():
         return labels
+    # The error lists every way out: other labels that all have, or the histories that have these.
     total, missing = len(dataset), np.flatnonzero(~has[labels])
     choices = [f"take {name} as labels, which all have" for name in LABELS if has[name].all()] or [
         "choose histories or a release with labels"
@@ -50,6 +51,7 @@ def warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
 
     The end is the mean of `return_end` over a task's selected histories, see `schema.are_labels_weak`.
     """
+    # Labels and their returns belong to a task, so one history of each task is enough to look them up.
     codes, first, task = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
     ends = np.bincount(task, dataset.column("return_end")) / np.bincount(task)
     values = dataset.index.values("task_id")

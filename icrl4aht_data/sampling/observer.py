@@ -86,10 +86,12 @@ class Observer:
             fast_observe(self._layouts[0], records, out, threads, self._canonical)
             return
         slab = max(1, _STEPS // math.prod(out.shape[1:-3]))
+        # Each layout has its own channels, so its rows of the batch are rendered apart and copied into place.
         numbers = self._selection.layout_numbers[histories]
         for number in np.unique(numbers).tolist():
             layout, rows = self._layouts[number], np.flatnonzero(numbers == number)
 
+            # Defaults bind the loop's variables, which threads would otherwise see change.
             def render(start: int, stop: int, layout=layout, rows=rows) -> None:
                 for first in range(start, stop, slab):
                     part = rows[first : min(first + slab, stop)]

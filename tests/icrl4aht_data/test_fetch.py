@@ -42,23 +42,11 @@ from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from tests.helpers.batches import assert_equal
 from tests.helpers.damages import contents, flip_bit
 from tests.helpers.random_releases import SHARD
-from tests.servers.common import (
-    Cut,
-    Fault,
-    Flip,
-    Hub,
-    Long,
-    Redirect,
-    Server,
-    Short,
-    Slow,
-    Status,
-    http_server,
-    hub_server,
-    s3_server,
-)
-from tests.servers.http import Answer
+from tests.servers.faults import Cut, Fault, Flip, Long, Redirect, Short, Slow, Status
+from tests.servers.http import Answer, Server, http_server
+from tests.servers.hub import Hub, hub_server
 from tests.servers.process import hub_environment, hub_settings
+from tests.servers.s3 import s3_server
 
 TABLE = chunk_table_name(SHARD)
 HUB = "hf://datasets/org/name"
@@ -85,7 +73,7 @@ def served(kind: str, folder: Path) -> Iterator[tuple[str, Server | Hub | None]]
             yield server.url, server
     elif kind == "s3":
         with s3_server(folder) as bucket:
-            yield bucket.url, None
+            yield bucket, None
     else:
         with tempfile.TemporaryDirectory() as root, hub_server(Path(root)) as hub:
             hub.add_repo("org/name", folder)
@@ -544,7 +532,7 @@ def test_credentials_in_an_address_are_used_and_never_kept_or_shown(lite, tmp_pa
     def route(request, body) -> Answer:
         allowed = request.headers["Authorization"] == "Basic bWU6aHVudGVyMg==" and request.target.endswith("?key=t0ken")
         path = lite[0] / request.path.lstrip("/")
-        return Answer(path, etag='"x"') if allowed and path.is_file() else Answer(b"", 404 if allowed else 401)
+        return Answer(path) if allowed and path.is_file() else Answer(b"", 404 if allowed else 401)
 
     said, server = [], Server(route)
     url = f"{server.url.replace('http://', 'http://me:hunter2@')}?key=t0ken"

@@ -40,7 +40,8 @@ from tests.helpers.plugins import installed, write_package
 from tests.helpers.random_releases import random_history, random_release
 from tests.helpers.tiny import TINY
 from tests.packaging.test_readme import blocks, commands, understand
-from tests.servers.common import hub_server, uploads
+from tests.servers.hub import hub_server
+from tests.servers.process import uploads
 
 DOCS = ROOT / "docs"
 PAGES = {

@@ -33,7 +33,8 @@ from tests.helpers.damages import contents
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_release
 from tests.robustness.limits import PAGE, can_mount, file_size_limit, memory_limit, small_disk, time_limit
-from tests.servers.common import Slow, http_server
+from tests.servers.faults import Slow
+from tests.servers.http import http_server
 
 SLOW = pytest.mark.slow
 

@@ -13,29 +13,23 @@ from fnmatch import fnmatchcase
 class Request:
     """One request in a server's log. All but `sent` is logged before the first byte of the answer is sent.
 
-    Rules see method, path, target, headers and began only, because the answer is not known yet.
+    Rules see neither `status` nor `sent`, because the answer is not known yet.
 
     Args:
         method: GET, HEAD, ...
         path: decoded and without the query.
-        start: first byte of the requested range; None without a Range header that the body can satisfy.
-        stop: end of the requested range, exclusive.
-        status: of the answer.
-        sent: bytes of the body that were written to the socket.
         target: path and query as the client sent them.
-        headers: of the request.
-        began: time.monotonic() at its arrival.
+        headers: headers of the request.
+        status: status of the answer.
+        sent: bytes of the body that were written to the socket.
     """
 
     method: str
     path: str
-    start: int | None = None
-    stop: int | None = None
+    target: str
+    headers: Message = field(repr=False)
     status: int = 0
     sent: int = 0
-    target: str = ""
-    headers: Message = field(default_factory=Message, repr=False)
-    began: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,10 +71,9 @@ class Long:
 
 @dataclass(frozen=True)
 class Flip:
-    """A body of the right length, with `bits` of the byte at `position` inverted; negative ones count from the end."""
+    """A body of the right length, with the bits of the byte at `position` inverted."""
 
     position: int = 0
-    bits: int = 0xFF
 
 
 @dataclass(frozen=True)
@@ -88,7 +81,6 @@ class Redirect:
     """A redirect to another path of this server, or to a URL."""
 
     to: str
-    code: int = 302
 
 
 Fault = Cut | Status | Slow | Short | Long | Flip | Redirect
@@ -101,9 +93,9 @@ class Faults:
     `path` is a pattern of fnmatch (`*` crosses `/`); `method` None is any method.
     """
 
-    def __init__(self, *rules: Rule) -> None:
+    def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._rules = list(rules)
+        self._rules: list[Rule] = []
 
     def __call__(self, request: Request) -> Fault | None:
         with self._lock:
@@ -120,23 +112,10 @@ class Faults:
 
         def rule(request: Request) -> Fault | None:
             nonlocal left
-            if left == 0 or not _matches(request, path, method):
+            if left == 0 or method not in (None, request.method) or not fnmatchcase(request.path, path):
                 return None
             left -= 1
             return fault
-
-        self.add(rule)
-
-    def every(self, k: int, fault: Fault, path: str = "*", method: str | None = "GET") -> None:
-        """Add a fault of the k-th request that matches, the 2k-th, and so on."""
-        seen = 0
-
-        def rule(request: Request) -> Fault | None:
-            nonlocal seen
-            if not _matches(request, path, method):
-                return None
-            seen += 1
-            return fault if seen % k == 0 else None
 
         self.add(rule)
 
@@ -144,7 +123,3 @@ class Faults:
         """Remove all rules."""
         with self._lock:
             self._rules.clear()
-
-
-def _matches(request: Request, path: str, method: str | None) -> bool:
-    return (method is None or request.method == method) and fnmatchcase(request.path, path)

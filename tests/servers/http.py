@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import io
 import os
-import re
 import socket
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -42,14 +39,12 @@ class Answer:
     Args:
         body: content, or the file that has it.
         status: HTTP status.
-        headers: besides Content-Length and what an etag adds.
-        etag: with its quotes; a body with one is served in ranges.
+        headers: besides Content-Length.
     """
 
     body: bytes | Path = b""
     status: int = 200
     headers: dict[str, str] = field(default_factory=dict)
-    etag: str | None = None
 
 
 Route = Callable[[Request, bytes], Answer]
@@ -116,7 +111,7 @@ class Handler(BaseHTTPRequestHandler):
     def answer(self) -> None:
         body = self._read_body()
         path = unquote(urlsplit(self.path).path)
-        request = Request(self.command, path, target=self.path, headers=self.headers, began=time.monotonic())
+        request = Request(self.command, path, self.path, self.headers)
         fault = self.owner.faults(request)
         self.owner.log.append(request)
         if isinstance(fault, Slow):
@@ -124,7 +119,7 @@ class Handler(BaseHTTPRequestHandler):
         if isinstance(fault, Status):
             answer = Answer(b"as the test ordered\n", fault.code, fault.headers)
         elif isinstance(fault, Redirect):
-            answer = Answer(b"", fault.code, {"Location": fault.to})
+            answer = Answer(b"", 302, {"Location": fault.to})
         else:
             answer = self.owner.route(request, body)
         self._send(request, answer, fault)
@@ -160,50 +155,29 @@ class Handler(BaseHTTPRequestHandler):
         return line
 
     def _send(self, request: Request, answer: Answer, fault: Fault | None) -> None:
-        headers, etag = dict(answer.headers), answer.etag
         with _opened(answer.body) as file:
             size = os.fstat(file.fileno()).st_size if isinstance(answer.body, Path) else len(answer.body)
-            status, start, stop = answer.status, 0, size
-            if etag is not None:
-                headers |= {"ETag": etag, "Accept-Ranges": "bytes"}
-                status, start, stop = self._selected(size)
-            if status == 206:
-                request.start, request.stop = start, stop
-            if status == 416:
-                headers["Content-Range"] = f"bytes */{size}"
-            if start < stop:
-                stop += fault.by if isinstance(fault, Long) else -fault.by if isinstance(fault, Short) else 0
-                stop = max(start, stop)
-            if status == 206:
-                headers["Content-Range"] = f"bytes {start}-{stop - 1}/{max(size, stop)}"
-            request.status = status
-            self.send_response(status)
-            for name, value in (headers | {"Content-Length": str(stop - start)}).items():
+            if size:
+                size += fault.by if isinstance(fault, Long) else -fault.by if isinstance(fault, Short) else 0
+            request.status, length = answer.status, max(0, size)
+            self.send_response(answer.status)
+            for name, value in (answer.headers | {"Content-Length": str(length)}).items():
                 self.send_header(name, value)
             self.end_headers()
             if self.command != "HEAD":
-                file.seek(start)
-                self._send_body(request, file, stop - start, fault)
-
-    def _selected(self, size: int) -> tuple[int, int, int]:
-        """Status, first byte and end of what this request's range selects."""
-        found = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
-        if found is None:
-            return 200, 0, size
-        start, stop = int(found[1]), min(int(found[2] or size) + 1, size)
-        return (206, start, stop) if start < stop else (416, 0, 0)
+                self._send_body(request, file, length, fault)
 
     def _send_body(self, request: Request, file: BinaryIO, length: int, fault: Fault | None) -> None:
         pace = fault.bytes_per_second if isinstance(fault, Slow) else None
         most = BLOCK if pace is None else max(1, int(pace * PACE))
-        flipped, bits = (fault.position % length, fault.bits) if isinstance(fault, Flip) and length else (None, 0)
+        flipped = fault.position % length if isinstance(fault, Flip) and length else -1
         end = min(length, fault.after) if isinstance(fault, Cut) else length
         self.close_connection |= isinstance(fault, Cut)
         while request.sent < end:
             count = min(most, end - request.sent)
             block = bytearray(file.read(count).ljust(count, b"\0"))
-            if flipped is not None and 0 <= flipped - request.sent < count:
-                block[flipped - request.sent] ^= bits
+            if 0 <= flipped - request.sent < count:
+                block[flipped - request.sent] ^= 0xFF
             request.sent += count
             self.wfile.write(block)
             if pace is not None and self.owner.closing.wait(count / pace):
@@ -213,16 +187,6 @@ class Handler(BaseHTTPRequestHandler):
 
 def _opened(body: bytes | Path) -> BinaryIO:
     return body.open("rb") if isinstance(body, Path) else io.BytesIO(body)
-
-
-def file_answer(path: Path) -> Answer:
-    """A file with the headers that nginx would send."""
-    stat = path.stat()
-    headers = {
-        "Last-Modified": formatdate(stat.st_mtime, usegmt=True),
-        "Content-Type": "application/octet-stream",
-    }
-    return Answer(path, headers=headers, etag=f'"{stat.st_mtime_ns:x}-{stat.st_size:x}"')
 
 
 @contextmanager
@@ -236,7 +200,7 @@ def http_server(folder: Path, faults: Faults | None = None) -> Iterator[Server]:
         path = (root / request.path.replace("\0", "").lstrip("/")).resolve()
         if not path.is_relative_to(root) or not path.is_file():
             return Answer(b"not found\n", 404)
-        return file_answer(path)
+        return Answer(path)
 
     server = Server(route, faults)
     try:

@@ -44,7 +44,7 @@ class Hub(HubState):
             for path in folder.rglob("*"):
                 if path.is_file():
                     name = path.relative_to(folder).as_posix()
-                    files[name] = self.blobs.add(path, is_large(name, path.stat().st_size))
+                    files[name] = self.blobs.add(path.read_bytes(), is_large(name, path.stat().st_size))
             commit = repo.commit("main", files)
             if tag is not None:
                 repo.tags[tag] = commit.oid
@@ -86,7 +86,7 @@ class Hub(HubState):
                 self.blobs.add(body, lfs=True)
             return Answer()
         path = self.blobs.path(sha256)
-        return Answer(path, etag=f'"{sha256}"') if path.exists() else Answer(b"no such object\n", 404)
+        return Answer(path, headers={"ETag": f'"{sha256}"'}) if path.exists() else Answer(b"no such object\n", 404)
 
 
 @contextmanager

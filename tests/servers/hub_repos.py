@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -109,18 +108,11 @@ class Blobs:
         """Path of a content, which need not exist."""
         return self._root / sha256
 
-    def add(self, data: bytes | Path, lfs: bool) -> File:
-        """Store a copy of a content; later changes of the original have no effect."""
-        if isinstance(data, Path):
-            with data.open("rb") as file:
-                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-        else:
-            sha256 = hashlib.sha256(data).hexdigest()
+    def add(self, data: bytes, lfs: bool) -> File:
+        """Store a content."""
+        sha256 = hashlib.sha256(data).hexdigest()
         if not self.path(sha256).exists():  # a client may be downloading it
-            if isinstance(data, Path):
-                shutil.copyfile(data, self.path(sha256))
-            else:
-                self.path(sha256).write_bytes(data)
+            self.path(sha256).write_bytes(data)
         return self.file(sha256, lfs)
 
     def file(self, sha256: str, lfs: bool) -> File:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 from tests.servers.faults import Request
 from tests.servers.http import Answer
-from tests.servers.hub_card import card_errors
+from tests.servers.hub_card import card_error
 from tests.servers.hub_repos import LFS_SUFFIXES, File, HubState, Refusal, Repo, is_large
 
 REPO = r"/api/datasets/(?P<id>[^/]+/[^/]+)"
@@ -100,7 +99,7 @@ def resolve(call: Call) -> Answer:
         raise Refusal(404, "Entry not found", "EntryNotFound", headers)
     file = commit.files[path]
     if not file.lfs:
-        return Answer(call.hub.blobs.path(file.sha256), headers=headers, etag=f'"{file.oid}"')
+        return Answer(call.hub.blobs.path(file.sha256), headers=headers | {"ETag": f'"{file.oid}"'})
     name = quote(path.rsplit("/", 1)[-1])
     headers |= {
         "X-Linked-Etag": f'"{file.sha256}"',
@@ -142,24 +141,13 @@ def preupload(call: Call) -> Answer:
 def lfs_batch(call: Call) -> Answer:
     """Upload addresses of large files; none for a content that the CDN has."""
     call.require_token()
-    objects, verify = [], f"{call.hub.endpoint}{urlsplit(call.request.target).path.removesuffix('batch')}verify"
-    _ = call.repo
+    objects = []
     for announced in call.json()["objects"]:
         entry: dict = {"oid": announced["oid"], "size": announced["size"]}
         if not call.hub.blobs.path(announced["oid"]).exists():
-            upload = {"href": f"{call.hub.cdn}/lfs/{announced['oid']}"}
-            entry["actions"] = {"upload": upload, "verify": {"href": verify}}
+            entry["actions"] = {"upload": {"href": f"{call.hub.cdn}/lfs/{announced['oid']}"}}
         objects.append(entry)
     return answer({"transfer": "basic", "objects": objects})
-
-
-def lfs_verify(call: Call) -> Answer:
-    call.require_token()
-    announced = call.json()
-    path = call.hub.blobs.path(announced["oid"])
-    if not path.exists() or path.stat().st_size != announced["size"]:
-        raise Refusal(404, f"object {announced['oid']} of {announced['size']} bytes was not uploaded")
-    return answer({})
 
 
 def commit(call: Call) -> Answer:
@@ -182,13 +170,10 @@ def _apply(hub: HubState, files: dict[str, File], key: str, value: dict) -> None
     """Change the files of a commit by one operation."""
     path = value["path"].strip("/")
     if key == "file":
-        try:
-            content = base64.b64decode(value["content"], validate=True)
-        except binascii.Error as error:
-            raise Refusal(400, f"{path}: {error}") from None
-        errors = card_errors(content.decode(errors="replace"))[0] if path == "README.md" else []
-        if errors:
-            raise Refusal(400, f"Invalid metadata in README.md: {'; '.join(errors)}")
+        content = base64.b64decode(value["content"], validate=True)
+        error = card_error(content.decode()) if path == "README.md" else None
+        if error:
+            raise Refusal(400, f"Invalid metadata in README.md: {error}")
         files[path] = hub.blobs.add(content, lfs=False)
     elif key == "lfsFile":
         if not hub.blobs.path(value["oid"]).exists():
@@ -210,13 +195,8 @@ def new_tag(call: Call) -> Answer:
 
 
 def validate_yaml(call: Call) -> Answer:
-    errors, warnings = card_errors(call.json()["content"])
-    status = 400 if errors else 200
-    if call.request.headers.get("Accept") == "text/plain":
-        lines = "".join(f"- Error: {error}\n" for error in errors)
-        return Answer(lines.encode(), status, {"Content-Type": "text/plain"})
-    messages = {"errors": errors, "warnings": warnings}
-    return answer({name: [{"message": text} for text in texts] for name, texts in messages.items()}, status)
+    error = card_error(call.json()["content"])
+    return answer({"errors": [{"message": error}] if error else [], "warnings": []}, 400 if error else 200)
 
 
 ROUTES: list[tuple[str, str, Route]] = [
@@ -230,7 +210,6 @@ ROUTES: list[tuple[str, str, Route]] = [
     ("POST", f"{REPO}/commit{AT}", commit),
     ("POST", f"{REPO}/tag{AT}", new_tag),
     ("POST", rf"{WEB}\.git/info/lfs/objects/batch", lfs_batch),
-    ("POST", rf"{WEB}\.git/info/lfs/objects/verify", lfs_verify),
     ("GET HEAD", f"{WEB}/resolve{AT}/(?P<path>.+)", resolve),
 ]
 """Methods, pattern of the path, route."""

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import fsspec
 import huggingface_hub
 import pytest
 from huggingface_hub import constants, hf_api
@@ -37,12 +36,6 @@ def _set(changes: Mapping[str, str | None]) -> None:
         os.environ.pop(name, None)
         if value is not None:
             os.environ[name] = value
-
-
-def forget_filesystems(*protocols: str) -> None:
-    """Drop fsspec's cached filesystems, which would outlive the server and the settings they were made for."""
-    for protocol in protocols:
-        fsspec.get_filesystem_class(protocol).clear_instance_cache()
 
 
 def hub_environment(endpoint: str, home: Path, token: str) -> dict[str, str]:

@@ -6,26 +6,17 @@ import logging
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import boto3
 from moto.server import ThreadedMotoServer
 
-from tests.servers.process import environment, forget_filesystems
-
-
-@dataclass(frozen=True)
-class Bucket:
-    """A served bucket: `url` is its root for fsspec, `endpoint` the address of its server."""
-
-    url: str
-    endpoint: str
+from tests.servers.process import environment
 
 
 @contextmanager
-def s3_server(folder: Path, bucket: str = "data") -> Iterator[Bucket]:
-    """A bucket with the files of a folder, which `fsspec.filesystem("s3")` finds without options."""
+def s3_server(folder: Path, bucket: str = "data") -> Iterator[str]:
+    """A bucket with the files of a folder, which fsspec finds without options; yields its address."""
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # moto logs every request
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
@@ -47,11 +38,9 @@ def s3_server(folder: Path, bucket: str = "data") -> Iterator[Bucket]:
                 if path.is_file():
                     key = path.relative_to(folder).as_posix()
                     client.put_object(Bucket=bucket, Key=key, Body=path.read_bytes())
-            forget_filesystems("s3")
             try:
-                yield Bucket(f"s3://{bucket}", endpoint)
+                yield f"s3://{bucket}"
             finally:
-                forget_filesystems("s3")
                 client.close()
     finally:
         # moto's buckets belong to the process, not to its server.

@@ -26,7 +26,7 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.small_models import random_parameters
-from tests.servers.common import http_server
+from tests.servers.http import http_server
 
 SHORT = dataclasses.replace(PROTOCOLS["seeded"], episodes=2, steps=10)
 WIDE = [task for task in published_tasks("teammate") if (task.layout.name, task.teammate_family) == ("demo_wide", "H4")]

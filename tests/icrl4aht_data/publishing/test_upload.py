@@ -22,7 +22,9 @@ from icrl4aht_data.publishing.upload import upload_release
 from icrl4aht_data.utils.templates import card_file, fill_template
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_release
-from tests.servers.common import Hub, Request, Slow, Status, hub_server, uploads
+from tests.servers.faults import Request, Slow, Status
+from tests.servers.hub import Hub, hub_server
+from tests.servers.process import uploads
 
 pytestmark = uploads
 REPO, ADDRESS = "us/histories", "hf://datasets/us/histories"

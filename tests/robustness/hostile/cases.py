@@ -46,7 +46,7 @@ from tests.robustness.hostile.spoil import (
     theta,
     typed,
 )
-from tests.servers.common import Fault, Long, Redirect
+from tests.servers.faults import Fault, Long, Redirect
 
 
 class Case(NamedTuple):

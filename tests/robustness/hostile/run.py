@@ -30,7 +30,8 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_releases import make_tasks, random_history
 from tests.robustness.hostile.cases import CASES, Case
 from tests.robustness.limits import memory_limit, time_limit
-from tests.servers.common import Faults, http_server
+from tests.servers.faults import Faults
+from tests.servers.http import http_server
 
 SECRET = "text outside of the release"
 MEMORY = 3 * 2**30
@@ -124,7 +125,7 @@ def download(root: Path, out: Path, case: Case) -> None:
     """Download from a server with the faults of a case."""
     faults = Faults()
     for path, fault in case.rules.items():
-        faults.every(1, fault, path=path, method=None)
+        faults.next(fault, times=10**9, path=path, method=None)
     with http_server(root, faults) as server:
         fetch_planned(plan_download(server.url, to=out / "mirror"))
 
