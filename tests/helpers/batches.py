@@ -18,6 +18,7 @@ def samplers(dataset, **options):
     return [
         dataset.ad(batch_size=6, length=50, teammate_actions=True, **options),
         dataset.ad(batch_size=6, length=130, **options),  # longer than the histories
+        dataset.ad(batch_size=6, length=50, every=2, **options),
         dataset.dpt(batch_size=6, context=17, **options),
         dataset.dpt(batch_size=6, context=17, order="random", teammate_actions=True, **options),
     ]

@@ -216,6 +216,7 @@ class TestLosses:
     [
         ("datasets", lambda sampler: hf_index(sampler.dataset), "hf"),
         ("torch.utils.data", torch_loader, "torch"),
+        ("pandas", lambda sampler: sampler.dataset.to_pandas(), "pandas"),
         ("pyarrow", lambda sampler: to_parquet(sampler.dataset, Path("never.parquet")), "hf"),
     ],
 )

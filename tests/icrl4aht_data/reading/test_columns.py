@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-import sys
 import warnings
 
 import numpy as np
@@ -20,7 +18,6 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.provenance import ExpertLabels
 from icrl4aht_data.format.schema import ENTRY_HINTS
-from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.random_releases import random_release
 
 
@@ -81,12 +78,6 @@ def test_data_frame(measured):
     for name in ("history_id", "T", "return_end", "has_expert_actions"):
         assert frame[name].tolist() == [getattr(entry, name) for entry in dataset.entries]
     assert frame.obs_shape.tolist() == [entry.obs_shape for entry in dataset.entries]
-
-
-def test_a_data_frame_without_pandas(lite, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(OptionError, match=re.escape("" + install_command("pandas"))):
-        load_icrl4aht(lite[0]).to_pandas()
 
 
 def test_filters_of_sources_and_algorithms(measured):

@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -94,7 +95,7 @@ def test_closing_ends_the_thread(sampler):
     assert workers() == 0
 
 
-def test_resuming_continues_exactly(lite, sampler):
+def test_resuming_continues_exactly(sampler):
     batches = sampler.batches()
     for _ in range(4):
         next(batches)  # prefetched but unconsumed batches are made again
@@ -104,11 +105,34 @@ def test_resuming_continues_exactly(lite, sampler):
         next(resumed)
         resumed.load_state_dict(state)
         assert_equal(next(resumed), sampler[4])
-    dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8")
-    with pytest.raises(OptionError, match="belongs to other batches: it has seed = 3, not 4"):
-        dataset.ad(batch_size=3, length=9, seed=4).batches().load_state_dict(state)
-    with pytest.raises(OptionError, match="selection"):
-        dataset[1:].ad(batch_size=3, length=9, seed=3).batches().load_state_dict(state)
+
+
+SIZES: dict[str, Any] = {"batch_size": 3, "length": 9}
+OTHER_BATCHES = {
+    "belongs to other batches: it has seed = 0, not 4": lambda ds: ds.ad(seed=4, **SIZES),
+    "it has selection = ": lambda ds: ds[1:].ad(**SIZES),
+    "it has every = None, not 2": lambda ds: ds.ad(every=2, **SIZES),
+    "it has labels = None, not 'oracle'": lambda ds: ds.ad(labels="oracle", **SIZES),
+    "channels = 'own', not 'canonical'": lambda ds: ds.with_options(channels="canonical").ad(**SIZES),
+    "sampler = 'ADSampler', not 'DPTSampler'": lambda ds: ds.dpt(batch_size=3, context=9),
+}
+
+
+@pytest.mark.parametrize("message", OTHER_BATCHES)
+def test_positions_of_other_batches_are_not_resumed(two_sources, message):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
+    state = dataset.ad(**SIZES).batches(prefetch=0).state_dict()
+    with pytest.raises(OptionError, match=message):
+        OTHER_BATCHES[message](dataset).batches(prefetch=0).load_state_dict(state)
+
+
+def test_positions_saved_before_an_option_existed_are_resumed(two_sources):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
+    for sampler in (dataset.ad(**SIZES), dataset.dpt(batch_size=3, context=9)):
+        batches = sampler.batches(prefetch=0)
+        state = {name: value for name, value in batches.state_dict().items() if name not in ("channels", "labels")}
+        batches.load_state_dict(state | {"next": 7})
+        assert_equal(next(batches), sampler[7])
 
 
 @pytest.mark.parametrize("cache", CACHES)

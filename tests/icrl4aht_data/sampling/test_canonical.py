@@ -140,20 +140,6 @@ def test_selections(root):
         own.with_options(channels=46)  # type: ignore[arg-type]
 
 
-def test_positions_of_other_channels_are_not_resumed(lite):
-    one = canonical(lite[0]).filter(layout="demo_wide").ad(batch_size=2, length=5)
-    two = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8").ad(batch_size=2, length=5)
-    with one.batches() as batches, two.batches() as other:
-        next(batches)
-        with pytest.raises(OptionError, match="channels = 'canonical', not 'own'"):
-            other.load_state_dict(batches.state_dict())
-        earlier = other.state_dict()
-        del earlier["channels"]  # positions saved before canonical channels existed
-        other.load_state_dict(earlier)
-        with pytest.raises(OptionError, match="channels = 'own', not 'canonical'"):
-            batches.load_state_dict(earlier)
-
-
 def test_memory_of_a_batch(lite, reconverted_release):
     """Memory includes the arrays and the state records or observations they are rendered from."""
     longest = max(record_size(get_layout(name)) for name in LAYOUTS)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.sampling.draws import Curriculum
 from tests.helpers.batches import CACHES
 from tests.helpers.two_sources import EPISODES, LENGTH
@@ -73,19 +72,3 @@ def test_parts_of_histories(two_sources):
     for i, first in ((0, 2), (9, 4), (50, 4)):
         assert set((parts.windows(i)[1] // LENGTH).tolist()) == {first, first + 1}
         assert (parts[i].attention_mask.sum(axis=1) == LENGTH).all()
-
-
-def test_processes_share_a_batch(two_sources):
-    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
-    halves = [dataset.ad(every=2, process_index=k, process_count=2, **OPTIONS)[1] for k in (0, 1)]
-    complete = dataset.ad(every=2, **OPTIONS)[1]
-    for name, whole in complete._asdict().items():
-        if whole is not None:
-            np.testing.assert_array_equal(np.concatenate([getattr(half, name) for half in halves]), whole)
-
-
-def test_positions_of_other_samplers_are_not_resumed(two_sources):
-    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
-    state = dataset.ad(every=2, **OPTIONS).batches(prefetch=0).state_dict()
-    with pytest.raises(OptionError, match="it has every = 2, not 3"):
-        dataset.ad(every=3, **OPTIONS).batches(prefetch=0).load_state_dict(state)

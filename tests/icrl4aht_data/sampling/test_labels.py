@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.errors import LabelsMissingError, OptionError, WeakLabelsWarning
+from icrl4aht_data.errors import LabelsMissingError, WeakLabelsWarning
 from icrl4aht_data.format.schema import HISTORIES, PROVENANCE
-from icrl4aht_data.interop import hf_episodes, hf_index
+from icrl4aht_data.interop import hf_episodes
 from icrl4aht_data.reading.history import LABELS
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.batches import CACHES, assert_equal
@@ -61,32 +61,6 @@ def test_label_kinds_change_the_targets_only(two_sources, cache, labels):
         np.testing.assert_array_equal(batch.target_actions[row, :valid], expected)
     assert not batch.target_actions[~batch.attention_mask].any()
     assert (batch.target_actions != taken.target_actions).any()
-
-
-def test_hugging_face_has_both_labels(two_sources, tmp_path, monkeypatch):
-    monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
-    root, written = two_sources
-    dataset = load_icrl4aht(root).select([3, 4])
-    rows: Any = list(hf_episodes(dataset))
-    for name in ("expert_actions", "oracle_actions"):
-        found = np.concatenate([row[name] for row in rows if row["history_id"] == 3])
-        np.testing.assert_array_equal(found, written[3][name])
-    assert hf_index(dataset)["has_oracle_actions"] == [True, True]
-
-
-def test_resuming_needs_the_same_labels(sampler):
-    with sampler.batches(prefetch=0) as batches:
-        next(batches)
-        state = batches.state_dict()
-        batches.load_state_dict(state)
-        assert_equal(next(batches), sampler[1])
-    expert = sampler.dataset.dpt(**OPTIONS).batches(prefetch=0)
-    with pytest.raises(OptionError, match="labels = 'oracle', not 'expert'"):
-        expert.load_state_dict(state)
-    expert.load_state_dict(
-        {name: value for name, value in state.items() if name != "labels"}
-    )  # positions saved by older versions
-    assert expert.next == 1
 
 
 @pytest.fixture(scope="module")
