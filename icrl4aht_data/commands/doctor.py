@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, metadata, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 from huggingface_hub import constants
@@ -53,16 +53,8 @@ _JAX_CODE = "import json, jax; print(json.dumps([jax.default_backend(), [d.devic
 _JAX_TIMEOUT = 120  # seconds
 
 
-class Problem(NamedTuple):
-    """Problem of an installation.
-
-    Attributes:
-        problem: description of the problem.
-        next_step: advice on how to correct it.
-    """
-
-    problem: str
-    next_step: str
+Problems = dict[str, str]
+"""Problem of an installation -> advice on how to correct it."""
 
 
 def diagnose() -> dict[str, Any]:
@@ -71,10 +63,14 @@ def diagnose() -> dict[str, Any]:
     Returns:
         A JSON object: "ok", then a mapping of findings per section (sizes in bytes), then "problems".
     """
-    problems: list[Problem] = []
+    problems: Problems = {}
     checks = (_packages, _plugins, _devices, _folders, _network, _bundled)
     sections = {check.__name__.removeprefix("_"): check(problems) for check in checks}
-    return {"ok": not problems, **sections, "problems": [problem._asdict() for problem in problems]}
+    return {
+        "ok": not problems,
+        **sections,
+        "problems": [{"problem": each, "next_step": step} for each, step in problems.items()],
+    }
 
 
 def in_words(found: dict[str, Any]) -> Iterator[str]:
@@ -101,7 +97,7 @@ def _text(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else value
 
 
-def _packages(problems: list[Problem]) -> dict[str, Any]:
+def _packages(problems: Problems) -> dict[str, Any]:
     facts: dict[str, Any] = {PACKAGE: {"found": _installed(PACKAGE), "folder": str(MINI.parent)}}
     oldest = SpecifierSet(f">={'.'.join(map(str, OLDEST_HDF5))}")
     wanted = [("HDF5", oldest, h5py.version.hdf5_version)]
@@ -109,7 +105,7 @@ def _packages(problems: list[Problem]) -> dict[str, Any]:
     try:
         about = metadata(PACKAGE)
     except PackageNotFoundError:
-        problems.append(Problem(f"{PACKAGE}: not installed", f"pip install {PACKAGE}, or -e . in a checkout"))
+        problems[f"{PACKAGE}: not installed"] = f"pip install {PACKAGE}, or -e . in a checkout"
     else:
         wanted.append(("Python", SpecifierSet(about["Requires-Python"]), platform.python_version()))
         needed = {one.name: one for one in map(Requirement, reversed(about.get_all("Requires-Dist") or []))}
@@ -124,8 +120,8 @@ def _packages(problems: list[Problem]) -> dict[str, Any]:
         if found is None and extra is not None:
             facts[name]["install"] = install_command(extra)
         elif found is None or not versions.contains(found, prereleases=True):
-            problem = f"{name} {found or 'is not installed'}: expected {versions}"
-            problems.append(Problem(problem, steps.get(name, f"pip install -U '{name}{versions}'")))
+            step = steps.get(name, f"pip install -U '{name}{versions}'")
+            problems[f"{name} {found or 'is not installed'}: expected {versions}"] = step
     return facts
 
 
@@ -136,7 +132,7 @@ def _installed(name: str) -> str | None:
         return None
 
 
-def _plugins(problems: list[Problem]) -> dict[str, Any]:
+def _plugins(problems: Problems) -> dict[str, Any]:
     """Return the objects that other packages register, by entry-point group; teammates and methods are not imported."""
     facts: dict[str, Any] = {}
     for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, Plugins(METHOD_GROUP, ())):
@@ -145,11 +141,11 @@ def _plugins(problems: list[Problem]) -> dict[str, Any]:
             if plugins is LAYOUT_PLUGINS:
                 _ = [get_layout(name) for name in plugins.names]
         except PluginError as error:
-            problems.append(Problem(str(error), "correct or uninstall the package"))
+            problems[str(error)] = "correct or uninstall the package"
     return facts
 
 
-def _devices(problems: list[Problem]) -> dict[str, Any]:
+def _devices(problems: Problems) -> dict[str, Any]:
     facts: dict[str, Any] = {"cores": usable_cores(), "free_memory": free_memory()}
     if importlib.util.find_spec("jax"):
         try:
@@ -159,8 +155,7 @@ def _devices(problems: list[Problem]) -> dict[str, Any]:
                 facts["note"] = f"JAX sees no GPU: on a machine with one, `{install_command('cuda13')}`, or cuda12"
         except (OSError, ValueError, subprocess.SubprocessError) as error:
             reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
-            step = "pip install -U --force-reinstall jax jaxlib"
-            problems.append(Problem(f"JAX cannot be used: {reason}", step))
+            problems[f"JAX cannot be used: {reason}"] = "pip install -U --force-reinstall jax jaxlib"
     return facts
 
 
@@ -174,7 +169,7 @@ def _query_jax() -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
-def _folders(problems: list[Problem]) -> dict[str, Any]:
+def _folders(problems: Problems) -> dict[str, Any]:
     cache, data = cache_folder(), data_folder()
     facts = {
         "cache": _folder("cache", cache, CACHE_VARIABLES, problems),
@@ -185,13 +180,13 @@ def _folders(problems: list[Problem]) -> dict[str, Any]:
     try:
         facts["cache"]["limit"] = cache_limit()
     except OptionError as error:
-        problems.append(Problem(str(error), "correct it, or unset it"))
+        problems[str(error)] = "correct it, or unset it"
     facts["cache"]["left_over"] = [str(p) for p in cache.glob(".*.partial-*")]
     facts["data"]["in_part"] = _disk_usage(path for part in data.glob("*/*/.partial-*") for path in part.rglob("*"))
     return facts
 
 
-def _folder(name: str, path: Path, variables: tuple[str, ...], problems: list[Problem]) -> dict[str, Any]:
+def _folder(name: str, path: Path, variables: tuple[str, ...], problems: Problems) -> dict[str, Any]:
     """Return a folder's path, setting, free space and whether it is writable; the folder may not exist yet."""
     free, writable = None, False
     try:
@@ -201,10 +196,10 @@ def _folder(name: str, path: Path, variables: tuple[str, ...], problems: list[Pr
             writable = True
     except OSError as error:
         problem = f"{path}: the {name} folder cannot be written: {error.strerror or error}"
-        problems.append(Problem(problem, f"set {variables[0]} to another folder, or make it writable"))
+        problems[problem] = f"set {variables[0]} to another folder, or make it writable"
     if free is not None and free < _LEAST_FREE:
         problem = f"{path}: the disk of the {name} folder is nearly full: {free:,} bytes are free"
-        problems.append(Problem(problem, f"set {variables[0]} to a folder on another disk, or free some space"))
+        problems[problem] = f"set {variables[0]} to a folder on another disk, or free some space"
     set_by = next((variable for variable in variables if os.environ.get(variable)), None)
     facts = {"path": str(path), "set_by": set_by, "variable": variables[0], "exists": os.access(path, os.F_OK)}
     return facts | {"writable": writable, "free": free}
@@ -220,22 +215,22 @@ def _disk_usage(paths: Iterable[Path]) -> int:
     return total
 
 
-def _network(problems: list[Problem]) -> dict[str, Any]:
+def _network(problems: Problems) -> dict[str, Any]:
     remote = default_remote()
     if remote is not None and not is_address(remote):
         step = "set it to one such as hf://datasets/<org>/<repo>, https://... or s3://..., or unset it"
-        problems.append(Problem(f"ICRL4AHT_REMOTE={remote!r}: expected an address", step))
+        problems[f"ICRL4AHT_REMOTE={remote!r}: expected an address"] = step
     try:
         check_credentials(remote or "")
     except OptionError as error:
-        problems.append(Problem(f"ICRL4AHT_REMOTE: {error}", "set it to such an address, or unset it"))
+        problems[f"ICRL4AHT_REMOTE: {error}"] = "set it to such an address, or unset it"
         remote = "not shown"
     return {"offline": offline_switches(), "remote": remote and without_credentials(remote)}
 
 
-def _bundled(problems: list[Problem]) -> dict[str, Any]:
+def _bundled(problems: Problems) -> dict[str, Any]:
     report = verify_release(MINI, level="quick")
-    problems += [Problem(f"the bundled release, {f.file}: {f.problem}", RESTORE) for f in report.findings]
+    problems |= {f"the bundled release, {each.file}: {each.problem}": RESTORE for each in report.findings}
     facts: dict[str, Any] = {"ok": report.ok}
     with suppress(Icrl4ahtError):  # unreadable files are already reported
         info = read_info(MINI)

@@ -46,33 +46,6 @@ TRACK, SPLIT = Names("track", lambda: TRACKS), Names("split", lambda: SPLITS)
 FAMILY = Names("family", all_families)
 
 
-class Root(click.ParamType):
-    """Type of a release: a folder, converted to a path, or an address, kept as text.
-
-    Args:
-        remote: accept addresses only.
-    """
-
-    name = "release"
-
-    def __init__(self, remote: bool = False) -> None:
-        self._remote = remote
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str | Path:
-        if not str(value):
-            self.fail("expected a release folder or an address, found an empty text", param, ctx)
-        if is_address(value):
-            return value
-        if self._remote:
-            self.fail(
-                f"{value}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...", param, ctx
-            )
-        return Path(value)
-
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return [CompletionItem(incomplete, type="dir")]
-
-
 class Folder(click.Path):
     """Type of a folder, which need not exist; an empty text, as from an unset shell variable, is an error.
 
@@ -91,6 +64,29 @@ class Folder(click.Path):
         if self._made_by and not path.is_dir():
             self.fail(f"{path}: no such folder; {self._made_by} makes one", param, ctx)
         return path
+
+
+class Root(Folder):
+    """Type of a release: a folder, converted to a path, or an address, kept as text.
+
+    Args:
+        remote: accept addresses only.
+    """
+
+    name = "release"
+
+    def __init__(self, remote: bool = False) -> None:
+        super().__init__()
+        self._remote = remote
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str | Path:
+        if is_address(value):
+            return value
+        if self._remote:
+            self.fail(
+                f"{value}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...", param, ctx
+            )
+        return super().convert(value, param, ctx)
 
 
 class NewFile(click.Path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
@@ -20,7 +19,6 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.fetch import ReleaseLocation
 from icrl4aht_data.format.index import ALIASES, Index
-from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.provenance import ProvenanceByTask, read_provenance
 from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, PROVENANCE, Entry
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
@@ -97,8 +95,13 @@ class Selection:
     Attributes:
         ids: int (H,), ids of the histories in the release, in the order of the selection.
         index: the release's index.
+        info: the release's versions, kind, environment and totals, as in meta/info.json.
         origin: the release: its folder on this machine, and its remote if it has one.
+        root: the release's folder on this machine; for a remote release the folder of downloaded files.
         options: form and channels of observations, cache mode, threads.
+        obs: form of observations: "float32", "uint8" or "state"; see `history.OBS`.
+        channels: channels of observations: each layout's own, or the canonical ones; see `channels.CHANNELS`.
+        threads: number of threads that decode and render.
 
     Raises:
         OptionError: for obs="state" of a release without state records.
@@ -112,8 +115,9 @@ class Selection:
         options: ReadOptions,
         ids: np.ndarray | None = None,
     ) -> None:
-        self.origin, self.index, self._shards = location, index, shards
-        self.options = options
+        self.origin, self.root, self._shards = location, location.folder, shards
+        self.index, self.info = index, index.info
+        self.options, self.obs, self.channels, self.threads = options, options.obs, options.channels, options.threads
         self.ids = np.arange(len(index.entries)) if ids is None else ids
         self._source: HistorySource | None = None
         if self.obs == "state" and not self.has_states:
@@ -127,16 +131,6 @@ class Selection:
 
     def __setstate__(self, state: tuple) -> None:
         self.__init__(*state)
-
-    @property
-    def obs(self) -> Obs:
-        """Form of observations: "float32", "uint8" or "state"; see `history.OBS`."""
-        return self.options.obs
-
-    @property
-    def channels(self) -> Channels:
-        """The channels of observations: each layout's own, or the canonical ones; see `channels.CHANNELS`."""
-        return self.options.channels
 
     @property
     def obs_shape(self) -> tuple[int, int, int]:
@@ -154,21 +148,6 @@ class Selection:
                 f'channels="canonical", which all layouts share, or add layout={self.layouts[0].name!r}'
             )
         return next(iter(shapes))
-
-    @property
-    def threads(self) -> int:
-        """Number of threads that decode and render."""
-        return self.options.threads
-
-    @property
-    def root(self) -> Path:
-        """The release's folder on this machine; for a remote release the folder of downloaded files."""
-        return self.origin.folder
-
-    @property
-    def info(self) -> ReleaseInfo:
-        """The release's versions, kind, environment and totals, as in meta/info.json."""
-        return self.index.info
 
     @cached_property
     def provenance(self) -> ProvenanceByTask:

@@ -55,6 +55,7 @@ class Sampler(Generic[B, D, T]):
         seed: seed of the draws.
         teammate_actions: whether batches have the teammate's actions.
         process_index, process_count: number of this process and of all processes.
+        local_size: rows of each batch in this process: batch_size / process_count.
     """
 
     batch_type: type[B]
@@ -85,6 +86,7 @@ class Sampler(Generic[B, D, T]):
                 f"process_index = {process_index}, process_count = {process_count}, batch_size = {batch_size}: "
                 f"expected an index below the count, and a batch that divides evenly among the processes"
             )
+        self.local_size = batch_size // process_count
         self.dataset, self.layouts, self._observer = dataset, dataset.layouts, Observer(dataset)
         # Here, not at the first batch: a training that fails after an hour of compiling is worse.
         if teammate_actions and not dataset.column("has_teammate_actions").all():
@@ -115,11 +117,6 @@ class Sampler(Generic[B, D, T]):
 
     def __iter__(self) -> Iterator[B]:
         return (self[i] for i in range(len(self)))
-
-    @property
-    def local_size(self) -> int:
-        """Rows of each batch in this process: batch_size / process_count."""
-        return self.batch_size // self.process_count
 
     def batch(self, i: int, out: B | None = None) -> B:
         """Return batch i, written into `out`, a batch from `empty()`, if given.

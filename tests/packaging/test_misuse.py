@@ -134,7 +134,7 @@ def test_bad_input_has_a_message_and_an_exit_code(say, arguments, message, code)
 
 
 def test_empty_arguments_are_refused(say):
-    assert say("list", "")[1].endswith("expected a release folder or an address, found an empty text")
+    assert say("list", "")[1].endswith("expected a folder, found an empty text")
     assert say("release", "build", "--out", "")[1].endswith("expected a folder, found an empty text")
 
 
