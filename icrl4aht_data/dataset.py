@@ -7,10 +7,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Self, Unpack
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, teammate_id
 from icrl4aht_data.environments import make_environment
@@ -193,7 +194,10 @@ class Dataset(Selection):
         """
         if by not in SPLIT_BY:
             raise unknown("split by", by, SPLIT_BY)
-        share, seed = check_number("validation", validation, 0, 1), check_int("seed", seed, 0)
+        share, seed = (
+            check_number("validation", validation, Annotated[float, Meta(gt=0, lt=1)]),
+            check_int("seed", seed, 0),
+        )
         if by == "history":
             held = choose_histories(self, share, seed)
         else:

@@ -160,20 +160,13 @@ def check_int(name: str, value: Any, least: int) -> int:
     return number
 
 
-def check_number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return the value as a float after checking that it is a number between `low` and `high`, exclusive.
-
-    Infinity is accepted without limits.
+def check_number(name: str, value: Any, hint: Any = float) -> float:
+    """Return the value, a number of Python or NumPy, as a float after checking its bounds; see `convert_option`.
 
     Raises:
-        OptionError: if it is not; with the option's name.
+        OptionError: if it is not a finite number within the bounds; with the option's name.
     """
-    is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    unlimited = (low, high) == (-math.inf, math.inf)
-    if not is_number or math.isnan(value) or not (unlimited or low < value < high):
-        limits = "" if unlimited else f" between {low:g} and {high:g}"
-        raise OptionError(f"{name} = {value!r}: expected a number{limits}")
-    return float(value)
+    return convert_option(name, value.item() if isinstance(value, np.generic) else value, hint)
 
 
 def check_position(sequence: str, position: Any, count: int) -> int:

@@ -139,7 +139,7 @@ class TestSplit:
         with pytest.raises(OptionError, match=r"every task of .* has one history"):
             one[:1].split(by="history")
         for share in (0, 1, 1.5, True, "a"):
-            with pytest.raises(OptionError, match=rf"validation = {share!r}: expected a number between 0 and 1"):
+            with pytest.raises(OptionError, match=rf"validation = {share!r}: expected "):
                 two_sourced.split(share)
         with pytest.raises(UnknownNameError, match=r"unknown split by 'task'; valid: teammate, history"):
             two_sourced.split(by="task")  # type: ignore[arg-type]
