@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.browsing.drawings import ShapeRecorder, layout_drawings
 from icrl4aht_data.browsing.embedding import NO_ACTION, embed_history, spread_episodes, spread_histories
-from icrl4aht_data.browsing.page import PAGE_START, make_browser_page, save_browser_page
+from icrl4aht_data.browsing.page import PAGE_START, make_browser_page
 from icrl4aht_data.browsing.serving import page_server
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError, UnknownNameError
@@ -258,11 +258,3 @@ def test_the_server_listens_on_loopback_only():
         finally:
             server.shutdown()
             thread.join()
-
-
-def test_a_page_appears_complete_or_not_at_all(release, tmp_path, monkeypatch):
-    page = make_browser_page(load_icrl4aht(release)[:1])
-    monkeypatch.setattr("os.fsync", lambda number: (_ for _ in ()).throw(OSError(28, "No space left on device")))
-    with pytest.raises(OSError, match="No space"):
-        save_browser_page(page, tmp_path / "page.html")
-    assert not list(tmp_path.iterdir())

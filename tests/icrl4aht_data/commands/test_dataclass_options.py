@@ -77,14 +77,10 @@ def test_only_given_values_reach_the_command(words, given):
     ("words", "message"),
     [
         ("--steps 0", "steps = '0': expected `int` >= 1"),
-        ("--steps 1.5", "steps = '1.5': expected `int`"),
-        ("--learning-rate 0", "expected `float` > 0"),
-        ("--learning-rate nan", "learning_rate = 'nan': expected"),
         ("--learning-rate inf", "learning_rate = 'inf': expected a finite number"),
         ("--dropout 1", "expected `float` < 1.0"),
         ("--discounts 0.5 --discounts 2", "discounts = '2': expected `float` < 1.0"),
         ("--positions ropes", "unknown positions 'ropes'; valid: none, rope"),
-        ("--hidden 0", "hidden = '0': expected `int` >= 1"),
         ("--excluded 1", "No such option"),
         ("--internal 1", "No such option"),
     ],
@@ -112,7 +108,6 @@ def test_values_of_tables_replace_fields_of_nested_dataclasses():
     assert asdict(changed) == asdict(base) | {"dropout": 0.2, "widths": {"hidden": 8}, "discounts": (0.5,)}
     assert replace_options(base, {}) == base
     for values, message in (
-        ({"steps": 0}, "ego.steps = 0: expected `int` >= 1"),
         ({"widths": {"hidden": 0}}, "ego.widths.hidden = 0: expected `int` >= 1"),
         ({"widths": 3}, "ego.widths = 3: expected a table"),
         ({"step": 3}, "unknown key 'ego.step'; .*Did you mean 'ego.steps'"),
@@ -134,7 +129,6 @@ def test_values_of_tables_replace_fields_of_nested_dataclasses():
         ({"dropout": 1}, "dropout = 1: expected `float` < 1.0"),
         ({"discounts": ()}, r"discounts = \(\): expected `array` of length >= 1"),
         ({"discounts": (0.5, -1.0)}, r"discounts = \(0.5, -1.0\): expected `float` >= 0.0 - at `\$\[1\]`"),
-        ({"limit": 0}, "limit = 0"),
     ],
 )
 def test_a_dataclass_checks_its_own_values(values, message):

@@ -119,11 +119,6 @@ def test_a_history_has_its_expert_return(measured):
     assert "labels" not in repr(dataset[6])
 
 
-def test_a_release_without_returns_refuses_the_filter(lite):
-    with pytest.raises(NotStoredError, match=r"12 of 12 histories .*Leave out min_expert_return$"):
-        load_icrl4aht(lite[0], min_expert_return=0.0)
-
-
 class TestWeakLabels:
     """Random play earns slightly less than 0 in all tasks."""
 

@@ -20,11 +20,6 @@ from tests.helpers.two_sources import two_source_release
 OPTIONS: dict[str, Any] = {"batch_size": 16, "context": 9, "seed": 4}
 
 
-@pytest.fixture
-def sampler(two_sources):
-    return load_icrl4aht(two_sources[0], layout="demo_wide").dpt(labels="oracle", **OPTIONS)
-
-
 def expected_targets(written, sampler, i: int) -> np.ndarray:
     """Return the labels at the query steps of batch i."""
     query, steps, *_ = sampler._draw(i)
