@@ -14,7 +14,7 @@ import numpy as np
 
 from icrl4aht_data.clients import Advance, without_credentials
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
-from icrl4aht_data.fetch import ReleaseLocation, Remote, is_address, open_root, short_hash
+from icrl4aht_data.fetch import ReleaseLocation, Remote, is_address, open_remote, short_hash
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import read_manifest
@@ -35,7 +35,7 @@ class DownloadPlan:
         changed: names of downloaded files that differ from the manifest.
     """
 
-    root: ReleaseLocation
+    root: Remote
     files: dict[str, int]
     absent: list[str]
     changed: list[str]
@@ -78,12 +78,8 @@ def plan_download(
         RemoteError, OfflineError: if the index cannot be fetched.
         EmptySelectionError, UnknownNameError: if no history matches the filters, or a filter has no such value.
     """
-    if not is_address(url):
-        found = without_credentials(url)
-        raise OptionError(f"{found}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...")
-    root = open_root(url, to)
-    remote, index = _remote(root), read_index(root.folder)
-    names = sorted(chosen_files(root, **wanted))
+    remote = open_remote(url, to)
+    index, names = read_index(remote.folder), sorted(chosen_files(ReleaseLocation(remote.folder, remote), **wanted))
     present = {name: remote.path(name).stat().st_size for name in names if remote.path(name).exists()}
     sizes = {name: index.info.shards[name] for name in names if name in index.info.shards}
     unknown = [name for name in names if name not in sizes and name not in present]
@@ -94,12 +90,7 @@ def plan_download(
             changed.append(name)
         done += sizes[name]
         advance("compare", done, total)
-    return DownloadPlan(root, sizes, sorted(sizes.keys() - present), changed)
-
-
-def _remote(root: ReleaseLocation) -> Remote:
-    assert root.remote is not None
-    return root.remote
+    return DownloadPlan(remote, sizes, sorted(sizes.keys() - present), changed)
 
 
 def fetch_planned(plan: DownloadPlan, advance: Advance | None = None) -> int:
@@ -109,8 +100,7 @@ def fetch_planned(plan: DownloadPlan, advance: Advance | None = None) -> int:
         RemoteError: if a file cannot be fetched; calling again resumes.
         OSError: if the disk is full or not writable.
     """
-    remote = _remote(plan.root)
-    before = remote.fetched
+    remote, before = plan.root, plan.root.fetched
     if not remote.in_hub_cache:
         _write_note(remote, plan.files)
     remote.fetch([*plan.changed, *plan.absent], advance, again=True)
@@ -195,7 +185,7 @@ def repair(root: str | Path, damaged: Iterable[str], *, source: str | None = Non
         OptionError: if no source is known, or the source has another release.
         RemoteError, OfflineError: if the source cannot be reached.
     """
-    remote = _remote(open_root(_repair_source(root, source)))
+    remote = open_remote(_repair_source(root, source))
     names = set(damaged) & remote.manifest.keys()
     if not is_address(root):
         manifest = (remote.folder / MANIFEST).read_bytes()

@@ -59,7 +59,7 @@ class ReleaseLocation:
     remote: Remote | None = None
 
     def __str__(self) -> str:
-        return str(self.folder) if self.remote is None else self.remote.url
+        return str(self.folder if self.remote is None else self.remote)
 
     def file(self, name: str) -> Path:
         """Return the path of a file, fetched first if necessary; a local one of meta/ is checked against the manifest.
@@ -117,6 +117,9 @@ class Remote:
     in_hub_cache: bool = False
     fetched: int = 0
 
+    def __str__(self) -> str:
+        return self.url
+
     def fetch(self, names: Iterable[str], advance: Advance | None = None, again: bool = False) -> None:
         """Download files that are not in the folder, several at once; stops at the first one that fails.
 
@@ -164,7 +167,7 @@ class Remote:
         most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
         if scratch is None:
             _remove_from_cache(target)  # a changed file, which the client would take
-        path = with_retries(address, lambda: _get(self.client, address, name, scratch, most, advance))
+        path = _get(self.client, address, name, scratch, most, advance)
         size, found = path.stat().st_size, file_hash(path)
         if found != self.manifest[name]:
             if scratch is None:
@@ -219,7 +222,7 @@ class Remote:
 def _get(
     client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, most: int, advance: Advance
 ) -> Path:
-    """Fetch a file of at most `most` bytes; `advance` has been called with all of them when it is complete."""
+    """Fetch a file of at most `most` bytes, with retries; the sum of `advance` is then the size of the file."""
     arrived = 0
 
     def count(size: int) -> None:
@@ -229,11 +232,11 @@ def _get(
         if arrived > most:
             raise RemoteError(f"{address}: expected at most {most:,} bytes, the server sent more", is_content=True)
 
-    try:
-        path = client.get(name, scratch, count)
-    except BaseException:
-        advance(-arrived)
-        raise
+    def attempt() -> Path:
+        count(-arrived)  # the bytes of a failed attempt are sent again
+        return client.get(name, scratch, count)
+
+    path = with_retries(address, attempt)
     advance(path.stat().st_size - arrived)  # what the Hub's cache had under another name
     return path
 
@@ -244,26 +247,33 @@ def _remove_from_cache(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
-def open_root(root: str | Path, to: Path | None = None) -> ReleaseLocation:
-    """Locate a release; fetch the manifest and the index of a remote one.
+def open_root(root: str | Path) -> ReleaseLocation:
+    """Locate a release, a folder or an address; see `open_remote` for the errors."""
+    if is_address(root):
+        remote = open_remote(str(root))
+        return ReleaseLocation(remote.folder, remote)
+    return ReleaseLocation(Path(root.removeprefix("file://") if isinstance(root, str) else root).expanduser())
+
+
+def open_remote(url: str, to: Path | None = None) -> Remote:
+    """Open a release at an address; fetch its manifest and index.
 
     Args:
-        root: a folder or an address: hf://datasets/<org>/<repo>[@<revision>], s3://, https://, any other of fsspec.
-        to: folder for the files of a remote release; see the module for the default.
+        url: hf://datasets/<org>/<repo>[@<revision>], s3://, https://, or any other address of fsspec.
+        to: folder for its files; see the module for the default.
 
     Raises:
-        OptionError: if `root` is no address, or `to` has files of something else.
+        OptionError: if `url` is no address, or `to` has files of something else.
         RootNotFoundError: if the address has no release.
         RemoteError: if the remote cannot be reached, or serves something else than its manifest lists.
         OfflineError: if network access is switched off and the index is not downloaded.
     """
-    if isinstance(root, Path) or "://" not in root:
-        return ReleaseLocation(Path(root).expanduser())
-    if root.startswith("file://"):
-        return ReleaseLocation(Path(root.removeprefix("file://")))
-    remote = (_open_hub if root.startswith("hf://") else _open_address)(root, to)
+    if not is_address(url):
+        found = without_credentials(url)
+        raise OptionError(f"{found}: expected an address such as hf://datasets/<org>/<repo>, s3://... or https://...")
+    remote = (_open_hub if url.startswith("hf://") else _open_address)(url, to)
     remote.fetch([name for name in _INDEX_FILES if name in remote.manifest])
-    return ReleaseLocation(remote.folder, remote)
+    return remote
 
 
 def _open_hub(url: str, to: Path | None) -> Remote:
@@ -310,9 +320,7 @@ def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | 
     address = f"{url}/{MANIFEST}"
     try:
         with client.connect():
-            path = with_retries(
-                address, lambda: _get(client, address, MANIFEST, scratch, disk.TEXT_BYTES, lambda size: None)
-            )
+            path = _get(client, address, MANIFEST, scratch, disk.TEXT_BYTES, lambda size: None)
     except RemoteError as error:
         if error.missing and offline_switches():
             raise OfflineError(f"{url}: offline, and no version of it is downloaded; go online") from None
