@@ -35,16 +35,12 @@ class EpisodeColumn(NamedTuple):
     shape: tuple[Literal["steps", "width"], ...] = ()
 
 
+_NAMES = ("task_id", "track", "split", "layout", "teammate_family", "teammate_kind", "source")
+
 EPISODE_COLUMNS: dict[str, EpisodeColumn] = {
     "history_id": EpisodeColumn("int64"),
     "episode": EpisodeColumn("int32"),
-    "task_id": EpisodeColumn("str"),
-    "track": EpisodeColumn("str"),
-    "split": EpisodeColumn("str"),
-    "layout": EpisodeColumn("str"),
-    "teammate_family": EpisodeColumn("str"),
-    "teammate_kind": EpisodeColumn("str"),
-    "source": EpisodeColumn("str"),
+    **dict.fromkeys(_NAMES, EpisodeColumn("str")),
     "learner": EpisodeColumn("int32"),
     "return": EpisodeColumn("float32"),
     "rewards": EpisodeColumn("float32", ("steps",)),

@@ -64,9 +64,7 @@ def read_lines(path: Path) -> Iterator[str]:
     """
     plain_size(path, 2**62)
     with wrap_read_errors(path), path.open("rb") as stream:
-        number = 0
-        while line := stream.readline(LINE_BYTES):
-            number += 1
+        for number, line in enumerate(iter(lambda: stream.readline(LINE_BYTES), b""), start=1):
             if len(line) == LINE_BYTES:
                 raise IndexFormatError(f"{path}, line {number}: expected at most {LINE_BYTES:,} bytes")
             yield line.removesuffix(b"\n").decode()
@@ -182,8 +180,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     try:
         with add_filename(path):
             yield partial
-            with partial.open("rb+") as stream:
-                os.fsync(stream.fileno())
+            sync(partial)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -227,7 +224,7 @@ def check_own_folder(folder: Path, names: Collection[str], what: str) -> None:
     """
     if os.path.lexists(folder) and not folder.is_dir():
         raise OptionError(f"{folder}: a file is where a folder is needed; give another folder")
-    found = (final_name(path.name) for path in folder.iterdir()) if folder.is_dir() else ()
+    found = [final_name(path.name) for path in folder.iterdir()] if folder.is_dir() else []
     foreign = sorted(name for name in found if name not in names)
     if foreign:
         raise OptionError(

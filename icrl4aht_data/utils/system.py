@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -81,9 +82,6 @@ def free_memory() -> int:
         return 4 * 2**30
 
 
-_pool: ThreadPoolExecutor | None = None
-
-
 def usable_cores() -> int:
     """Return the number of cores that this process may use."""
     try:
@@ -115,20 +113,13 @@ def in_slices(work: Callable[[int, int], None], n: int, threads: int, least: int
             raise error
 
 
+@cache
 def _get_pool() -> ThreadPoolExecutor:
-    global _pool
-    if _pool is None:
-        _pool = ThreadPoolExecutor(max_workers=2 * usable_cores(), thread_name_prefix="icrl4aht")
-    return _pool
-
-
-def _forget_pool() -> None:
-    global _pool
-    _pool = None
+    return ThreadPoolExecutor(max_workers=2 * usable_cores(), thread_name_prefix="icrl4aht")
 
 
 if hasattr(os, "register_at_fork"):  # threads do not survive a fork
-    os.register_at_fork(after_in_child=_forget_pool)
+    os.register_at_fork(after_in_child=_get_pool.cache_clear)
 
 
 _DEFAULT_LIMIT = 100 * 10**9
