@@ -25,6 +25,7 @@ class _Config(msgspec.Struct, forbid_unknown_fields=True):
 class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
     license: Literal["mit"]
     tags: list[str] = []
+    datasets: list[str] = []
     library_name: str = ""
     pipeline_tag: str = ""
     pretty_name: str = ""
