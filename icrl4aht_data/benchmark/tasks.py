@@ -30,7 +30,6 @@ from icrl4aht_data.benchmark.facts import (
     kind_family,
 )
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, unknown
-from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import is_inside, json_hash, parse_json, read_lines
 
@@ -202,7 +201,7 @@ class _Teammate(msgspec.Struct, forbid_unknown_fields=True):
     theta_id: Any
     base_seed: Any
     theta: dict[str, Any]
-    slot: Literal[1] = TEAMMATE
+    slot: Literal[1] = 1  # `actions.TEAMMATE`
 
 
 class _TaskFields(msgspec.Struct, forbid_unknown_fields=True):
