@@ -155,14 +155,11 @@ class Dataset(Selection):
             OptionError: if no field is given, or an argument is not a string.
             UnknownNameError: for a field that does not exist; names the nearest one.
         """
-        if not names:
-            raise OptionError('sort: expected the name of an index field, such as ds.sort("return_end")')
-        for name in names:
-            if not isinstance(name, str):
-                raise OptionError(
-                    f"sort: expected names of index fields, such as "
-                    f'ds.sort("layout", "return_end"), found {name!r}; for another order give its ids to ds.select'
-                )
+        if not names or not all(isinstance(name, str) for name in names):
+            raise OptionError(
+                f'sort: expected names of index fields, such as ds.sort("layout", "return_end"), found {names!r}; for '
+                f"another order give its ids to ds.select"
+            )
         keys = []
         for name in names:
             values = self.column(name)

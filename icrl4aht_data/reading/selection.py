@@ -451,16 +451,15 @@ class Selection:
             given = np.asarray(ids)  # also of a list of bools, as a comprehension over histories gives
         except (TypeError, ValueError) as error:  # nested lists of unequal length
             raise OptionError(f"select: expected a list of history ids, found {ids!r:.200}") from error
-        if given.dtype == bool and given.ndim == 1:  # before the check for integers, since bools index like 0 and 1
-            if len(given) != len(self):
-                raise OptionError(
-                    f"select: expected a bool for each of {counted_histories(len(self))}, found {len(given)}"
-                )
+        if given.dtype == bool and given.shape == self.ids.shape:  # first, since bools would index like 0 and 1
             given = self.ids[given]
         if not given.size:
             raise EmptySelectionError(f"{self.root}: select was given no history id")
         if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer):
-            raise OptionError(f"select: expected a list of history ids, found {given.dtype} of shape {given.shape}")
+            raise OptionError(
+                f"select: expected a list of history ids, or a bool for each of {counted_histories(len(self))}, found "
+                f"{given.dtype} of shape {given.shape}"
+            )
         chosen = given.astype(np.int64)
         absent = chosen[~np.isin(chosen, self.ids)]
         if len(absent):

@@ -49,7 +49,7 @@ def test_histories_are_selected_by_a_mask(lite):
     assert dataset.select(mask).ids.tolist() == dataset.ids[mask].tolist()
     with pytest.raises(EmptySelectionError):
         dataset.select(np.zeros(len(dataset), bool))
-    with pytest.raises(OptionError, match=r"expected a bool for each of \d+ histories, found 3"):
+    with pytest.raises(OptionError, match=r"a bool for each of 12 histories, found bool of shape \(3,\)"):
         dataset.select(mask[:3])
     for wrong in ([1.5], [[0]], ["0"]):
         with pytest.raises(OptionError, match="expected a list of history ids"):

@@ -31,17 +31,6 @@ def test_learners(two_sources):
         load_icrl4aht(two_sources[0], learner="first")  # type: ignore[arg-type]
 
 
-def test_a_source_that_a_release_does_not_have(lite, two_sources):
-    with pytest.raises(EmptySelectionError, match=r"no history has source='noise'\..*; sources: ppo$"):
-        load_icrl4aht(lite[0], source="noise")
-    with pytest.raises(EmptySelectionError, match=r"split='validation', source='ppo'\..*; sources: ppo, noise$"):
-        load_icrl4aht(two_sources[0], split="validation", source="ppo")
-    with pytest.raises(
-        UnknownNameError, match=r"unknown source 'nois'; valid: ppo, noise, student\. Did you mean 'noise'"
-    ):
-        load_icrl4aht(lite[0], source="nois")
-
-
 def test_representations_say_sources_and_splits(two_sources):
     dataset = load_icrl4aht(two_sources[0])
     assert "; splits train (28), validation (12); sources ppo (16), noise (24); 4,800 transitions" in repr(dataset)

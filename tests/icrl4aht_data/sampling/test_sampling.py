@@ -143,19 +143,6 @@ def _is_slice(window, states):
     return any(np.array_equal(window, states[k : k + len(window)]) for k in range(len(states) - len(window) + 1))
 
 
-@pytest.mark.parametrize("order", ["contiguous", "random"])
-def test_the_last_steps_next_state_is_the_episodes_end(lite, order):
-    root, written = lite
-    batch = load_icrl4aht(root, obs="state").select([2]).dpt(batch_size=3, context=120, order=order)[0]
-    states, following = written[2]["state"], _following(written[2])
-    if order == "contiguous":
-        np.testing.assert_array_equal(batch.context_obs, np.stack([states] * 3))
-        np.testing.assert_array_equal(batch.context_next_obs, np.stack([following] * 3))
-    else:
-        found = {"state": batch.context_obs.reshape(360, -1), "next": batch.context_next_obs.reshape(360, -1)}
-        assert set(_rows(found)) <= set(_rows({"state": states, "next": following}))
-
-
 @pytest.mark.parametrize("obs", ["float32", "uint8", "state"])
 def test_fields_dtypes_and_shapes(lite, obs):
     dataset = load_icrl4aht(lite[0], layout="demo_wide", obs=obs)
