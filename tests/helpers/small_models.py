@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from icrl4aht_baselines.methods.encoder import FlatEncoder
+from icrl4aht_baselines.control.worlds import FlatEncoder
 from icrl4aht_baselines.methods.method import Method, World
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.tokens import plain_view

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from icrl4aht_generation.policy import Policy
 from jax.experimental import io_callback
 
 from icrl4aht_data.errors import OptionError, unknown
@@ -37,20 +38,8 @@ class EgoInput(NamedTuple):
     prev_done: Any
 
 
-class HostPolicy(NamedTuple):
-    """A `icrl4aht_generation.policy.Policy` whose functions take a batch of B tasks, for agents that cannot be vmapped.
-
-    Attributes:
-        params: pytree of parameters.
-        init: (params, keys (B,)) -> memory of the batch.
-        act: (params, memory, views of the batch, keys (B,)) -> actions, int32 (B,), and the memory.
-        sees: content of the views, as in `Policy`.
-    """
-
-    params: Any
-    init: Callable[[Any, Any], Any]
-    act: Callable[[Any, Any, Any, Any], tuple[Any, Any]]
-    sees: Literal["state", "observation", "ego_input"]
+class HostPolicy(Policy):
+    """A policy whose functions take a batch of B tasks, with B keys and B views, for agents that cannot be vmapped."""
 
 
 class HostAgent(Protocol):

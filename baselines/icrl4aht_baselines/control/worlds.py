@@ -11,19 +11,32 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from icrl4aht_generation.learners.encoder import orthogonal_dense
 from icrl4aht_generation.policy import Policy
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 
 from icrl4aht_baselines.agents.host import EgoInput
-from icrl4aht_baselines.methods.encoder import FlatEncoder
 from icrl4aht_baselines.methods.method import World
 from icrl4aht_baselines.methods.tokens import plain_view
 from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch
 from icrl4aht_data.sampling.draws import random_uint32, scale_to_range
+
+
+class FlatEncoder(nn.Module):
+    """One dense layer, for worlds whose observation is a short vector."""
+
+    features: int
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, obs: Num[Array, "*B N"]) -> Float[Array, "*B F"]:
+        """Return features of observations, which are integers or float."""
+        return orthogonal_dense(self.features)(obs.astype(self.dtype))
 
 
 class SmallWorld(NamedTuple):

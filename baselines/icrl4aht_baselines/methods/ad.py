@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax.numpy as jnp
 from icrl4aht_generation.learners.encoder import encoding_log
-from jaxtyping import Array, Bool, Float, Int, Num
+from jaxtyping import Array, Bool, Float, Int
 
 from icrl4aht_baselines.methods.conditional import change_if
 from icrl4aht_baselines.methods.method import (
@@ -27,7 +27,7 @@ from icrl4aht_baselines.methods.method import (
     squared_error,
 )
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.methods.tokens import RingBuffer, StepInput, StepTokens, batch_steps
+from icrl4aht_baselines.methods.tokens import StepInput, StepTokens, batch_steps
 from icrl4aht_data.sampling.ad import ADBatch
 
 
@@ -51,7 +51,7 @@ class WindowMemory(NamedTuple):
     Attributes:
         tokens: float32 (K, D), the window's steps in order, at the front.
         steps: int32 (), number of steps in the window.
-        trunk: the trunk's memory of these steps.
+        trunk: the trunk's memory of these steps; None if every step computes the complete window.
     """
 
     tokens: Float[Array, "K D"]
@@ -89,37 +89,36 @@ class StepModel(nn.Module):
 
     def start(self, context: int, cached: bool) -> Any:
         """Return the memory of an ego before its first step."""
-        if not cached:
-            return RingBuffer.empty(context, self.tokens.width)
         trunk: Any = self.trunk
-        return WindowMemory(jnp.zeros((context, self.tokens.width)), jnp.int32(0), trunk.start(context))
+        states = trunk.start(context) if cached else None
+        return WindowMemory(jnp.zeros((context, self.tokens.width)), jnp.int32(0), states)
 
-    def act(self, step: StepInput, done: Bool[Array, ""], memory: Any) -> tuple[Any, Any]:
+    def act(self, step: StepInput, done: Bool[Array, ""], memory: WindowMemory) -> tuple[Any, WindowMemory]:
         """Return the head's output for one step of an ego, and the memory with the step."""
         trunk: Any = self.trunk
-        token = self.tokens(step)
-        if isinstance(memory, RingBuffer):
-            memory = memory.add(token)
-            window, valid = memory.last(len(memory.tokens), memory.written)
-            return self.head(trunk(window[None])[0, valid - 1]), memory
         tokens, steps, states = self._with_room(memory)
-        feature, states = trunk.advance(token, states)
-        return self.head(feature), WindowMemory(tokens.at[steps].set(token), steps + 1, states)
+        token = self.tokens(step)
+        tokens = tokens.at[steps].set(token)
+        if states is None:
+            feature = trunk(tokens[None])[0, steps]
+        else:
+            feature, states = trunk.advance(token, states)
+        return self.head(feature), WindowMemory(tokens, steps + 1, states)
 
     def _with_room(self, memory: WindowMemory) -> WindowMemory:
-        """Return the memory, dropping the oldest steps of a full window and recomputing the trunk's memory.
+        """Return the memory, dropping the oldest steps of a full window and recomputing the trunk's memory, if any.
 
         A kept step's keys and values were computed when it could still see the steps that go, so all are computed
         again, as if the kept steps were all that ever happened.
         """
         trunk, variables = self.trunk.unbind()
         context = len(memory.tokens)
-        kept = context - dropped_steps(context)
+        kept = context - (1 if memory.trunk is None else dropped_steps(context))
 
         def drop_oldest(variables: Any, memory: WindowMemory) -> WindowMemory:
             tokens = jnp.roll(memory.tokens, kept - context, axis=0)
-            states = trunk.start(context)
-            if kept:
+            states = None if memory.trunk is None else trunk.start(context)
+            if kept and states is not None:
                 states = trunk.apply(variables, tokens[:kept], context, method="start_after")
             return WindowMemory(tokens, jnp.int32(kept), states)
 
@@ -141,23 +140,32 @@ def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head:
     return StepModel(make_tokens(StepTokens, options, world), trunk, head, next_obs, teammate)
 
 
+def step_method(name: str, label: str, model: StepModel, loss: Loss, world: World, **settings: Any) -> Method:
+    """Return a method that learns from AD's batches; `settings` are further fields of `Method`."""
+    example = example_step(world)
+    return Method(
+        name=name, label=label, data="ad", model=model, example=(example, example.prev_action), loss=loss, **settings
+    )
+
+
 def example_step(world: World) -> StepInput:
     """Return a step of zeros, (1, 1)."""
     zero = jnp.zeros((1, 1), jnp.int32)
     return StepInput(jnp.zeros((1, 1, *world.obs_shape)), zero, jnp.zeros((1, 1)), zero)
 
 
-def next_obs_loss(predicted: Float[Array, "B L N"], obs: Num[Array, "B L ..."], batch: ADBatch) -> Float[Array, ""]:
-    """Return the auxiliary loss over steps whose successor is in the window and in the same episode."""
-    errors = squared_error(predicted[:, :-1], obs[:, 1:])
-    return mean_of_rows(errors, jnp.asarray(batch.attention_mask)[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1])
-
-
-def teammate_loss(predicted: Float[Array, "B L A"], batch: ADBatch) -> Float[Array, ""]:
-    """Return the auxiliary loss over steps whose successor, which shows the teammate's action, is in the window."""
-    assert batch.prev_teammate_actions is not None
-    errors = cross_entropy(predicted[:, :-1], jnp.asarray(batch.prev_teammate_actions)[:, 1:], 0.0)
-    return mean_of_rows(errors, jnp.asarray(batch.attention_mask)[:, 1:])
+def auxiliary_losses(output: StepOutput, steps: StepInput, batch: ADBatch, world: World) -> dict[str, Array]:
+    """Return the losses of the model's predictions of the next observation and of the teammate's action, by name."""
+    losses, mask = {}, jnp.asarray(batch.attention_mask)
+    if output.next_obs is not None:
+        # Steps count whose successor is in the window and in the same episode.
+        errors = squared_error(output.next_obs[:, :-1], world.observations(steps.obs)[:, 1:])
+        losses["next_obs_loss"] = mean_of_rows(errors, mask[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1])
+    if output.teammate is not None:
+        # A step's successor shows the teammate's action, in the next episode as well.
+        errors = cross_entropy(output.teammate[:, :-1], jnp.asarray(batch.prev_teammate_actions)[:, 1:], 0.0)
+        losses["teammate_loss"] = mean_of_rows(errors, mask[:, 1:])
+    return losses
 
 
 def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
@@ -172,14 +180,13 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
         # The action taken is the next step's previous action; the last step has none and is not predicted.
         taken = jnp.roll(steps.prev_action, -1, axis=1)
         output: StepOutput = run_model(model, options, params, key, steps, taken)
-        total = mean_of_rows(cross_entropy(output.head, targets, options.label_smoothing), mask)
-        log = {"action_loss": total, "accuracy": mean_of_rows(1.0 * (output.head.argmax(axis=-1) == targets), mask)}
-        if output.next_obs is not None:
-            log["next_obs_loss"] = next_obs_loss(output.next_obs, world.observations(steps.obs), batch)
-            total += log["next_obs_loss"]
-        if output.teammate is not None:
-            log["teammate_loss"] = teammate_loss(output.teammate, batch)
-            total += log["teammate_loss"]
+        errors = cross_entropy(output.head, targets, options.label_smoothing)
+        log = {
+            "action_loss": mean_of_rows(errors, mask),
+            "accuracy": mean_of_rows(1.0 * (output.head.argmax(axis=-1) == targets), mask),
+            **(auxiliary := auxiliary_losses(output, steps, batch, world)),
+        }
+        total = sum(auxiliary.values(), start=log["action_loss"])
         return total, {"loss": total, **log, **encoding_log(steps.obs)}
 
     return loss
@@ -192,16 +199,8 @@ def action_method(
 
     def make(options: ModelOptions, world: World) -> Method:
         model = make_step_model(options, world, make_trunk(options), nn.Dense(world.actions))
-        example = example_step(world)
-        return Method(
-            name=name,
-            label=label,
-            data="ad",
-            model=model,
-            example=(example, example.prev_action),
-            loss=action_loss(model, options, world),
-            logits=lambda head: head,
-        )
+        loss = action_loss(model, options, world)
+        return step_method(name, label, model, loss, world, logits=lambda head: head)
 
     return make
 

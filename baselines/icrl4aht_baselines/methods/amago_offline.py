@@ -19,11 +19,10 @@ import jax.numpy as jnp
 from icrl4aht_generation.learners.encoder import encoding_log
 from jaxtyping import Array, Float
 
-from icrl4aht_baselines.methods.ad import StepOutput, example_step, make_step_model, next_obs_loss
+from icrl4aht_baselines.methods.ad import StepOutput, auxiliary_losses, make_step_model, step_method
 from icrl4aht_baselines.methods.method import (
     Method,
     World,
-    check_no_teammate_loss,
     cross_entropy,
     make_transformer,
     mean_of_rows,
@@ -74,7 +73,6 @@ class ActorCriticHead(nn.Module):
 
 def amago_offline(options: ModelOptions, world: World) -> Method:
     """Return an offline actor-critic on AD's tokens and transformer."""
-    check_no_teammate_loss("amago_offline", options)
     head = ActorCriticHead(options.width, len(options.discounts), world.actions)
     model = make_step_model(options, world, make_transformer(options), head)
     discounts_G = jnp.asarray(options.discounts)
@@ -103,27 +101,15 @@ def amago_offline(options: ModelOptions, world: World) -> Method:
         imitation = better * cross_entropy(online.logits, repeated, options.label_smoothing)
         actor = mean_of_rows((imitation - Q_WEIGHT * baseline_BxLxG).mean(axis=-1), mask)
 
-        total = actor + CRITIC_WEIGHT * critic
         log = {
             "actor_loss": actor,
             "critic_loss": critic,
             "value": mean_of_rows(baseline_BxLxG[..., -1], mask),
             "imitated": mean_of_rows(better.mean(axis=-1), mask),
+            **(auxiliary := auxiliary_losses(output, steps, batch, world)),
         }
-        if output.next_obs is not None:
-            log["next_obs_loss"] = next_obs_loss(output.next_obs, world.observations(steps.obs), batch)
-            total += log["next_obs_loss"]
+        total = sum(auxiliary.values(), start=actor + CRITIC_WEIGHT * critic)
         return total, {"loss": total, **log, **encoding_log(steps.obs)}
 
-    example = example_step(world)
-    return Method(
-        name="amago_offline",
-        label="AMAGO-Offline",
-        data="ad",
-        model=model,
-        example=(example, example.prev_action),
-        loss=loss,
-        logits=lambda output: output.logits[..., -1, :],
-        slow=SLOW,
-        takes_labels=False,
-    )
+    settings: Any = {"logits": lambda output: output.logits[..., -1, :], "slow": SLOW, "takes_labels": False}
+    return step_method("amago_offline", "AMAGO-Offline", model, loss, world, **settings)

@@ -19,33 +19,16 @@ SHORT_ROWS, LONG_ROWS = 64, 512
 """Query rows computed at once; sequences of up to `LONG_ROWS` tokens, such as the paper's 500, are short."""
 
 
-def causal_attention(
-    q_BxNxHxDh: Float[Array, "B N H Dh"], k_BxNxHxDh: Float[Array, "B N H Dh"], v_BxNxHxDh: Float[Array, "B N H Dh"]
-) -> Float[Array, "B N H Dh"]:
-    """Return attention in which each token sees those up to itself."""
-    return _attention(q_BxNxHxDh, k_BxNxHxDh, v_BxNxHxDh, 1)
-
-
-def query_attention(
-    q_BxQxHxDh: Float[Array, "B K+1 H Dh"],
-    own_k_BxQxHxDh: Float[Array, "B K+1 H Dh"],
-    own_v_BxQxHxDh: Float[Array, "B K+1 H Dh"],
-    k_BxKxHxDh: Float[Array, "B K H Dh"],
-    v_BxKxHxDh: Float[Array, "B K H Dh"],
-) -> Float[Array, "B K+1 H Dh"]:
-    """Return attention in which query j sees the first j tokens of a context, and itself."""
-    return _attention(q_BxQxHxDh, k_BxKxHxDh, v_BxKxHxDh, 0, own_k_BxQxHxDh, own_v_BxQxHxDh)
-
-
-def _attention(q: Array, k: Array, v: Array, seen_by_first: int, *own: Array) -> Array:
-    """Return attention of queries: row i sees the first `seen_by_first` + i keys, and its own key if it has one.
+def causal_attention(q: Array, k: Array, v: Array, *own: Array) -> Float[Array, "B N H Dh"]:
+    """Return attention in which each token sees those up to itself.
 
     Args:
         q: queries (B, N, H, Dh).
-        k, v: keys and values (B, K, H, Dh).
-        seen_by_first: number of keys that the first row sees.
-        own: a key and a value for each query (B, N, H, Dh), or nothing.
+        k, v: keys and values of the same tokens; or (B, K, H, Dh) of a context, if there are `own` ones.
+        own: key and value of each query (B, N, H, Dh), which is then no token of the context: query j sees the first j
+            tokens and itself.
     """
+    seen_by_first = 0 if own else 1
     q, k, v = (x.swapaxes(1, 2) for x in (q / q.shape[-1] ** 0.5, k, v))
     length, rows = q.shape[2], (q, *(x.swapaxes(1, 2) for x in own))
     if length > LONG_ROWS:

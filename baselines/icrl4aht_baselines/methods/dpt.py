@@ -22,7 +22,6 @@ from icrl4aht_baselines.methods.conditional import change_if
 from icrl4aht_baselines.methods.method import (
     Method,
     World,
-    check_no_teammate_loss,
     cross_entropy,
     make_next_obs_head,
     make_tokens,
@@ -31,14 +30,8 @@ from icrl4aht_baselines.methods.method import (
     squared_error,
 )
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.methods.tokens import (
-    RingBuffer,
-    StepInput,
-    Transition,
-    TransitionTokens,
-    batch_transitions,
-)
-from icrl4aht_baselines.methods.transformer import AttentionCache, Transformer
+from icrl4aht_baselines.methods.tokens import StepInput, Transition, TransitionTokens, batch_transitions
+from icrl4aht_baselines.methods.transformer import Transformer, TransformerMemory
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.sampling.dpt import DPTBatch
 
@@ -56,22 +49,24 @@ class DPTOutput(NamedTuple):
 
 
 class DPTMemory(NamedTuple):
-    """Memory of an acting ego: its transitions, as a ring of K + KEPT_STEPS slots.
+    """Memory of an acting ego: its transitions, as a ring of S = K + KEPT_STEPS slots.
 
     The transitions of the running episode are stored, but not visible before the episode ends.
 
     Attributes:
-        buffer: tokens of the transitions; `written` counts them so far.
+        tokens: float32 (S, D), tokens of the transitions; transition i is in slot i % S.
+        written: int32 (), transitions so far.
         complete: int32 (), transitions of finished episodes.
-        caches: the transformer's caches of the last K transitions of finished episodes, computed when an episode ends,
-            with one slot more, for the query; None if every step computes the context again.
+        context: the transformer's memory of the last K transitions of finished episodes, with one slot more, for the
+            query.
         last_obs: float32, observation before the last action.
         started: bool (), whether a step was taken.
     """
 
-    buffer: RingBuffer
+    tokens: Float[Array, "S D"]
+    written: Int[Array, ""]
     complete: Int[Array, ""]
-    caches: tuple[AttentionCache, ...] | None
+    context: TransformerMemory
     last_obs: Array
     started: Bool[Array, ""]
 
@@ -108,11 +103,10 @@ class DPT(nn.Module):
     def start(self, context: int, cached: bool) -> DPTMemory:
         """Return the memory of an ego before its first step: room for K transitions and a running episode.
 
-        A context that grows by steps is not cached: it would have to be computed again in every step.
+        The context is computed when it changes, which is exact, so `cached` has no effect.
         """
-        buffer = RingBuffer.empty(context + KEPT_STEPS, self.tokens.width)
-        caches = self.trunk.empty_caches(context + 1) if cached and self.finished_episodes_only else None
-        return DPTMemory(buffer, jnp.int32(0), caches, jnp.zeros(self.obs_shape), jnp.bool_(False))
+        tokens, zero = jnp.zeros((context + KEPT_STEPS, self.tokens.width)), jnp.int32(0)
+        return DPTMemory(tokens, zero, zero, self.trunk.start(context + 1), jnp.zeros(self.obs_shape), jnp.bool_(False))
 
     def act(self, step: StepInput, done: Bool[Array, ""], memory: DPTMemory) -> tuple[Float[Array, " A"], DPTMemory]:
         """Return the policy for one step of an ego, and the memory with the outcome of the step before.
@@ -124,46 +118,24 @@ class DPT(nn.Module):
         both = jnp.stack([memory.last_obs, obs])
         transition = Transition(both, step.prev_action, step.prev_reward, step.prev_teammate_action)
         token, query = self.tokens.context(transition)[0], self.tokens.query(obs)
-        written = memory.buffer.written + (memory.started & ~done)
         # Without a new transition `written` stays, and the next step overwrites the token added here.
-        buffer = RingBuffer(memory.buffer.add(token).tokens, written)
+        tokens = memory.tokens.at[memory.written % len(memory.tokens)].set(token)
+        written = memory.written + (memory.started & ~done)
         complete = jnp.where(done, written, memory.complete) if self.finished_episodes_only else written
-        caches = memory.caches
-        if caches is None:
-            feature = self._answer_from_tokens(query, buffer, complete)
-        else:
-            caches = self._cache_context(done, buffer, complete, caches)
-            feature, caches = self._answer_from_caches(query, complete, caches)
-        return self.head(feature), DPTMemory(buffer, complete, caches, obs, jnp.bool_(True))
-
-    def _answer_from_tokens(self, query: Array, buffer: RingBuffer, complete: Array) -> Array:
-        """Compute the answer from the tokens of the complete context."""
-        window, valid = buffer.last(len(buffer.tokens) - KEPT_STEPS, complete)
-        sequence = jnp.append(window, query[None], axis=0).at[valid].set(query)  # the query sees none behind it
-        return self.trunk(sequence[None])[0, valid]
-
-    def _cache_context(
-        self, done: Array, buffer: RingBuffer, complete: Array, caches: tuple[AttentionCache, ...]
-    ) -> tuple[AttentionCache, ...]:
-        """Compute the keys and values of the context if an episode has ended, which is when it changes."""
+        context = len(tokens) - KEPT_STEPS
         trunk, variables = self.trunk.unbind()
-        slots = caches[0].slots
 
-        def compute(inputs: Any, caches: Any) -> Any:
-            variables, buffer, complete = inputs
-            window, _ = buffer.last(slots - 1, complete)
-            return trunk.apply(variables, window, slots, method="caches_of")
+        def compute(inputs: Any, memory: TransformerMemory) -> Any:
+            variables, tokens, complete = inputs
+            first = jnp.maximum(complete - context, 0)
+            window = tokens[(first + jnp.arange(context)) % len(tokens)]
+            return trunk.apply(variables, window, context + 1, method="start_after")
 
-        return change_if(done, compute, (variables, buffer, complete), caches)
-
-    def _answer_from_caches(
-        self, query: Array, complete: Array, caches: tuple[AttentionCache, ...]
-    ) -> tuple[Array, tuple[AttentionCache, ...]]:
-        """Compute the answer from the cached keys and values of the context."""
-        last = caches[0].slots - 1
-        valid = jnp.minimum(complete, last)
-        visible = jnp.append(jnp.arange(last) < valid, True)
-        return self.trunk.step(query, caches, jnp.int32(last), valid, visible)
+        changed = done if self.finished_episodes_only else jnp.bool_(True)
+        seen = change_if(changed, compute, (variables, tokens, complete), memory.context)
+        # The query follows the valid transitions, and the next query takes its slot.
+        feature, seen = self.trunk.advance(query, seen._replace(written=jnp.minimum(complete, context)))
+        return self.head(feature), DPTMemory(tokens, written, complete, seen, obs, jnp.bool_(True))
 
 
 def _in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Array, "B K+1 ..."]:
@@ -173,7 +145,6 @@ def _in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Array, "B 
 
 def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:
     """Return the Decision-Pretrained Transformer; 3,285,022 parameters at C = 40 channels."""
-    check_no_teammate_loss("dpt", options)
     tokens = make_tokens(TransitionTokens, options, world)
     head, next_obs = nn.Dense(world.actions), make_next_obs_head(options, world)
     model = DPT(tokens, make_transformer(options), head, world.obs_shape, next_obs, finished_episodes_only)

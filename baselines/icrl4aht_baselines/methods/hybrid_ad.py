@@ -1,6 +1,6 @@
 """Hybrid-AD (paper, Sec. 5.3, "Recurrent Architecture Variant"): AD's loss on a recurrent state tracker.
 
-Shapes: `B` batch size, `N` tokens of a sequence, `D` width.
+Shapes: `B` batch size, `N` tokens of a sequence, `D` width, `S` numbers of the state: layers x D.
 """
 
 from __future__ import annotations
@@ -30,41 +30,34 @@ class RecurrentTrunk(nn.Module):
 
     def __call__(self, x: Float[Array, "B N D"], *, deterministic: bool = True) -> Float[Array, "B N D"]:
         """Return features of complete sequences."""
-        zeros = tuple(jnp.zeros((x.shape[0], self.width), x.dtype) for _ in range(self.layers))
-        return jnp.swapaxes(self._scan(jnp.swapaxes(x, 0, 1), zeros, deterministic)[0], 0, 1)
+        zeros = jnp.zeros((x.shape[0], self.layers * self.width), x.dtype)
+        return jnp.swapaxes(self.follow(jnp.swapaxes(x, 0, 1), zeros, deterministic)[0], 0, 1)
 
-    def start(self, context: int) -> tuple[Float[Array, " D"], ...]:
-        """Return the states before the first token, one per layer, whatever the context's length."""
-        return tuple(jnp.zeros(self.width) for _ in range(self.layers))
+    def start(self, context: int) -> Float[Array, " S"]:
+        """Return the state before the first token, whatever the context's length."""
+        return jnp.zeros(self.layers * self.width)
 
-    def start_after(self, x: Float[Array, "N D"], context: int) -> tuple[Float[Array, " D"], ...]:
-        """Return the states after a sequence of tokens."""
-        return self._advance(x, self.start(context))[1]
+    def start_after(self, x: Float[Array, "N D"], context: int) -> Float[Array, " S"]:
+        """Return the state after a sequence of tokens."""
+        return self.follow(x[:, None], self.start(context)[None])[1][0]
 
     def advance(
-        self, x: Float[Array, " D"], memory: tuple[Float[Array, " D"], ...]
-    ) -> tuple[Float[Array, " D"], tuple[Float[Array, " D"], ...]]:
-        """Return the features of one more token, and the states after it."""
-        features, states = self._advance(x[None], memory)
-        return features[0], states
+        self, x: Float[Array, " D"], state: Float[Array, " S"]
+    ) -> tuple[Float[Array, " D"], Float[Array, " S"]]:
+        """Return the features of one more token, and the state after it."""
+        features, state = self.follow(x[None, None], state[None])
+        return features[0, 0], state[0]
 
     def follow(
-        self, x: Float[Array, "N B D"], states: tuple[Float[Array, "B D"], ...]
-    ) -> tuple[Float[Array, "N B D"], tuple[Float[Array, "B D"], ...]]:
-        """Return the features of B sequences with time on the first axis, and the states after them."""
-        return self._scan(x, states, True)
-
-    def _advance(self, x: Float[Array, "N D"], states: tuple[Array, ...]) -> tuple[Float[Array, "N D"], tuple]:
-        features, states = self._scan(x[:, None], tuple(hidden[None] for hidden in states), True)
-        return features[:, 0], tuple(hidden[0] for hidden in states)
-
-    def _scan(self, x: Float[Array, "N B D"], states: tuple[Array, ...], deterministic: bool) -> tuple[Array, tuple]:
+        self, x: Float[Array, "N B D"], state: Float[Array, "B S"], deterministic: bool = True
+    ) -> tuple[Float[Array, "N B D"], Float[Array, "B S"]]:
+        """Return the features of B sequences with time on the first axis, and the state after them."""
         no_reset, last_states = jnp.zeros(x.shape[:2], bool), []
-        for gru, state in zip(self.grus, states, strict=True):
-            state, x = gru(state, x, no_reset)
+        for gru, layer in zip(self.grus, jnp.split(state, self.layers, axis=-1), strict=True):
+            layer, x = gru(layer, x, no_reset)
             x = self.drop(x, deterministic=deterministic)
-            last_states.append(state)
-        return self.norm(x), tuple(last_states)
+            last_states.append(layer)
+        return self.norm(x), jnp.concatenate(last_states, axis=-1)
 
 
 def _make_trunk(options: ModelOptions) -> RecurrentTrunk:

@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Float, Int, Num
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.tokens import BatchView, StepInput, Tokens
 from icrl4aht_baselines.methods.transformer import Transformer
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS
 
 Loss = Callable[[Any, Any, Any, Any], tuple[Array, dict[str, Array]]]
@@ -134,16 +133,6 @@ class NextObsHead(nn.Module):
 def make_next_obs_head(options: ModelOptions, world: World) -> NextObsHead | None:
     """Return the head of the auxiliary loss, or None without +next_obs."""
     return NextObsHead(options.width, world.actions, int(np.prod(world.obs_shape))) if options.next_obs else None
-
-
-def check_no_teammate_loss(name: str, options: ModelOptions) -> None:
-    """Check that a method without a prediction of the teammate's action is not given its loss.
-
-    Raises:
-        OptionError: if `teammate_loss` is set.
-    """
-    if options.teammate_loss:
-        raise OptionError(f"teammate_loss = True: {name} does not predict the teammate's action; leave it out")
 
 
 def squared_error(predicted: Float[Array, "*B N"], obs: Num[Array, "*B ..."]) -> Float[Array, "*B"]:

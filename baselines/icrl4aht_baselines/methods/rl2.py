@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from icrl4aht_baselines.methods.ad import example_step
 from icrl4aht_baselines.methods.hybrid_ad import RecurrentTrunk
-from icrl4aht_baselines.methods.method import Method, World, check_no_teammate_loss, make_tokens
+from icrl4aht_baselines.methods.method import Method, World, make_tokens
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.tokens import StepInput, StepTokens
 
@@ -48,7 +48,7 @@ class PolicyValueHead(nn.Module):
 
 
 class RL2Model(nn.Module):
-    """Tokens of steps, GRU layers, and the head. The states of all layers are one array of S = layers x D numbers."""
+    """Tokens of steps, GRU layers, and the head. The state is one array of S = layers x D numbers."""
 
     tokens: StepTokens
     trunk: RecurrentTrunk
@@ -56,21 +56,19 @@ class RL2Model(nn.Module):
 
     def __call__(self, steps: StepInput, state: Float[Array, "B S"]) -> tuple[PolicyValue, Float[Array, "B S"]]:
         """Return the output at T steps of B tasks, inputs (T, B, ..), and the state after the last one."""
-        layers = tuple(jnp.split(state, self.trunk.layers, axis=-1))
-        features, layers = self.trunk.follow(self.tokens(steps), layers)
-        return self.head(features), jnp.concatenate(layers, axis=-1)
+        features, state = self.trunk.follow(self.tokens(steps), state)
+        return self.head(features), state
 
     def start(self, context: int, cached: bool) -> Float[Array, " S"]:
         """Return the state before a task; both arguments have no effect, since a recurrent state has no window."""
-        return jnp.zeros(self.trunk.layers * self.trunk.width)
+        return self.trunk.start(context)
 
     def act(
         self, step: StepInput, done: Bool[Array, ""], state: Float[Array, " S"]
     ) -> tuple[PolicyValue, Float[Array, " S"]]:
         """Return the output for one step of one task, and the state after it."""
-        layers = tuple(jnp.split(state, self.trunk.layers))
-        feature, layers = self.trunk.advance(self.tokens(step), layers)
-        return self.head(feature), jnp.concatenate(layers)
+        feature, state = self.trunk.advance(self.tokens(step), state)
+        return self.head(feature), state
 
 
 def _no_batches(params: Any, slow: Any, batch: Any, key: Any) -> tuple[Array, dict[str, Array]]:
@@ -79,7 +77,6 @@ def _no_batches(params: Any, slow: Any, batch: Any, key: Any) -> tuple[Array, di
 
 def rl2(options: ModelOptions, world: World) -> Method:
     """Return the recurrent policy of RL^2."""
-    check_no_teammate_loss("rl2", options)
     trunk = RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
     model = RL2Model(make_tokens(StepTokens, options, world), trunk, PolicyValueHead(options.width, world.actions))
     example = (example_step(world), jnp.zeros((1, options.recurrent_layers * options.width)))

@@ -1,7 +1,7 @@
 """Histories as tokens, for training and acting alike (paper, App. E.2 and E.3).
 
 AD's tokens are made of `StepInput`s, DPT's context of `Transition`s. Shapes: `*B` any leading axes (batch and time in
-training, none when acting), `D` width of a token, `K` length of a context, `S` slots of a ring buffer.
+training, none when acting), `D` width of a token, `K` length of a context.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ import jax.numpy as jnp
 from icrl4aht_generation.learners.encoder import group_equal
 from jaxtyping import Array, Float, Int
 
-from icrl4aht_baselines.methods.encoder import FEATURES
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch
+
+FEATURES = 64
+"""Width of an encoded observation and of an embedded action (the paper's d_emb)."""
 
 BatchView = Callable[[Any, Any], Any]
 """Function (observations or state records of a batch, `layouts` of the batch or None) -> input of the encoder."""
@@ -142,29 +144,3 @@ class TransitionTokens(Tokens):
 
     def _token(self, parts: list[Array], deterministic: bool) -> Array:
         return self.drop(self.project(jnp.concatenate(parts, -1, dtype=self.dtype)), deterministic=deterministic)
-
-
-class RingBuffer(NamedTuple):
-    """Tokens that an acting ego keeps, as a ring: entry i is in slot i % S.
-
-    Attributes:
-        tokens: float32 (S, D).
-        written: int32 (), entries so far.
-    """
-
-    tokens: Float[Array, "S D"]
-    written: Int[Array, ""]
-
-    @classmethod
-    def empty(cls, slots: int, width: int) -> RingBuffer:
-        """Return a buffer without entries."""
-        return cls(jnp.zeros((slots, width)), jnp.int32(0))
-
-    def add(self, token: Float[Array, " D"]) -> RingBuffer:
-        """Return the buffer with one more entry, which replaces the oldest of a full buffer."""
-        return RingBuffer(self.tokens.at[self.written % len(self.tokens)].set(token), self.written + 1)
-
-    def last(self, context: int, stop: Int[Array, ""]) -> tuple[Float[Array, "K D"], Int[Array, ""]]:
-        """Return the entries stop - K .. stop - 1 in order, at the front of the array, and their number."""
-        first = jnp.maximum(stop - context, 0)
-        return self.tokens[(first + jnp.arange(context)) % len(self.tokens)], stop - first

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from icrl4aht_baselines.methods.attention import causal_attention, query_attention
+from icrl4aht_baselines.methods.attention import causal_attention
 from icrl4aht_baselines.methods.options import Positions
 
 
@@ -27,11 +27,6 @@ class AttentionCache(NamedTuple):
 
     keys: Float[Array, "H S Dh"]
     values: Float[Array, "H S Dh"]
-
-    @property
-    def slots(self) -> int:
-        """Number of tokens that fit."""
-        return self.keys.shape[1]
 
 
 class TransformerMemory(NamedTuple):
@@ -75,24 +70,22 @@ class TransformerBlock(nn.Module):
         q, k, v = self._project(x_BxNxD, positions_N)  # each (B, N, H, Dh)
         attended = causal_attention(q[:, :context], k[:, :context], v[:, :context])
         if context < x_BxNxD.shape[1]:
-            answers = query_attention(q[:, context:], k[:, context:], v[:, context:], k[:, :context], v[:, :context])
+            own = k[:, context:], v[:, context:]
+            answers = causal_attention(q[:, context:], k[:, :context], v[:, :context], *own)
             attended = jnp.concatenate([attended, answers], axis=1)
         return self._add_residuals(x_BxNxD, attended, deterministic)
 
     def step(
-        self,
-        x_D: Float[Array, " D"],
-        position: Int[Array, ""],
-        cache: AttentionCache,
-        slot: Int[Array, ""],
-        visible_S: Bool[Array, " S"],
+        self, x_D: Float[Array, " D"], cache: AttentionCache, number: Int[Array, ""]
     ) -> tuple[Float[Array, " D"], AttentionCache]:
-        """Return the features of one token, whose key and value are written into a slot before it attends."""
-        x_1x1xD = x_D[None, None]
-        q, k, v = (projected[0, 0] for projected in self._project(x_1x1xD, position[None]))  # each (H, Dh)
-        cache = AttentionCache(cache.keys.at[:, slot].set(k), cache.values.at[:, slot].set(v))
-        attended = _attend_to_cache(q, cache, visible_S)[None, None]
-        return self._add_residuals(x_1x1xD, attended, True)[0, 0], cache
+        """Return the features of a token, and the cache with it; see `Transformer.advance`."""
+        q, k, v = (projected[0, 0] for projected in self._project(x_D[None, None], number[None]))  # each (H, Dh)
+        cache = AttentionCache(cache.keys.at[:, number].set(k), cache.values.at[:, number].set(v))
+        # `jax.nn.dot_product_attention` takes ten times as long for one token on a CPU.
+        scores_HxS = jnp.einsum("hd,hsd->hs", q, cache.keys) / q.shape[-1] ** 0.5
+        weights_HxS = jax.nn.softmax(scores_HxS, where=jnp.arange(scores_HxS.shape[1]) <= number)
+        attended = jnp.einsum("hs,hsd->hd", weights_HxS, cache.values)
+        return self._add_residuals(x_D[None, None], attended[None, None], True)[0, 0], cache
 
     def cache(
         self, x_NxD: Float[Array, "N D"], positions_N: Int[Array, " N"]
@@ -114,14 +107,6 @@ class TransformerBlock(nn.Module):
 
         x_BxNxD = x_BxNxD + drop(self.out(drop(attended.reshape(x_BxNxD.shape))))
         return x_BxNxD + drop(self.down(nn.gelu(self.up(self.feed_norm(x_BxNxD)))))
-
-
-def _attend_to_cache(
-    q_HxDh: Float[Array, "H Dh"], cache: AttentionCache, visible_S: Bool[Array, " S"]
-) -> Float[Array, "H Dh"]:
-    """Return one token's attention. `jax.nn.dot_product_attention` takes ten times as long for it on a CPU."""
-    scores_HxS = jnp.einsum("hd,hsd->hs", q_HxDh, cache.keys) / q_HxDh.shape[-1] ** 0.5
-    return jnp.einsum("hs,hsd->hd", jax.nn.softmax(scores_HxS, where=visible_S), cache.values)
 
 
 def _rotate(x_BxNxHxDh: Float[Array, "B N H Dh"], positions_N: Int[Array, " N"]) -> Float[Array, "B N H Dh"]:
@@ -180,48 +165,26 @@ class Transformer(nn.Module):
             x = block(x, positions_N, context, deterministic)
         return self.norm(x)
 
-    def step(
-        self,
-        x_D: Float[Array, " D"],
-        caches: tuple[AttentionCache, ...],
-        slot: Int[Array, ""],
-        position: Int[Array, ""],
-        visible_S: Bool[Array, " S"],
-    ) -> tuple[Float[Array, " D"], tuple[AttentionCache, ...]]:
-        """Return the features of one token, written into `slot`; it sees the visible slots, its own among them."""
-        updated = []
-        for block, cache in zip(self.blocks, caches, strict=True):
-            x_D, cache = block.step(x_D, position, cache, slot, visible_S)
-            updated.append(cache)
-        return self.norm(x_D), tuple(updated)
-
-    def empty_caches(self, slots: int) -> tuple[AttentionCache, ...]:
-        """Return zero caches of `slots` slots, one per layer."""
-        zeros = jnp.zeros((self.heads, slots, self.width // self.heads))
-        return (AttentionCache(zeros, zeros),) * self.layers
-
-    def caches_of(self, x_NxD: Float[Array, "N D"], slots: int) -> tuple[AttentionCache, ...]:
-        """Return caches of `slots` slots, one per layer, whose first N hold a sequence; N is not 0."""
-        behind = ((0, 0), (0, slots - len(x_NxD)), (0, 0))
-        caches = []
-        for block in self.blocks:
-            x_NxD, cache = block.cache(x_NxD, jnp.arange(len(x_NxD)))
-            caches.append(AttentionCache(*(jnp.pad(part, behind) for part in cache)))
-        return tuple(caches)
-
     def start(self, context: int) -> TransformerMemory:
         """Return an empty memory for `context` tokens."""
-        return TransformerMemory(self.empty_caches(context), jnp.int32(0))
+        zeros = jnp.zeros((self.heads, context, self.width // self.heads))
+        return TransformerMemory((AttentionCache(zeros, zeros),) * self.layers, jnp.int32(0))
 
     def start_after(self, x_NxD: Float[Array, "N D"], context: int) -> TransformerMemory:
         """Return a memory for `context` tokens that holds a sequence; N is not 0."""
-        return TransformerMemory(self.caches_of(x_NxD, context), jnp.int32(len(x_NxD)))
+        length, caches = len(x_NxD), []
+        for block in self.blocks:
+            x_NxD, cache = block.cache(x_NxD, jnp.arange(length))
+            behind = ((0, 0), (0, context - length), (0, 0))
+            caches.append(AttentionCache(*(jnp.pad(part, behind) for part in cache)))
+        return TransformerMemory(tuple(caches), jnp.int32(length))
 
     def advance(
         self, x_D: Float[Array, " D"], memory: TransformerMemory
     ) -> tuple[Float[Array, " D"], TransformerMemory]:
         """Return the features of one more token, and the memory with it, which must not be full before."""
-        caches, written = memory
-        visible_S = jnp.arange(caches[0].slots) <= written
-        feature_D, caches = self.step(x_D, caches, written, written, visible_S)
-        return feature_D, TransformerMemory(caches, written + 1)
+        caches = []
+        for block, cache in zip(self.blocks, memory.caches, strict=True):
+            x_D, cache = block.step(x_D, cache, memory.written)
+            caches.append(cache)
+        return self.norm(x_D), TransformerMemory(tuple(caches), memory.written + 1)

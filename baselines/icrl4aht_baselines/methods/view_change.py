@@ -25,10 +25,15 @@ from icrl4aht_data.overcooked.layouts import Layout
 _INDICATOR, _WALL = (CANONICAL_CHANNELS.index(name) for name in ("recipe_indicator", "wall"))
 _RECIPE = np.array([name.startswith("recipe_") for name in CANONICAL_CHANNELS])
 _ROWS, _COLUMNS = -3, -2
-_MIRRORED_ACTIONS = {
-    _ROWS: (DOWN, UP, LEFT, RIGHT, STAY, INTERACT),
-    _COLUMNS: (UP, DOWN, RIGHT, LEFT, STAY, INTERACT),
-}
+_MIRRORED_ACTIONS = np.array(
+    [
+        (UP, DOWN, LEFT, RIGHT, STAY, INTERACT),
+        (DOWN, UP, LEFT, RIGHT, STAY, INTERACT),
+        (UP, DOWN, RIGHT, LEFT, STAY, INTERACT),
+        (DOWN, UP, RIGHT, LEFT, STAY, INTERACT),
+    ]
+)
+"""Number of the mirroring, see `changed_view` -> action in the mirrored view for each action."""
 
 
 class ViewChange(NamedTuple):
@@ -54,9 +59,7 @@ class ViewChange(NamedTuple):
 
     def actions(self, actions: Int[Array, "*B"]) -> Int[Array, "*B"]:
         """Return actions in the ego's view for actions in the environment, and the other way round."""
-        for mirrored, axis in ((self.upside_down, _ROWS), (self.sideways, _COLUMNS)):
-            actions = jnp.where(mirrored, jnp.asarray(_MIRRORED_ACTIONS[axis], actions.dtype)[actions], actions)
-        return actions
+        return jnp.asarray(_MIRRORED_ACTIONS, actions.dtype)[self.upside_down + 2 * self.sideways, actions]
 
     def at_each_step(self, steps: int, axis: int) -> ViewChange:
         """Return the changes with an axis of steps inserted."""
@@ -85,10 +88,7 @@ def mirrored_action(actions: np.ndarray, mirroring: np.ndarray) -> np.ndarray:
         actions: int (B, ..).
         mirroring: int (B,), as in `changed_view`.
     """
-    plain = np.arange(len(_MIRRORED_ACTIONS[_ROWS]))
-    rows, columns = (np.array(_MIRRORED_ACTIONS[axis]) for axis in (_ROWS, _COLUMNS))
-    mapped = np.stack([plain, rows, columns, rows[columns]]).astype(actions.dtype)
-    return mapped[mirroring.reshape(-1, *(1,) * (actions.ndim - 1)), actions]
+    return _MIRRORED_ACTIONS.astype(actions.dtype)[mirroring.reshape(-1, *(1,) * (actions.ndim - 1)), actions]
 
 
 def no_change(*shape: int) -> ViewChange:

@@ -87,11 +87,10 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     view, canonical = _view(dataset, histories.mirror, hidden), dataset.channels == "canonical"
     method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, view, canonical))
     labels = _labels_of(method, histories.labels)
-    draws = _draws(split.train, options, histories)
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
         part: number_layouts(
-            _sampler(method, selection, options, model, histories, labels, draws if part == "train" else {}),
+            _sampler(method, selection, options, model, histories, labels, training=part == "train"),
             dataset.layouts,
             histories.mirror,
         )
@@ -242,65 +241,42 @@ def _sampler(
     model: ModelOptions,
     histories: HistoryOptions,
     labels: Labels | None,
-    draws: Mapping[str, Any],
+    *,
+    training: bool,
 ) -> Any:
-    """Return the sampler of a part of the histories; `draws` are further options of it."""
-    lengths, every = dataset.column("T"), histories.every
-    if options.context > lengths.min():
-        text = f"context = {options.context}: the shortest history of {dataset!r} has {lengths.min()} steps; take fewer"
-        for name in dataset.counts("source"):
-            if lengths[dataset.column("source") == name].min() >= options.context:
-                text += f", or choose --source {name}, whose histories are longer"
-                break
-        raise OptionError(text)
+    """Return the sampler of a part of the histories; held-out ones are drawn uniformly and from all their steps."""
+    every, draws = histories.every, {}
+    steps = int(dataset.column("episodes").min()) // every * dataset.info.environment.kept_steps
+    if training and histories.weights == "improvement":  # a history that does not rise counts as one that rises by 1
+        draws["weights"] = np.maximum(dataset.column("return_end") - dataset.column("return_start"), 1.0)
+    if training and histories.curriculum:
+        draws["curriculum"] = Curriculum(max(1, round(histories.curriculum * options.steps)))
+        steps = int(draws["curriculum"].first[1] * steps)  # those of the first batch, which has the fewest
     shared: Any = {
         "batch_size": options.batch_size,
         "seed": options.seed,
         "teammate_actions": model.teammate_actions,
+        "labels": labels,
         "process_index": jax.process_index(),
         "process_count": jax.process_count(),
         **draws,
     }
-    if method.data == "ad":
-        fewest = int(dataset.column("episodes").min())
-        steps = fewest // every * dataset.info.environment.kept_steps
-        if every > 1 and options.context > steps:
+    if method.data == "dpt":
+        if every > 1:
             raise OptionError(
-                f"context = {options.context}, every = {every}: every {every}-th of the {fewest} episodes of the "
-                f"shortest history of {dataset!r} are {steps} steps; take fewer, or a smaller --every"
+                f"every = {every}: {method.name} learns from contexts of one part of a history; leave it out"
             )
-        if histories.queries > 1:
-            raise OptionError(
-                f"queries = {histories.queries}: {method.name} learns from windows without queries; leave it out"
-            )
-        return dataset.ad(length=options.context, every=every, labels=labels, **shared)
-    if every > 1:
-        raise OptionError(f"every = {every}: {method.name} learns from contexts of one part of a history; leave it out")
-    assert labels is not None
-    return dataset.dpt(
-        context=options.context, order=histories.order, labels=labels, queries=histories.queries, **shared
-    )
-
-
-def _draws(dataset: Dataset, options: TrainOptions, histories: HistoryOptions) -> dict[str, Any]:
-    """Return the sampler's options on how histories are drawn in training; held-out ones are drawn uniformly.
-
-    Raises:
-        OptionError: if a window does not fit the part of a history that a curriculum begins with.
-    """
-    draws: dict[str, Any] = {}
-    if histories.weights == "improvement":  # a history that does not rise counts as one that rises by a point
-        draws["weights"] = np.maximum(dataset.column("return_end") - dataset.column("return_start"), 1.0)
-    if histories.curriculum:
-        curriculum = Curriculum(max(1, round(histories.curriculum * options.steps)))
-        first = int(curriculum.first[1] * dataset.column("T").min())
-        if options.context > first:
-            raise OptionError(
-                f"context = {options.context}, curriculum = {histories.curriculum:g}: it begins with {first} steps of "
-                f"the shortest history of {dataset!r}; take fewer, or no --curriculum"
-            )
-        draws["curriculum"] = curriculum
-    return draws
+        return dataset.dpt(context=options.context, order=histories.order, queries=histories.queries, **shared)
+    if histories.queries > 1:
+        raise OptionError(
+            f"queries = {histories.queries}: {method.name} learns from windows without queries; leave it out"
+        )
+    if options.context > steps:
+        raise OptionError(
+            f"context = {options.context}: with every = {every} and curriculum = {histories.curriculum:g}, the shortest "
+            f"history of {dataset!r} has {steps} steps for a window; take fewer, or choose longer histories"
+        )
+    return dataset.ad(length=options.context, every=every, **shared)
 
 
 class HistorySplit(NamedTuple):

@@ -5,8 +5,6 @@ Checkpoints, logs and resuming are those of `icrl4aht_generation.learners.resume
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,8 +12,6 @@ from typing import Any
 import jax
 from icrl4aht_generation.learners.resume import METRICS, TIMING, Checkpoints, differing_settings
 
-from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.utils.files import atomic_write, check_own_folder, parse_json, read_text, write_json
 
@@ -45,17 +41,11 @@ def read_config(folder: Path) -> dict[str, Any]:
     except (IndexFormatError, KeyError, TypeError) as error:
         raise OptionError(f"{folder}: not a run: expected {CONFIG} with run_format ({error})") from error
     if found != RUN_FORMAT:
-        writer, reader = config.get("package_version"), format_versions()["package_version"]
-        other = f", or use this run with version {writer} of this package, which wrote it" if writer != reader else ""
         raise OptionError(
-            f"{path}: run_format {found!r}, but version {reader} of this package reads run_format {RUN_FORMAT} only: "
-            f"train again into another folder (another --out){other}"
+            f"{path}: run_format {found!r}, expected {RUN_FORMAT}: train again into another folder (another --out), or "
+            f"use version {config.get('package_version')} of this package, which wrote this run"
         )
     return config
-
-
-_DEFAULTS = {"model": ModelOptions(), "play": PlayOptions(), "histories": HistoryOptions(()), "train": TrainOptions()}
-"""Part of a run's settings -> the defaults of its options."""
 
 
 def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
@@ -73,7 +63,7 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
     """
     if (folder / CONFIG).exists() and Checkpoints(folder / CHECKPOINTS).latest is not None:
         found = read_config(folder)
-        different = differing_settings(_with_defaults(found, config), config)
+        different = differing_settings(found, config)
         if different:
             listed = "; ".join(f"{name}: the run has {a!r}, expected {b!r}" for name, (a, b) in different.items())
             raise OptionError(f"{folder}: holds a run of other settings ({listed}); give another --out")
@@ -84,18 +74,3 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
         with atomic_write(folder / CONFIG) as partial:
             write_json(partial, config)
     return config
-
-
-def _with_defaults(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a run as this version of the package would state them.
-
-    Options that are newer than the run get their defaults. Options that no longer exist are left out if the run did not
-    use them.
-    """
-    completed = dict(found)
-    for part, options in _DEFAULTS.items():
-        if isinstance(found.get(part), dict) and part in config:
-            known, own = config[part], found[part]
-            defaults = {name: value for name, value in asdict(options).items() if name in known}
-            completed[part] = defaults | {name: value for name, value in own.items() if name in known or value}
-    return completed

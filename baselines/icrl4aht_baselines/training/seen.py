@@ -123,23 +123,27 @@ def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[s
     return tuple(name for name in OVERLAPS if name in found)
 
 
+def _overlap_kinds(names: Iterable[str]) -> list[OverlapKind]:
+    """Return kinds of overlap in the order of `OVERLAPS`."""
+    found = set(names)
+    return [kind for name, kind in OVERLAPS.items() if name in found]
+
+
 def overlap_marks(overlaps: Iterable[str]) -> str:
     """Return the marks of kinds of overlap, such as " †§"; empty if there is none."""
-    found = set(overlaps)
-    marks = "".join(kind.mark for name, kind in OVERLAPS.items() if name in found)
+    marks = "".join(kind.mark for kind in _overlap_kinds(overlaps))
     return f" {marks}" if marks else ""
 
 
 def overlap_legend(overlaps: Iterable[str]) -> list[str]:
     """Return an explanation of each mark, such as "† ...", in the order of `OVERLAPS`."""
-    found = set(overlaps)
-    return [f"{kind.mark} {kind.meaning}" for name, kind in OVERLAPS.items() if name in found]
+    return [f"{kind.mark} {kind.meaning}" for kind in _overlap_kinds(overlaps)]
 
 
 def describe_overlap(overlaps: Iterable[str]) -> str:
     """Return a sentence on kinds of overlap."""
-    texts = [OVERLAPS[name].meaning for name in OVERLAPS if name in set(overlaps)]
-    return f"Overlap with the training data: {'; '.join(texts)}." if texts else "No overlap with the training data."
+    texts = "; ".join(kind.meaning for kind in _overlap_kinds(overlaps))
+    return f"Overlap with the training data: {texts}." if texts else "No overlap with the training data."
 
 
 def describe_training(seen: SeenInTraining | None) -> str:

@@ -172,7 +172,7 @@ def test_attention_equals_masked_attention(monkeypatch):
 
     def ours(q, k, v):
         context = attention.causal_attention(q[:, :7], k[:, :7], v[:, :7])
-        queries = attention.query_attention(q[:, 7:], k[:, 7:], v[:, 7:], k[:, :7], v[:, :7])
+        queries = attention.causal_attention(q[:, 7:], k[:, :7], v[:, :7], k[:, 7:], v[:, 7:])
         return jnp.concatenate([context, queries], axis=1)
 
     def results(attend):
