@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -237,7 +237,7 @@ def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) ->
 
     cost = estimate_cost(_profile_with_threads(profile_name, None).with_ego(ego), devices)
     if as_json:
-        click.echo(json.dumps(cost.to_json(), indent=2))
+        click.echo(json.dumps(asdict(cost), indent=2))
     else:
         for name, value in cost.rows():
             click.echo(f"{name:<28} {value}")
@@ -257,7 +257,7 @@ def check(a: Path, b: Path, as_json: bool) -> None:
 
     compared = compare_rebuilds(a, b)
     if as_json:
-        click.echo(json.dumps(compared.to_json(), indent=2))
+        click.echo(json.dumps({"equal": not compared.differences, **asdict(compared)}, indent=2))
     else:
         for name, difference in compared.differences.items():
             click.echo(f"{name}: {difference}")
@@ -278,12 +278,11 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
 
     Prints one JSON line: steps/s, and the shares of environment, forward pass and update. Writes nothing.
     """
-    from icrl4aht_generation.planning.plan import task_learner
-    from icrl4aht_generation.planning.speed import learner_speed
+    from icrl4aht_generation.planning.plan import learner_speed
 
     name = get_layout(layout).name
     profile = _profile_with_threads(profile_name, None).with_ego(ego)
-    measured = learner_speed(task_learner(profile, profile.ego_on(name), name))
+    measured = learner_speed(profile, name)
     click.echo(json.dumps({"profile": profile_name, "layout": name, **measured}))
 
 

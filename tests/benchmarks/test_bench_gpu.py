@@ -116,7 +116,7 @@ def test_learners_lower_for_cuda(encoder):
     update: Any = compiled_update(learner)
     traced = update.trace(jax.eval_shape(learner.init, jax.random.key(0)))
     traced.lower(lowering_platforms=("cuda",))
-    assert product_flops(traced.jaxpr) > 1e6 * learner.steps_per_update
+    assert product_flops(traced.jaxpr) > 1e6 * learner.config.steps_per_update
 
 
 @pytest.mark.slow

@@ -100,7 +100,8 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampl
             parameters are too large.
     """
     check_bundle_name(name)
-    trained, steps = read_trained(run), read_config(run)["train"]["steps"]
+    trained, config = read_trained(run), read_config(run)
+    steps = config["train"]["steps"]
     if trained.step < steps:
         raise OptionError(f"{run}: at step {trained.step} of {steps}: continue the training with the same command")
     size = sum(4 * leaf.size for leaf in jax.tree.leaves(trained.params))
@@ -109,7 +110,6 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampl
     target = folder / name / track
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
-    config = json.loads((run / CONFIG).read_text(encoding="utf-8"))
     if not is_address(config["histories"]["root"]):  # a path on the training machine, without meaning elsewhere
         config["histories"]["root"] = Path(config["histories"]["root"]).name
     (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")

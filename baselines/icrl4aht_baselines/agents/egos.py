@@ -99,11 +99,6 @@ AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random,
 """Reference egos: name -> function from a layout to the policy."""
 
 
-def agent_names() -> list[str]:
-    """Return the names of the reference egos and of the bundled models."""
-    return [*AGENTS, *bundled_models()]
-
-
 def find_agent(
     name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None, forget: bool = False
 ) -> NamedEgo:
@@ -128,7 +123,7 @@ def find_agent(
     model = bundled_models().get(name)
     if model is None and not Path(name).is_dir():
         hint = "A trained model is named by its folder, which `icrl4aht-data train` makes."
-        raise UnknownNameError(f"{unknown('agent', name, agent_names())} {hint}")
+        raise UnknownNameError(f"{unknown('agent', name, [*AGENTS, *bundled_models()])} {hint}")
     if model is None and not (Path(name) / CONFIG).is_file():
         raise UnknownNameError(f"{name}: not a run: {CONFIG} is missing; `icrl4aht-data train` makes runs")
     own_greedy = model is None or not model.sampled

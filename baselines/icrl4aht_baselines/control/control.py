@@ -105,30 +105,25 @@ def format_checks(checks: list[ControlCheck]) -> str:
 
 def dpt_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
     """Compare DPT's regret with that of Thompson sampling, whose posterior it approximates (Lee et al. 2023)."""
-    rng, small = np.random.default_rng(0), worlds.bandit()
-    method = dpt(BANDIT_MODEL, small.world, finished_episodes_only=False)
+    rng, method = np.random.default_rng(0), dpt(BANDIT_MODEL, worlds.bandit().world, finished_episodes_only=False)
     rows = [worlds.dpt_rows(count, size.bandit_steps, rng) for count in (size.rows, 256)]
     state = _train(method, rows, size, 0, folder, done)
-    return _bandit_checks("DPT", "Thompson sampling", worlds.thompson, method, state, size, rng)
+    return _bandit_checks("DPT", ("Thompson sampling", worlds.thompson), method, state, size, rng)
 
 
 def ad_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
     """Compare AD's regret with that of its source, upper confidence bounds."""
-    rng, small = np.random.default_rng(1), worlds.bandit()
-    method = ad(BANDIT_MODEL, small.world)
-
-    def histories(count: int) -> Any:
+    rng, method, rows = np.random.default_rng(1), ad(BANDIT_MODEL, worlds.bandit().world), []
+    for count in (size.rows, 256):
         played = worlds.play_bandits(worlds.ucb, rng.random((count, worlds.ARMS)), size.bandit_steps, rng)
-        return worlds.ad_rows(np.ones((*played[0].shape, 1), np.uint8), *played, small.episode)
-
-    state = _train(method, [histories(size.rows), histories(256)], size, 1, folder, done)
-    return _bandit_checks("AD", "UCB", worlds.ucb, method, state, size, rng)
+        rows.append(worlds.ad_rows(np.ones((*played[0].shape, 1), np.uint8), *played, 0))
+    state = _train(method, rows, size, 1, folder, done)
+    return _bandit_checks("AD", ("UCB", worlds.ucb), method, state, size, rng)
 
 
 def _bandit_checks(
     name: str,
-    rival: str,
-    choose: worlds.BanditAlgorithm,
+    rival: tuple[str, worlds.BanditAlgorithm],
     method: Method,
     state: TrainState,
     size: ControlSize,
@@ -144,10 +139,10 @@ def _bandit_checks(
         policy = learned(method, state.params, context, PlayMode(greedy=False))
         return regret(worlds.play_world(worlds.bandit(), policy, jnp.asarray(means), 0, size.bandit_steps)[0])
 
-    rival_regret = regret(worlds.play_bandits(choose, means, size.bandit_steps, rng)[0])
+    rival_regret = regret(worlds.play_bandits(rival[1], means, size.bandit_steps, rng)[0])
     uniform = float((means.max(axis=1) - means.mean(axis=1)).mean()) * size.bandit_steps
     full, cut = model_regret(size.bandit_steps), model_regret(int(name == "AD"))
-    note = f"{rival} {rival_regret:.1f}, uniform {uniform:.1f}"
+    note = f"{rival[0]} {rival_regret:.1f}, uniform {uniform:.1f}"
     return [
         ControlCheck("bandits", name, "regret, at most", full, 1.25 * rival_regret, note),
         ControlCheck("bandits", f"{name}, context cut off", "regret, at least", cut, 2.0 * rival_regret, note),

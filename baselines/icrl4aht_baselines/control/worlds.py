@@ -84,15 +84,14 @@ CELL_OBS = np.concatenate([np.tri(SIDE, SIDE - 1, -1, dtype=np.uint8)[line] for 
 """Observation of each cell, uint8 (cells, 2 * (SIDE - 1)): row r as r ones, then column c as c ones."""
 
 
-def _next_cells() -> np.ndarray:
-    """Return the cell after each move, int32 (cells, moves)."""
-    to = np.clip(np.stack([_ROWS, _COLUMNS], axis=-1)[:, None] + MOVES, 0, SIDE - 1)
-    return (to[..., 0] * SIDE + to[..., 1]).astype(np.int32)
+_TO = np.clip(np.stack([_ROWS, _COLUMNS], axis=-1)[:, None] + MOVES, 0, SIDE - 1)
+NEXT_CELLS = (_TO[..., 0] * SIDE + _TO[..., 1]).astype(np.int32)
+"""Cell after each move, int32 (cells, moves)."""
 
 
 def dark_room() -> SmallWorld:
     """Return Dark Room: a task is the goal's cell, int32 (); the reward is 1 after a step that ends on it."""
-    next_cells = jnp.asarray(_next_cells())
+    next_cells = jnp.asarray(NEXT_CELLS)
 
     def step(goal: Array, cell: Array, action: Array, key: Array) -> tuple[Array, Array]:
         cell = next_cells[cell, action]
@@ -186,7 +185,6 @@ def search(goals: np.ndarray, episodes: int, rng: np.random.Generator) -> tuple[
     fewer later, and 3 in 100 from 0.6 of the history on, so that histories show good behaviour after few rewards as
     well as after many.
     """
-    next_cells = _next_cells()
     target = rng.integers(0, CELLS, len(goals))
     cell, known = target, np.zeros(len(goals), bool)
     steps = episodes * ROOM_STEPS
@@ -196,11 +194,11 @@ def search(goals: np.ndarray, episodes: int, rng: np.random.Generator) -> tuple[
             cell = np.full(len(goals), MIDDLE)
         arrived = (cell == target) & ~known
         target = np.where(arrived, rng.integers(0, CELLS, len(goals)), target)
-        distance = _distance(next_cells[cell], target[:, None]) + 0.5 * rng.random((len(goals), len(MOVES)))
+        distance = _distance(NEXT_CELLS[cell], target[:, None]) + 0.5 * rng.random((len(goals), len(MOVES)))
         noise = rng.random(len(goals)) < max(0.03, 0.5 * (1 - t / (0.6 * steps)))
         action = np.where(noise, rng.integers(0, len(MOVES), len(goals)), distance.argmin(axis=1))
         cells[:, t], actions[:, t] = cell, action
-        cell = next_cells[cell, action]
+        cell = NEXT_CELLS[cell, action]
         rewards[:, t] = cell == goals
         known |= cell == goals
         target = np.where(cell == goals, goals, target)

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from icrl4aht_generation.learners.encoder import encoding_log
 from jaxtyping import Array, Bool, Float, Int
 
-from icrl4aht_baselines.methods.conditional import change_if
 from icrl4aht_baselines.methods.method import (
     Loss,
     Method,
     World,
+    change_if,
     cross_entropy,
     make_next_obs_head,
     make_tokens,

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 from icrl4aht_generation.learners.encoder import encoding_log
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from icrl4aht_baselines.methods.conditional import change_if
 from icrl4aht_baselines.methods.method import (
     Method,
     World,
+    change_if,
     cross_entropy,
     make_next_obs_head,
     make_tokens,

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from icrl4aht_baselines.methods.options import ModelOptions
@@ -26,6 +27,7 @@ Loss = Callable[[Any, Any, Any, Any], tuple[Array, dict[str, Array]]]
 """(parameters, slow parameters or None, batch, dropout key or None) -> what to minimise, and numbers to log."""
 
 TokensType = TypeVar("TokensType", bound=Tokens)
+Changed = TypeVar("Changed")
 
 
 class World(NamedTuple):
@@ -161,3 +163,43 @@ def run_model(model: nn.Module, options: ModelOptions, params: Any, key: Any, *i
     params = jax.tree.map(lambda leaf: leaf.astype(dtype), params)
     rngs = {} if key is None else {"dropout": key}
     return model.apply({"params": params}, *inputs, **named, deterministic=key is None, rngs=rngs)
+
+
+def change_if(
+    condition: Bool[Array, ""], change: Callable[[Any, Changed], Changed], params: Any, memory: Changed
+) -> Changed:
+    """Return `change(params, memory)` if the condition holds, otherwise the memory.
+
+    `jax.vmap` turns `jax.lax.cond` into a selection, which computes both branches in every step. Here the change is
+    computed only in steps in which the condition holds for at least one row of the batch.
+
+    Args:
+        condition: bool ().
+        change: pure function that uses no other arrays than its arguments, and keeps shapes and dtypes of the memory.
+        params: pytree of arrays.
+        memory: pytree of arrays.
+    """
+
+    @custom_vmap
+    def choose(condition: Array, params: Any, memory: Changed) -> Changed:
+        return jax.lax.cond(condition, change, lambda params, memory: memory, params, memory)
+
+    @choose.def_vmap
+    def choose_rows(rows: int, batched: Any, condition: Array, params: Any, memory: Changed) -> tuple[Changed, Any]:
+        def with_rows(array: Array, has_rows: bool) -> Array:
+            return array if has_rows else jnp.broadcast_to(array, (rows, *array.shape))
+
+        condition_B = with_rows(condition, batched[0])
+        memory = jax.tree.map(with_rows, memory, batched[2])
+        axes = jax.tree.map(lambda has_rows: 0 if has_rows else None, batched[1])
+
+        def change_rows(params: Any, memory: Changed) -> Changed:
+            def choose_leaf(new: Array, old: Array) -> Array:
+                return jnp.where(condition_B.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+            return jax.tree.map(choose_leaf, jax.vmap(change, in_axes=(axes, 0))(params, memory), memory)
+
+        memory = jax.lax.cond(condition_B.any(), change_rows, lambda params, memory: memory, params, memory)
+        return memory, jax.tree.map(lambda _: True, memory)
+
+    return choose(condition, params, memory)

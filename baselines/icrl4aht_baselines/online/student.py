@@ -331,9 +331,8 @@ def _student_task(
         arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in RecordedHistories._fields}
         for stream in range(config.histories):
             of_history = {name: array[first + stream] for name, array in arrays.items()}
-            states, actions = of_history["state"], of_history["actions"]
-            (labels,) = oracle_labels(task.layout, [states], [actions])
-            dones = episode_ends(len(actions), KEPT_STEPS)
+            labels = oracle_labels(task.layout, of_history["state"], of_history["actions"])
+            dones = episode_ends(len(labels), KEPT_STEPS)
             yield NewHistory(stream, of_history | {"dones": dones, "oracle_actions": labels})
 
     made = Provenance(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -116,7 +116,11 @@ class Trainer:
         same = self.everywhere
         # The state is donated: two copies of parameters and optimizer would not fit where one just does.
         self.step = jax.jit(self._step, in_shardings=(same, self.rows), out_shardings=same, donate_argnums=0)
-        self.validate = jax.jit(self._validate, in_shardings=(same, self.rows), out_shardings=same)
+        self.validate = jax.jit(
+            lambda state, batch: method.loss(state.params, state.slow, batch, None)[1],
+            in_shardings=(same, self.rows),
+            out_shardings=same,
+        )
 
     def init(self) -> TrainState:
         """Return the state before the first step, on the trainer's devices."""
@@ -156,11 +160,16 @@ class Trainer:
             (_, log), gradient = gradient_of(state.params, state.slow, rows, jax.random.fold_in(key, number))
             return gradient, log
 
+        def split_rows(rows: Array) -> Array:
+            """Reshape (B, ..) to (parts, B / parts, ..), so that every part has rows on every device."""
+            rows = rows.reshape(-1, parts, *rows.shape[1:]).swapaxes(0, 1)
+            return jax.lax.with_sharding_constraint(rows, self._parts)
+
         if parts == 1:
             return part_gradient(jnp.int32(0), batch)
         # A scan keeps the activations of one part at a time; the methods' losses are means of rows of equal weight, so
         # that the mean of the parts is the gradient of the batch.
-        split = jax.tree.map(self._split_rows, batch)
+        split = jax.tree.map(split_rows, batch)
         first = jax.tree.map(lambda leaf: leaf[0], split)
         shapes = jax.eval_shape(part_gradient, jnp.int32(0), first)
         zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
@@ -170,14 +179,6 @@ class Trainer:
 
         total, _ = jax.lax.scan(add, zero, (jnp.arange(parts), split))
         return jax.tree.map(lambda leaf: leaf / parts, total)
-
-    def _split_rows(self, rows: Array) -> Array:
-        """Reshape (B, ..) to (accumulate, B / accumulate, ..), so that every part has rows on every device."""
-        parts = rows.reshape(-1, self.options.accumulate, *rows.shape[1:]).swapaxes(0, 1)
-        return jax.lax.with_sharding_constraint(parts, self._parts)
-
-    def _validate(self, state: TrainState, batch: Any) -> dict[str, Array]:
-        return self.method.loss(state.params, state.slow, batch, None)[1]
 
     def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 2) -> Batches:
         """Return batches on the devices; the next one is transferred during a step."""
@@ -253,13 +254,13 @@ def train(
             state = checkpoints.load(trainer.state_like())[0]
         first = int(state.step)
         # Lines after the checkpoint are dropped, since their steps are computed again.
-        log = stack.enter_context(RunLog(folder, lambda line: line["step"] <= first))
+        log = stack.enter_context(closing(RunLog(folder, lambda line: line["step"] <= first)))
         events = TensorBoardLog(folder / TENSORBOARD, folder / METRICS) if tensorboard and writes else None
         if events:
             stack.callback(events.close)
         batches = stack.enter_context(trainer.batches(data.train, first, options.steps))
         stop = stack.enter_context(StopSignals())  # entered last: what came before ends by a signal as usual
-        clock = _StepClock(first)
+        before = first, time.perf_counter(), 0.0
         save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * save_minutes)
         loss: float | None = None
         for step, batch in enumerate(batches, start=first + 1):
@@ -273,7 +274,11 @@ def train(
             if step % options.validate_every == 0 or last:
                 lines += trainer.validation_lines(state, data.validation, step)
             if lines:
-                log.write(*lines, timing=clock.line(step, batches.waited))
+                now = step, time.perf_counter(), batches.waited
+                steps, seconds, waited = np.subtract(now, before)
+                speed = {"steps_per_second": round(steps / seconds, 4), "loader_wait": round(waited / seconds, 4)}
+                log.write(*lines, timing={"step": step, **speed})
+                before = now
                 if events:
                     events.add(lines)
             saves, stopped_by = agree_on_stop(save.due(step), stop.received)
@@ -320,21 +325,3 @@ def agree_on_stop(save: bool, received: int) -> tuple[bool, int]:
 
 def _as_floats(log: dict[str, Array]) -> dict[str, float]:
     return {name: float(value) for name, value in jax.device_get(log).items()}
-
-
-class _StepClock:
-    """Steps per second, and the share of time spent waiting for batches, since the last line."""
-
-    def __init__(self, step: int) -> None:
-        self._step, self._time, self._waited = step, time.perf_counter(), 0.0
-
-    def line(self, step: int, waited: float) -> dict[str, Any]:
-        now = time.perf_counter()
-        seconds = now - self._time
-        line = {
-            "step": step,
-            "steps_per_second": round((step - self._step) / seconds, 4),
-            "loader_wait": round((waited - self._waited) / seconds, 4),
-        }
-        self._step, self._time, self._waited = step, now, waited
-        return line

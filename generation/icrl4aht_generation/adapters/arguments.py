@@ -7,11 +7,26 @@ from typing import Any, SupportsIndex
 import numpy as np
 from numpy.typing import DTypeLike
 
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.overcooked.channels import CHANNELS
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import faults, record_size
 from icrl4aht_data.utils.options import check_int
+
+RENDER_MODES = ["rgb_array"]
+"""Render modes of the environments: pictures, which need Pillow."""
+
+
+def check_choices(channels: str, render_mode: str | None = None) -> None:
+    """Check the channels and the render mode of an environment.
+
+    Raises:
+        UnknownNameError: for one that does not exist.
+    """
+    for name, value, valid in (("channels", channels, CHANNELS), ("render_mode", render_mode, (None, *RENDER_MODES))):
+        if value not in valid:
+            raise unknown(name, value, map(str, valid))
 
 
 def check_action(name: str, action: SupportsIndex) -> int:

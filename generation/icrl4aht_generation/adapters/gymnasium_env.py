@@ -17,13 +17,19 @@ from icrl4aht_data.benchmark.tasks import Task, parse_task
 from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
-from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
+from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.render import draw_frame
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int
-from icrl4aht_generation.adapters.arguments import check_action, check_integers, check_record
+from icrl4aht_generation.adapters.arguments import (
+    RENDER_MODES,
+    check_action,
+    check_choices,
+    check_integers,
+    check_record,
+)
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.learners.rollout import policy_player
 from icrl4aht_generation.policy import Noise, Policy
@@ -64,7 +70,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         UnknownNameError: for a noise, channels or a render mode that does not exist.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - declared so by the base class
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 5}  # noqa: RUF012 - declared so by the base class
 
     def __init__(
         self,
@@ -75,13 +81,9 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         channels: Channels = "own",
         render_mode: str | None = None,
     ) -> None:
-        for what, value, valid in (
-            ("noise", noise, get_args(Noise)),
-            ("channels", channels, CHANNELS),
-            ("render_mode", render_mode, (None, *self.metadata["render_modes"])),
-        ):
-            if value not in valid:
-                raise unknown(what, value, map(str, valid))
+        check_choices(channels, render_mode)
+        if noise not in get_args(Noise):
+            raise unknown("noise", noise, get_args(Noise))
         if not isinstance(task, Mapping):
             raise TaskFormatError(
                 f"task = {task!r:.200}: expected the fields of a task by name, such as dataclasses.asdict(task), found "
@@ -92,7 +94,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         policy = build_teammate(
             self.layout, self.task.teammate, TEAMMATE, noise, None if suite is None else Path(suite)
         )
-        self._game = _compiled(self.layout, policy._replace(params=()), channels == "canonical")
+        self._start, self._step = _compiled(self.layout, policy._replace(params=()), channels == "canonical")
         self._params = policy.params
         self.observation_space = spaces.Box(0, 255, observation_shape(self.layout, channels == "canonical"), np.uint8)
         self.action_space = spaces.Discrete(len(ACTIONS))
@@ -140,7 +142,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
                 f"recipes: expected items of {self.layout.name}'s recipes, {self.layout.recipe_items.tolist()}, found "
                 f"{np.unique(self._recipes).tolist()}"
             )
-        self._moment, observation = self._game.start(self._params, key, np.int32(episode), record)
+        self._moment, observation = self._start(self._params, key, np.int32(episode), record)
         return np.asarray(observation)[0], {"state": self.state}
 
     def step(self, action: SupportsIndex) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -156,7 +158,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         scripted = np.int32(self._script[0]) if len(self._script) else np.int32(-1)
         recipe = self._recipes[0] if len(self._recipes) else np.uint8(0)
         self._script, self._recipes = self._script[1:], self._recipes[1:]
-        played = self._game.step(self._params, moment, np.int32(number), scripted, recipe)
+        played = self._step(self._params, moment, np.int32(number), scripted, recipe)
         self._moment = played.after
         info = {
             "state": self.state,
@@ -212,15 +214,11 @@ class _Played(NamedTuple):
     teammate_action: Int[Array, ""]
 
 
-class _Game(NamedTuple):
-    """Compiled functions of one layout and one family of teammates."""
-
-    start: Callable[..., tuple[_Moment, Array]]
-    step: Callable[..., _Played]
-
-
 @lru_cache(maxsize=16)
-def _compiled(layout: Layout, policy: Policy, canonical: bool) -> _Game:
+def _compiled(
+    layout: Layout, policy: Policy, canonical: bool
+) -> tuple[Callable[..., tuple[_Moment, Array]], Callable[..., _Played]]:
+    """Return the compiled start of an episode, and its step, of one layout and one family of teammates."""
     env = Environment(layout)
     teammate = lambda params: policy_player(env, policy, params, TEAMMATE, 1)  # noqa: E731
 
@@ -242,4 +240,4 @@ def _compiled(layout: Layout, policy: Policy, canonical: bool) -> _Game:
         seen = observe(layout, outcome.state, EGO, canonical)
         return _Played(after, seen, outcome.reward, outcome.shaped, other)
 
-    return _Game(jax.jit(start), jax.jit(step))
+    return jax.jit(start), jax.jit(step)

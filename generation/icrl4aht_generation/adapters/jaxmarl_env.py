@@ -11,16 +11,16 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8, UInt32
 
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
-from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS
-from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
+from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.state import unpack
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_noun
+from icrl4aht_generation.adapters.arguments import check_choices
 from icrl4aht_generation.env import Environment, EnvState
 
 try:
@@ -75,8 +75,7 @@ class JaxMARLEnv(MultiAgentEnv):
     """
 
     def __init__(self, layout: str, *, max_steps: int = EPISODE_STEPS, channels: Channels = "own") -> None:
-        if channels not in CHANNELS:
-            raise unknown("channels", channels, CHANNELS)
+        check_choices(channels)
         super().__init__(num_agents=2)
         self.layout = get_layout(layout)
         self.max_steps = check_int("max_steps", max_steps, 1)

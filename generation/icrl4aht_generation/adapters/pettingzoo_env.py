@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any, NamedTuple, SupportsIndex
+from typing import Any, SupportsIndex
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS
-from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.channels import Channels, observation_shape
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.render import draw_frame
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_noun
-from icrl4aht_generation.adapters.arguments import check_action, check_record
+from icrl4aht_generation.adapters.arguments import RENDER_MODES, check_action, check_choices, check_record
 from icrl4aht_generation.env import Environment, EnvState
 
 try:
@@ -57,7 +57,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         OptionError: for a number of steps below 1.
     """
 
-    metadata: dict[str, Any] = {"name": "icrl4aht_v0", "render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - declared so by the base class
+    metadata: dict[str, Any] = {"name": "icrl4aht_v0", "render_modes": RENDER_MODES, "render_fps": 5}  # noqa: RUF012 - declared so by the base class
 
     def __init__(
         self,
@@ -67,10 +67,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         channels: Channels = "own",
         render_mode: str | None = None,
     ) -> None:
-        if channels not in CHANNELS:
-            raise unknown("channels", channels, CHANNELS)
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise unknown("render_mode", render_mode, self.metadata["render_modes"])
+        check_choices(channels, render_mode)
         self.layout = get_layout(layout)
         self.max_steps = check_int("max_steps", max_steps, 1)
         self.render_mode = render_mode
@@ -80,7 +77,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         # One object per agent and environment: PettingZoo wants equal spaces in every call, and seeds them.
         self._observed = {agent: spaces.Box(0, 255, shape, np.uint8) for agent in AGENT_NAMES}
         self._played = {agent: spaces.Discrete(len(ACTIONS)) for agent in AGENT_NAMES}
-        self._functions = _compiled(self.layout, channels == "canonical")
+        self._start, self._step = _compiled(self.layout, channels == "canonical")
         self._random, _ = seeding.np_random()
         self._running: EnvState | None = None
 
@@ -116,7 +113,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         key = self._random.integers(0, 2**32, 2, dtype=np.uint32)
         given = (options or {}).get("state")
         record = None if given is None else check_record(self.layout, given)
-        self._running, observations = self._functions.start(key, record)
+        self._running, observations = self._start(key, record)
         self.agents = list(AGENT_NAMES)
         return self._by_agent(observations), {agent: {} for agent in AGENT_NAMES}
 
@@ -136,7 +133,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         if set(actions) != set(AGENT_NAMES):
             raise OptionError(f"actions: expected those of {' and '.join(AGENT_NAMES)}, found {sorted(actions)}")
         both = np.array([check_action(f"action of {agent}", actions[agent]) for agent in AGENT_NAMES], np.int32)
-        after, observations, reward, shaped = self._functions.step(self._running, both)
+        after, observations, reward, shaped = self._step(self._running, both)
         self._running, ended = after, int(after.clock[0]) >= self.max_steps
         if ended:
             self.agents = []
@@ -168,13 +165,9 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         return dict(zip(AGENT_NAMES, np.asarray(observations)[0], strict=True))
 
 
-class _Functions(NamedTuple):
-    start: Callable[..., Any]
-    step: Callable[..., Any]
-
-
 @lru_cache(maxsize=16)
-def _compiled(layout: Any, canonical: bool) -> _Functions:
+def _compiled(layout: Layout, canonical: bool) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return the compiled start of an episode, and its step."""
     env = Environment(layout)
 
     def start(key, record):
@@ -188,4 +181,4 @@ def _compiled(layout: Any, canonical: bool) -> _Functions:
         after = state._replace(clock=state.clock + 1, record=outcome.state)
         return after, observe_both(layout, outcome.state, canonical), outcome.reward, outcome.shaped
 
-    return _Functions(jax.jit(start), jax.jit(step))
+    return jax.jit(start), jax.jit(step)

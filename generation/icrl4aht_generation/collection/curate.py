@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -94,8 +94,8 @@ def plot_filter(path: Path, title: str, before: np.ndarray, after: np.ndarray) -
     plot_curves(path, [(title, {label: returns for label, returns in sides.items() if len(returns)})])
 
 
-def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yield a policy's most probable action at every step of each stream.
+def relabel(layout: Layout, network: ActorCritic, params: Any, states: np.ndarray) -> np.ndarray:
+    """Return a policy's most probable action at every step of a stream, int8 (T,).
 
     The recurrent state is zero at the start of each episode, as in training.
 
@@ -103,33 +103,23 @@ def relabel(layout: Layout, network: ActorCritic, params: Any, states: Iterable[
         layout: the layout.
         network: the ego's network.
         params: parameters of the checkpoint that labels.
-        states: uint8 (T, S) for each stream.
-
-    Yields:
-        int8 (T,) for each stream.
+        states: uint8 (T, S).
     """
-    greedy = _compiled_greedy(layout, network.widths)
-    for stream in states:
-        yield _by_step(greedy(params, _by_episode(stream)))
+    return _by_step(_compiled_greedy(layout, network.widths)(params, _by_episode(states)))
 
 
-def oracle_labels(layout: Layout, states: Iterable[np.ndarray], actions: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yield the scripted oracle's action at every step of each stream.
+def oracle_labels(layout: Layout, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Return the scripted oracle's action at every step of a stream, int8 (T,).
 
     The oracle follows every episode from its first step: it remembers the recorded states and the actions that the ego
     took, and chooses its own action at each state.
 
     Args:
         layout: the layout.
-        states: uint8 (T, S) for each stream.
-        actions: int8 (T,) for each stream, the ego's.
-
-    Yields:
-        int8 (T,) for each stream.
+        states: uint8 (T, S).
+        actions: int8 (T,), the ego's.
     """
-    follow = _compiled_oracle(layout)
-    for stream, taken in zip(states, actions, strict=True):
-        yield _by_step(follow(_by_episode(stream), _by_episode(taken)))
+    return _by_step(_compiled_oracle(layout)(_by_episode(states), _by_episode(actions)))
 
 
 def _by_episode(stream: np.ndarray) -> jax.Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,8 +15,7 @@ from rich.text import Text
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.install_hints import install_command
-from icrl4aht_generation.collection.board import TaskBoard
-from icrl4aht_generation.collection.job import CollectionJob, TaskOutcome
+from icrl4aht_generation.collection.job import CollectionJob, TaskBoard, TaskOutcome
 from icrl4aht_generation.collection.options import CollectOptions, request_determinism
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.learners.resume import limit_xla_threads
@@ -52,17 +51,12 @@ def run_on_ray(
                 ready, _ = ray.wait(list(pending), num_returns=1, timeout=_POLL_SECONDS)
                 for reference in ready:
                     yield _outcome(ray, reference, pending.pop(reference), options)
-                _show_progress(job, pending.values(), board)
+                for work in pending.values():  # workers report through their artefacts' timing files
+                    if timing := last_timing(job.folder(work)):
+                        board.show_running(work.name, int(timing["update"]) + 1, timing["steps_per_second"])
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)
-
-
-def _show_progress(job: CollectionJob, tasks: Iterable[Work], board: TaskBoard) -> None:
-    for work in tasks:  # workers report through their artefacts' timing files
-        timing = last_timing(job.folder(work))
-        if timing:
-            board.show_running(work.name, int(timing["update"]) + 1, timing["steps_per_second"])
 
 
 def _work(job: CollectionJob, work: Work) -> str:
@@ -108,18 +102,15 @@ def _connected(options: CollectOptions) -> Iterator[Any]:
     except ImportError as error:
         raise OptionError(f"the executor ray needs Ray: {install_command('cluster')}") from error
     _check_reachable(options.address)
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    settings: dict[str, Any] = {"address": options.address or "local", "log_to_driver": False, "logging_level": "ERROR"}
+    if options.address is None:  # all cores by default; GPUs are found by Ray
+        settings |= {
+            "num_cpus": options.workers,
+            "include_dashboard": False,
+            "object_store_memory": _OBJECT_STORE_BYTES,
+        }
     try:
-        if options.address is None:
-            ray.init(
-                address="local",
-                num_cpus=options.workers,  # all cores by default; GPUs are found by Ray
-                include_dashboard=False,
-                object_store_memory=_OBJECT_STORE_BYTES,
-                **quiet,
-            )
-        else:
-            ray.init(address=options.address, **quiet)
+        ray.init(**settings)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise OptionError(f"Ray at {options.address or 'this machine'} cannot be reached: {error}") from error
     try:

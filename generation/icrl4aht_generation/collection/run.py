@@ -11,9 +11,14 @@ from pathlib import Path
 from rich.console import Console
 
 from icrl4aht_data.utils.progress import progress_bars
-from icrl4aht_generation.collection.board import TaskBoard
-from icrl4aht_generation.collection.failures import FAILED, FailureLog
-from icrl4aht_generation.collection.job import CollectionError, CollectionJob, TaskOutcome
+from icrl4aht_generation.collection.job import (
+    FAILED,
+    CollectionError,
+    CollectionJob,
+    FailureLog,
+    TaskBoard,
+    TaskOutcome,
+)
 from icrl4aht_generation.collection.options import CollectOptions
 from icrl4aht_generation.collection.ray_executor import run_on_ray
 from icrl4aht_generation.collection.task_folder import last_timing
@@ -26,20 +31,18 @@ def run_in_process(
 ) -> Generator[TaskOutcome]:
     """Run one task after the other."""
     for work in tasks:
-        yield _attempt(job, work, board, options.retries + 1)
 
+        def on_update(update: int, metrics: dict[str, float], name: str = work.name) -> None:
+            board.show_running(name, update + 1, metrics["steps_per_second"])
 
-def _attempt(job: CollectionJob, work: Work, board: TaskBoard, attempts: int) -> TaskOutcome:
-    def on_update(update: int, metrics: dict[str, float]) -> None:
-        board.show_running(work.name, update + 1, metrics["steps_per_second"])
-
-    outcome = TaskOutcome(work, "failed")
-    for attempt in range(1, attempts + 1):
-        try:
-            return TaskOutcome(work, job(work, on_update), attempt)
-        except Exception as error:  # any error: the other tasks continue
-            outcome = TaskOutcome(work, "failed", attempt, f"{type(error).__name__}: {error}", traceback.format_exc())
-    return outcome
+        for attempt in range(1, options.retries + 2):
+            try:
+                outcome = TaskOutcome(work, job(work, on_update), attempt)
+                break
+            except Exception as error:  # any error: the other tasks continue
+                text = f"{type(error).__name__}: {error}"
+                outcome = TaskOutcome(work, "failed", attempt, text, traceback.format_exc())
+        yield outcome  # type: ignore[possibly-undefined]
 
 
 def collect_tasks(

@@ -7,7 +7,6 @@ and since an update is a pure function of the state, the artefact has the bits o
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +21,7 @@ from icrl4aht_data.utils.files import NO_ROOM
 from icrl4aht_generation.collection.task_folder import (
     LEARNER,
     ArtefactWriter,
+    artefact_settings,
     check_room,
     disk_full,
     finish_artefact,
@@ -29,11 +29,10 @@ from icrl4aht_generation.collection.task_folder import (
     needed_bytes,
     partial_folder,
     publish_artefact,
-    resumable_settings,
 )
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.ego import Learner, compiled_update
-from icrl4aht_generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, run_lock
+from icrl4aht_generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, run_lock, software_versions
 from icrl4aht_generation.policy import Noise
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
@@ -119,7 +118,7 @@ def make_artefact(folder: Path, wait: bool, is_finished: Callable[[Path], bool],
 def _learn(
     work: Work, profile: Profile, partial: Path, on_update: UpdateCallback, suite: Path | None, save_seconds: float
 ) -> None:
-    task, saved = work.task, StateFile(partial / LEARNER, resumable_settings(work, profile))
+    task, saved = work.task, StateFile(partial / LEARNER, artefact_settings(work, profile) | software_versions())
     learner = make_learner(task, profile, suite)
     first, init, key = saved_progress(saved), jax.jit(learner.init), learner_key(work)
     state = saved.load(jax.eval_shape(init, key)) if first else init(key)
@@ -132,10 +131,7 @@ def _learn(
         return rollout, metrics
 
     def save(updates: int) -> None:
-        writer.sync()
-        began = time.perf_counter()
-        saved.save(state, updates)
-        writer.add_recording_time(time.perf_counter() - began)
+        writer.sync(lambda: saved.save(state, updates))
 
     with readable_disk_errors(partial, needed):
         if not first:

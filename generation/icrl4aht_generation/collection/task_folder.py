@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -35,7 +36,7 @@ from icrl4aht_generation.collection.record import HistoryArrays, array_shapes, r
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
-from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, software_versions, xla_threads
+from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, xla_threads
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
 
@@ -79,11 +80,6 @@ def common_settings(work: Work) -> dict[str, Any]:
         "learner": work.learner,
         "code_version": version("icrl4aht-data"),
     }
-
-
-def resumable_settings(work: Work, profile: Profile) -> dict[str, Any]:
-    """Return the settings that must not change for a resumed task to give the bits of an uninterrupted one."""
-    return artefact_settings(work, profile) | software_versions()
 
 
 def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
@@ -247,18 +243,15 @@ class ArtefactWriter:
             save_policy(checkpoint_path(self._partial, moments.index(updates)), network, params, card)
             self._recording += time.perf_counter() - began
 
-    def sync(self) -> None:
-        """Force everything written so far to the disk, and out of memory."""
+    def sync(self, save: Callable[[], None]) -> None:
+        """Force everything written so far to the disk, and out of memory; then save the state that led to it."""
         began = time.perf_counter()
         for array in self._histories:
             array.flush()  # type: ignore[attr-defined]
         self._histories = self._mapped()
         self._log.sync()
+        save()
         self._recording += time.perf_counter() - began
-
-    def add_recording_time(self, seconds: float) -> None:
-        """Add time to what `timing` calls recording."""
-        self._recording += seconds
 
     def close(self) -> None:
         """Close the log and unmap the arrays."""
@@ -269,14 +262,8 @@ class ArtefactWriter:
 def last_timing(folder: Path) -> dict[str, float] | None:
     """Return the last line of an artefact's timing, finished or not; None if there is none yet."""
     for path in (partial_folder(folder) / TIMING, folder / TIMING):
-        try:
-            with path.open("rb") as stream:
-                stream.seek(0, os.SEEK_END)
-                stream.seek(max(0, stream.tell() - 1000))
-                lines = [line for line in stream.read().split(b"\n")[:-1] if line.endswith(b"}")]
-            return json.loads(lines[-1]) if lines else None
-        except (OSError, ValueError):
-            continue
+        with suppress(OSError, ValueError, IndexError):
+            return json.loads(path.read_text(encoding="utf-8").splitlines()[-1])
     return None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -16,7 +15,7 @@ from safetensors.numpy import save as to_bytes
 
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.checkpoints import CHECKPOINT_BYTES
-from icrl4aht_data.utils.files import parse_json, plain_size, read_text
+from icrl4aht_data.utils.files import parse_json, plain_size, read_text, sync
 from icrl4aht_data.utils.options import replace_options
 from icrl4aht_generation.learners.config import PPOConfig, Widths
 from icrl4aht_generation.learners.network import ActorCritic
@@ -44,22 +43,16 @@ def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str,
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    write_policy(partial, network, params, card)
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
-
-
-def write_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str, Any]) -> None:
-    """Write policy.safetensors and policy.json into an existing folder, and sync them to the disk."""
     weights = {name: np.asarray(w) for name, w in flatten_dict(params, sep="/").items()}
-    stored = _without_zero_rows(weights)
-    (folder / POLICY_WEIGHTS).write_bytes(to_bytes(stored))  # `save_file` raises its own error for a full disk
     shapes = {name: list(w.shape) for name, w in weights.items()}
     content = card | {"widths": asdict(network.widths), "partners": network.partners, "shapes": shapes}
-    (folder / POLICY_CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    # `save_file` raises an error of its own for a full disk.
+    (partial / POLICY_WEIGHTS).write_bytes(to_bytes(_without_zero_rows(weights)))
+    (partial / POLICY_CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     for name in (POLICY_WEIGHTS, POLICY_CARD):
-        with (folder / name).open("rb+") as stream:
-            os.fsync(stream.fileno())
+        sync(partial / name)
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
 
 
 def load_card(folder: Path) -> dict[str, Any]:

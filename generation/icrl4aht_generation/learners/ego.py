@@ -67,11 +67,6 @@ class Learner:
     config: PPOConfig
 
     @property
-    def steps_per_update(self) -> int:
-        """Environment steps of an update, over all environments."""
-        return self.config.steps_per_update
-
-    @property
     def network(self) -> ActorCritic:
         """The ego's network."""
         return ActorCritic(self.config.widths, view=self.view)

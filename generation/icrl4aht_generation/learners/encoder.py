@@ -224,8 +224,6 @@ class WindowEncoder(nn.Module):
         """Apply the 1 x 1 convolutions. What the rules cannot produce becomes NaN: it has no word."""
         if isinstance(seen, WindowWords):
             x = jnp.asarray(_required(self.view).words.channels, self.dtype)
-        elif isinstance(seen, WindowEntries):
-            raise TypeError(f"encoder {self.kind}: expected observations or words, found entries")
         else:
             x = seen.reshape(*seen.shape[:-3], VISIBLE, seen.shape[-1]).astype(self.dtype)
         for width in self.pointwise:
@@ -246,8 +244,6 @@ class FlatDense(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Seen) -> Float[Array, "*B F"]:
-        if isinstance(seen, (WindowWords, GroupedWords)):
-            raise TypeError("encoder mlp: expected observations or entries, found words")
         if isinstance(seen, WindowEntries):
             x, rows = seen.values, VISIBLE * _required(self.view).channels
         else:

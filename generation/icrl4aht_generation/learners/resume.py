@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import jax
@@ -293,14 +292,6 @@ class RunLog:
         self._metrics, self._timing = (
             (path if self._writes else Path(os.devnull)).open("a", encoding="utf-8") for path in paths
         )
-
-    def __enter__(self) -> RunLog:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def write(self, *metrics: dict[str, Any], timing: dict[str, Any] | None = None) -> None:
         """Append lines; readers see them at once."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any
 
@@ -20,6 +20,7 @@ from rich import filesize
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.format.schema import KINDS, Kind
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.system import usable_cores
@@ -30,6 +31,7 @@ from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.ego import Learner
 from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.learners.network import ActorCritic
+from icrl4aht_generation.learners.rollout import init_rollout, random_player, roll_out
 from icrl4aht_generation.populations.build import population_runs
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.teammates.learned import build_untrained
@@ -102,10 +104,6 @@ class RebuildCost:
     devices: int
     hours_on_devices: float
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields."""
-        return asdict(self)
-
     def rows(self) -> Iterator[tuple[str, str]]:
         """Yield the rows of the printed table, (quantity, value)."""
         for field in fields(self):
@@ -136,11 +134,10 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
     runs = population_runs(profile, profile.algorithms, 0)
 
     steps = sum(ego.updates * ego.steps_per_update for _, ego in egos)
-    playing = sum(ego.updates * ego.steps_per_update * step_seconds(ego) for _, ego in egos)
+    playing = [ego.updates * ego.steps_per_update * step_seconds(ego) for _, ego in egos]
     noise_transitions = profile.noise.histories * profile.noise.episodes * KEPT_STEPS
     noise_seconds = noise_transitions / ENVIRONMENT_STEPS_PER_SECOND + COMPILE_SECONDS
-    seconds = [ego.updates * ego.steps_per_update * step_seconds(ego) + COMPILE_SECONDS for _, ego in egos]
-    seconds += [noise_seconds] * len(noise)
+    seconds = [played + COMPILE_SECONDS for played in playing] + [noise_seconds] * len(noise)
     teammate_seconds = sum(run.steps * step_seconds(run.config) + COMPILE_SECONDS for run in runs)
     kept = {
         "ppo": sum(
@@ -166,7 +163,7 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
         lite_bytes=sizes["lite"],
         full_bytes=sizes["full"],
         device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
-        steps_per_second=round(steps / playing, 1) if egos else None,
+        steps_per_second=round(steps / sum(playing), 1) if egos else None,
         teammate_hours=round(teammate_seconds / 3600, 2),
         noise_hours=round(len(noise) * noise_seconds / 3600, 2),
         hours_on_one=round((teammate_seconds + sum(seconds)) / 3600, 2),
@@ -200,13 +197,7 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
     def forward(params: Any, records: jax.Array) -> Any:
         return network.apply(params, network.initial_hidden(count), view(records), reset)
 
-    jax.block_until_ready(forward(params, records))
-    times = []
-    for _ in range(3):  # the fastest of a few, since other programs may slow some down
-        began = time.perf_counter()
-        jax.block_until_ready(forward(params, records))
-        times.append(time.perf_counter() - began)
-    return min(times) / (steps * count)
+    return _seconds(forward, params, records) / (steps * count)
 
 
 def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
@@ -215,12 +206,44 @@ def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
     return sum(math.prod(shape) * np.dtype(dtype).itemsize for arrays in shapes for shape, dtype in arrays)
 
 
-def task_learner(profile: Profile, ego: PPOConfig, layout_name: str) -> Learner:
-    """Return the ego of a task on a layout, with a teammate of the profile's kind."""
-    layout = get_layout(layout_name)
+def learner_speed(profile: Profile, layout_name: str) -> dict[str, float]:
+    """Measure the ego of a profile's task on a layout, with a teammate of the profile's kind.
+
+    Returns steps/s of complete updates, and the share of each part, after compiling.
+
+    Three programs are timed: roll-outs of the environment with the teammate and a random ego, roll-outs with the ego's
+    network, complete updates; each share is the difference to the program before.
+    """
+    layout, config = get_layout(layout_name), profile.ego_on(layout_name)
     heuristics = [work.task.teammate for work in profile.works() if work.source == "ppo"]
     if profile.algorithms or not heuristics:
         teammate = build_untrained(layout, profile.teammates.ppo.widths)
     else:
         teammate = build_teammate(layout, heuristics[0])
-    return Learner(Environment(layout), teammate, ego)
+    learner = Learner(Environment(layout), teammate, config)
+    state, key = jax.jit(learner.init)(jax.random.key(0)), jax.random.key(1)
+    players = learner.players(state.params, state.teammate)
+    random_players = [random_player(EGO, config.environments), players[TEAMMATE]]
+    start = init_rollout(learner.env, random_players, jax.random.split(key, config.environments))
+    env_only = jax.jit(lambda carry: roll_out(learner.env, random_players, carry, config.rollout, key)[0])
+    with_forward = jax.jit(lambda carry: roll_out(learner.env, players, carry, config.rollout, key))
+    environment = _seconds(env_only, start)
+    forward = _seconds(with_forward, state.carry)
+    update = _seconds(jax.jit(learner.update), state)
+    return {
+        "steps_per_second": round(config.steps_per_update / update, 1),
+        "environment_share": round(environment / update, 4),
+        "forward_share": round((forward - environment) / update, 4),
+        "update_share": round((update - forward) / update, 4),
+    }
+
+
+def _seconds(function: Any, *arguments: Any) -> float:
+    """Return the time of the fastest of a few calls, after one that compiles."""
+    jax.block_until_ready(function(*arguments))
+    times = []
+    for _ in range(3):  # the fastest of a few, since other programs may slow some down
+        started = time.perf_counter()
+        jax.block_until_ready(function(*arguments))
+        times.append(time.perf_counter() - started)
+    return min(times)

@@ -17,7 +17,6 @@ from icrl4aht_data.benchmark.facts import (
     TRACKS,
     layout_number,
     track_layouts,
-    track_of,
 )
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -82,7 +81,11 @@ def build_suite(
         if is_trained(suite, name, algorithm)
     ]
     for selection in selections:
-        console.print(_describe(selection, config.train))
+        few = f"; only {len(selection.train)} of {config.train}" if len(selection.train) < config.train else ""
+        console.print(
+            f"{selection.algorithm} on {selection.layout}: {selection.good} of {selection.candidates} checkpoints "
+            f"exceed the threshold; {len(selection.train)} for training, {len(selection.heldout)} held out{few}"
+        )
     for path in write_manifests(suite, selections):
         console.print(f"wrote {path}")
     return [selection for selection in selections if (selection.layout, selection.algorithm) in wanted]
@@ -135,14 +138,6 @@ def _train(run: PopulationRun, folder: Path, wait: bool, console: Console) -> bo
     return True
 
 
-def _describe(selection: TeammateSelection, wanted: int) -> str:
-    few = f"; only {len(selection.train)} of {wanted}" if len(selection.train) < wanted else ""
-    return (
-        f"{selection.algorithm} on {selection.layout}: {selection.good} of {selection.candidates} checkpoints exceed "
-        f"the threshold; {len(selection.train)} for training, {len(selection.heldout)} held out{few}"
-    )
-
-
 def report_diversity(
     suite: Path,
     layouts: Sequence[str],
@@ -189,17 +184,13 @@ def report_diversity(
 
 def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, out: Path, console: Console) -> None:
     returns = play_matrix(suite, layout, algorithm, greedy)
-    members = [f"m{k}" for k in range(len(returns))]
     diagonal = np.eye(len(returns), dtype=bool)
     title = f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps"
-    console.print(_matrix_table(title, "ego \\ teammate", members, returns, ".1f"))
+    path, members = _cross_play_picture(out, layout.name, algorithm), [f"m{k}" for k in range(len(returns))]
+    _show_matrix(console, path, title, members, ("ego", "teammate"), returns)
     self_play = returns[diagonal].mean()
     cross_play = returns[~diagonal].mean() if len(returns) > 1 else float("nan")
     console.print(f"self-play {self_play:.1f}, cross-play {cross_play:.1f}, gap {self_play - cross_play:.1f}")
-    path = _cross_play_picture(out, layout.name, algorithm)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_matrix(returns, members, path, f"{algorithm}, {layout.name}: return", ("ego", "teammate"))
-    console.print(f"wrote {path}")
 
 
 def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], out: Path, console: Console) -> None:
@@ -213,11 +204,8 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], ou
         families[short] = range(len(policies), len(policies) + len(thetas))
         policies += [build_teammate(layout, {"family": kind, "theta": theta}) for theta in thetas]
     distances = family_distances(hamming_distances(actions_on_common_states(layout, policies)), families)
-    labels = list(families)
-    console.print(_matrix_table(f"{layout.name}: mean Hamming distance of families", "", labels, distances, ".2f"))
-    path = _distances_picture(out, layout.name)
-    plot_matrix(distances, labels, path, f"{layout.name}: Hamming distance", ("family", "family"))
-    console.print(f"wrote {path} ({track_of(layout.name)} track)")
+    title = f"{layout.name}: mean Hamming distance of families"
+    _show_matrix(console, _distances_picture(out, layout.name), title, list(families), ("family",) * 2, distances)
 
 
 def _cross_play_picture(out: Path, layout: str, algorithm: str) -> Path:
@@ -228,12 +216,17 @@ def _distances_picture(out: Path, layout: str) -> Path:
     return out / layout / "distances.png"
 
 
-def _matrix_table(title: str, corner: str, names: Sequence[str], values: np.ndarray, form: str) -> Table:
-    """Return a square matrix with the same names for rows and columns."""
+def _show_matrix(
+    console: Console, path: Path, title: str, names: Sequence[str], axes: tuple[str, str], values: np.ndarray
+) -> None:
+    """Print a square matrix with the same names for rows and columns, and draw it into a picture."""
     table = Table(title=title)
-    table.add_column(corner)
+    table.add_column(" \\ ".join(axes))
     for name in names:
         table.add_column(name, justify="right")
     for name, row in zip(names, values, strict=True):
-        table.add_row(name, *(f"{value:{form}}" for value in row))
-    return table
+        table.add_row(name, *(f"{value:.2f}" for value in row))
+    console.print(table)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_matrix(values, names, path, title, axes)
+    console.print(f"wrote {path}")

@@ -30,6 +30,7 @@ def cross_play_returns(
     seed: int = 0,
     episodes: int = EPISODES_PER_PAIR,
     greedy: bool = False,
+    paired: bool = False,
 ) -> np.ndarray:
     """Return mean returns of all pairs over episodes of 400 steps.
 
@@ -42,29 +43,18 @@ def cross_play_returns(
         episodes: episodes of each pair.
         greedy: whether teammates take their most probable actions, as in the dataset. All other policies draw theirs,
             as in training, since two greedy policies can block each other for ever.
+        paired: whether only ego i plays with teammate i.
 
     Returns:
-        float64 (A, B).
+        float64 (A, B), or (A,) of pairs.
     """
     a, b = (jax.tree.leaves(params)[0].shape[0] for params in (egos, teammates))
     first, second = np.divmod(np.arange(a * b), b)
+    if paired:
+        first = second = np.arange(a)
     play = _compiled(layout, network.widths, network.partners, tuple(first), tuple(second), episodes, greedy)
-    return np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64).reshape(a, b)
-
-
-def paired_returns(
-    layout: Layout,
-    network: ActorCritic,
-    egos: Any,
-    teammates: Any,
-    seed: int = 0,
-    episodes: int = EPISODES_PER_PAIR,
-    greedy: bool = False,
-) -> np.ndarray:
-    """Return mean returns float64 (A,) of ego i with teammate i; arguments as in `cross_play_returns`."""
-    pairs = tuple(range(jax.tree.leaves(egos)[0].shape[0]))
-    play = _compiled(layout, network.widths, network.partners, pairs, pairs, episodes, greedy)
-    return np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64)
+    returns = np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64)
+    return returns if paired else returns.reshape(a, b)
 
 
 @lru_cache(maxsize=32)

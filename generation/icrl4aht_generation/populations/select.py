@@ -6,13 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS, layout_number, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, lock_path, process_lock
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS
@@ -60,10 +58,10 @@ def select_teammates(
         seed: seed of the draw.
 
     Raises:
-        OptionError: if the population is not finished, or was made by a version that did not measure these returns.
+        OptionError: if the population is not finished.
     """
     candidates = list(suite_checkpoints(suite, layout, algorithm))
-    good = [point for point in candidates if _return_as_teammate(suite, point) > THRESHOLD]
+    good = [point for point in candidates if point.card["teammate_return"] > THRESHOLD]
     order = np.random.default_rng([seed, ALGORITHMS.index(algorithm)]).permutation(len(good))
     held_out = min(heldout, max(len(good) - train, len(good) // 5))
     chosen = _members_in_turn([good[k] for k in order])
@@ -82,16 +80,6 @@ def _members_in_turn(points: Sequence[SuiteCheckpoint]) -> list[SuiteCheckpoint]
     return [points[k] for k in np.argsort(turns, kind="stable")]
 
 
-def _return_as_teammate(suite: Path, point: SuiteCheckpoint) -> float:
-    try:
-        return point.card["teammate_return"]
-    except KeyError as error:
-        raise OptionError(
-            f"{suite / point.path}: its card has no 'teammate_return', an earlier version made it: train the suite "
-            f"again, in another folder"
-        ) from error
-
-
 def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str) -> list[Task]:
     """Return one task per teammate, each with a seed that does not depend on the rest of the suite."""
     tasks = []
@@ -99,20 +87,16 @@ def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str)
         first = 10_000 * (layout_number(selection.layout) + 1) + 1_000 * ALGORITHMS.index(selection.algorithm)
         chosen = selection.train if split == "train" else selection.heldout
         for number, point in enumerate(chosen):
-            entry = _entry(suite, selection.algorithm, number, point)
+            entry = {
+                "kind": "rl",
+                "family": selection.algorithm,
+                "theta_id": number,
+                "base_seed": point.card["seed"],
+                "theta": {"checkpoint": point.path, "sha256": file_hash(suite / point.path / POLICY_WEIGHTS)},
+            }
             seed = first + number + (split != "train") * len(selection.train)
             tasks.append(make_task(track_of(selection.layout), split, selection.layout, entry, seed))
     return tasks
-
-
-def _entry(suite: Path, algorithm: str, number: int, point: SuiteCheckpoint) -> dict[str, Any]:
-    return {
-        "kind": "rl",
-        "family": algorithm,
-        "theta_id": number,
-        "base_seed": point.card["seed"],
-        "theta": {"checkpoint": point.path, "sha256": file_hash(suite / point.path / POLICY_WEIGHTS)},
-    }
 
 
 def write_manifests(suite: Path, selections: Sequence[TeammateSelection]) -> list[Path]:

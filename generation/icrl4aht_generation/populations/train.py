@@ -10,10 +10,10 @@ which a stopped run resumes to the same bytes.
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -24,9 +24,9 @@ import jax
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import IndexFormatError, OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import atomic_write, json_hash, write_json
+from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.checkpoint import (
@@ -55,7 +55,7 @@ from icrl4aht_generation.learners.resume import (
 )
 from icrl4aht_generation.plotting import plot_training
 from icrl4aht_generation.policy import stacked
-from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR, cross_play_returns, paired_returns
+from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR, cross_play_returns
 
 POPULATION_SAVE_SECONDS = 60.0
 """Interval of saves: the work that a kill can cost."""
@@ -153,13 +153,21 @@ class PopulationRun:
         return self.config.updates * sum(stage.steps_per_update for stage in self.stages)
 
 
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return the record of a finished population; empty if there is none, or it cannot be read."""
+    try:
+        record = parse_json(read_text(folder / POPULATION))
+    except IndexFormatError:
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
 def is_population_finished(folder: Path, run: PopulationRun) -> bool:
     """Return whether a folder has this population under these settings, with all its files unchanged."""
+    record = read_record(folder)
     try:
-        content = json.loads((folder / POPULATION).read_text(encoding="utf-8"))
-        same = content["settings_hash"] == run.settings_hash
-        return same and hashes_hold(folder, content["files"])
-    except (OSError, ValueError, KeyError, TypeError):
+        return record["settings_hash"] == run.settings_hash and hashes_hold(folder, record["files"])
+    except (OSError, KeyError, TypeError):
         return False
 
 
@@ -205,12 +213,15 @@ class _PopulationTraining:
 
     def train(self) -> None:
         if (self.folder / POPULATION).exists():
+            found = read_record(self.folder).get("settings") or self.run.settings
+            other = {name: was for name, (was, _) in differing_settings(found, self.run.settings).items()}
+            difference = f"of other settings: {other}" if other else "with changed files"
             raise OptionError(
-                f"{self.folder}: holds a finished population {self._difference()}; remove it, or give another --suite"
+                f"{self.folder}: holds a finished population {difference}; remove it, or give another --suite"
             )
         done, state = self._resume()
         updates = self.run.config.updates
-        with RunLog(self.folder, lambda line: line["stage"] * updates + line["update"] < done) as log:
+        with closing(RunLog(self.folder, lambda line: line["stage"] * updates + line["update"] < done)) as log:
             for stage in range(max(0, done - 1) // updates, len(self.run.stages)):
                 self._train_stage(stage, state, log)
                 state = None
@@ -225,15 +236,6 @@ class _PopulationTraining:
             return 0, None
         stage = (done - 1) // self.run.config.updates
         return done, self.saved.load(jax.eval_shape(self.run.stages[stage].init, self._key(stage)))
-
-    def _difference(self) -> str:
-        """Return a text that names the settings in which a finished population differs from this run."""
-        try:
-            found = json.loads((self.folder / POPULATION).read_text(encoding="utf-8"))["settings"]
-            other = {name: was for name, (was, _) in differing_settings(found, self.run.settings).items()}
-        except (OSError, ValueError, KeyError, AttributeError):
-            other = {}
-        return f"of other settings: {other}" if other else "with changed files"
 
     def _key(self, stage: int):
         return jax.random.fold_in(jax.random.key(self.run.seed), stage)
@@ -292,7 +294,8 @@ class _PopulationTraining:
         members = jax.tree.map(lambda leaf: leaf[:count], params)
         partners = jax.tree.map(lambda leaf: leaf[count : 2 * count], params) if run.has_best_responses else members
         returns, as_teammate = (
-            paired_returns(run.layout, population.network, partners, members, greedy=greedy) for greedy in (False, True)
+            cross_play_returns(run.layout, population.network, partners, members, greedy=greedy, paired=True)
+            for greedy in (False, True)
         )
         for k in range(count):
             card = {
@@ -347,11 +350,6 @@ class SuiteCheckpoint:
     path: str
     card: dict[str, Any]
 
-    @property
-    def is_member(self) -> bool:
-        """Whether the population's objective shaped the policy: all but CoMeDi's first one, plain self-play."""
-        return self.card["algorithm"] != "comedi" or self.card["member"] > 0
-
 
 def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
     """Return whether a suite has this population and it is finished."""
@@ -360,17 +358,13 @@ def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
 
 def population_threads(suite: Path, layout: str, algorithm: str) -> int | None:
     """Return the number of XLA threads that trained a suite's population; None if the suite does not say."""
-    try:
-        content = json.loads((suite / layout / algorithm / POPULATION).read_text(encoding="utf-8"))
-        return content["software"]["xla_threads"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    return (read_record(suite / layout / algorithm).get("software") or {}).get("xla_threads")
 
 
 def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:
     """Yield the checkpoints of a population's members, by member and checkpoint.
 
-    CoMeDi's first policy is excluded, since it is trained by plain self-play (see `SuiteCheckpoint.is_member`).
+    CoMeDi's first policy is excluded, since it is trained by plain self-play.
 
     Raises:
         OptionError: if the population is not finished.
@@ -381,7 +375,7 @@ def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Suit
     found = [path.parent for path in folder.glob(f"m*/c*/{POLICY_WEIGHTS}")]
     for path in sorted(found, key=lambda path: (int(path.parent.name[1:]), int(path.name[1:]))):
         point = SuiteCheckpoint(str(path.relative_to(suite)), load_card(path))
-        if point.is_member:
+        if algorithm != "comedi" or point.card["member"] > 0:
             yield point
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -90,12 +88,7 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     if not path.is_file():
         raise unknown("profile", name, profile_names())
     with _named_errors(path):
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-        try:
-            checked = msgspec.convert(content, _ProfileFile)
-        except msgspec.ValidationError as error:
-            raise OptionError(_mismatch(error, content)) from error
-        profile = _profile(path.stem, checked)
+        profile = _profile(path.stem, msgspec.toml.decode(path.read_bytes(), type=_ProfileFile))
     prepare(profile)
     with _named_errors(path):
         works = profile.works()  # raises for unknown presets, and for more sampled teammates than there are
@@ -109,21 +102,10 @@ def _named_errors(path: Path) -> Iterator[None]:
     """Name the file in errors about its content."""
     try:
         yield
-    except tomllib.TOMLDecodeError as error:
-        raise OptionError(f"{path}: not TOML: {error}") from error
-    except ValueError as error:
+    except (ValueError, msgspec.ValidationError) as error:
         raise OptionError(f"{path}: {error}") from error
-
-
-def _mismatch(error: msgspec.ValidationError, content: Any) -> str:
-    """Return an error of msgspec with the key first, and the value if it is not a table."""
-    expected, _, path = str(error).partition(" - at `$")
-    key = path.strip(".`")
-    for part in re.findall(r"\w+", key):
-        content = content[int(part)] if isinstance(content, list) else content[part]
-    if not key:
-        return expected
-    return f"{key}: {expected}" if isinstance(content, dict) else f"{key} = {content!r}: {expected}"
+    except msgspec.DecodeError as error:
+        raise OptionError(f"{path}: not TOML: {error}") from error
 
 
 def _profile(name: str, content: _ProfileFile) -> Profile:

@@ -74,23 +74,19 @@ class SampledConfig:
     ppo: dict[str, int]
     validation: dict[str, int]
 
-    def training(self, layout: str, source: str) -> list[dict[str, Any]]:
-        """Return the training teammates of a source on a layout.
+    def drawn(self, layout: str, source: str) -> list[tuple[str, dict[str, Any]]]:
+        """Return the teammates of a source on a layout, and the splits of their tasks.
 
         Raises:
             OptionError: if there are fewer draws that differ from the test instances.
         """
-        drawn = drawn_teammates(layout, self.families[layout], self.per_layout[layout])
-        return [entry for entry, _ in (drawn[: self.ppo[layout]] if source == "ppo" else drawn)]
-
-    def validating(self, layout: str) -> list[dict[str, Any]]:
-        """Return the validation teammates on a layout.
-
-        Raises:
-            OptionError: if there are fewer draws that differ from the test instances.
-        """
-        drawn = drawn_teammates(layout, self.families[layout], self.validation[layout], VALIDATION_DRAWS)
-        return [entry for entry, _ in drawn]
+        families, count = self.families[layout], self.ppo[layout] if source == "ppo" else None
+        drawn = drawn_teammates(layout, families, self.per_layout[layout])[:count]
+        found = [("train", entry) for entry, _ in drawn]
+        if source == "noise":
+            drawn = drawn_teammates(layout, families, self.validation[layout], VALIDATION_DRAWS)
+            found += [("validation", entry) for entry, _ in drawn]
+        return found
 
 
 @dataclass(frozen=True)
@@ -119,7 +115,7 @@ class Profile:
         xla_threads: threads of XLA on a CPU, so that every machine computes the same bits; None for all cores.
 
     Raises:
-        OptionError: if there is no task, or the ego's sizes do not fit.
+        OptionError: if the ego's sizes do not fit.
     """
 
     name: str
@@ -142,14 +138,6 @@ class Profile:
     xla_threads: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("xla_threads", "learners"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise OptionError(f"{name} = {value}: expected at least 1")
-        if not self.layouts or not (self.presets or self.sampled or self.algorithms):
-            raise OptionError(
-                "expected at least one of tasks.layouts, and one of tasks.presets, tasks.sampled or tasks.algorithms"
-            )
         if "ppo" not in self.sources:
             return
         for ego in (self.ego, *self.ego_layouts.values()):
@@ -235,9 +223,7 @@ class Profile:
         tasks = [_of_source(task, source) for task in tasks]
         if self.sampled is None:
             return tasks
-        entries = [("train", entry) for entry in self.sampled.training(layout, source)]
-        if source == "noise":
-            entries += [("validation", entry) for entry in self.sampled.validating(layout)]
+        entries = self.sampled.drawn(layout, source)
         return tasks + [
             make_task(track, split, layout, entry, _sampled_seed(layout, source, entry)) for split, entry in entries
         ]

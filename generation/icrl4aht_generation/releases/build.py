@@ -18,8 +18,7 @@ from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.writing.card import facts as release_facts
 from icrl4aht_data.writing.card import teammate_name
 from icrl4aht_data.writing.statistics import print_learning, print_statistics
-from icrl4aht_generation.collection.failures import FAILED
-from icrl4aht_generation.collection.job import CollectionError
+from icrl4aht_generation.collection.job import FAILED, CollectionError
 from icrl4aht_generation.collection.options import CollectOptions
 from icrl4aht_generation.collection.run import collect_tasks
 from icrl4aht_generation.populations.build import build_suite

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_generation.collection.failures import FAILED
+from icrl4aht_generation.collection.job import FAILED
 from icrl4aht_generation.collection.task_folder import FILTER_CURVES, LABELLER_RETURNS, METADATA
 from icrl4aht_generation.learners.resume import TIMING
 from icrl4aht_generation.populations.train import POPULATION
@@ -37,10 +37,6 @@ class Comparison:
     files: int = 0
     differences: dict[str, str] = field(default_factory=dict)
     xla_threads: tuple[list[int], list[int]] = ([], [])
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields, and whether the folders are equal."""
-        return {"equal": not self.differences, **asdict(self)}
 
 
 def compare_rebuilds(a: Path, b: Path) -> Comparison:
@@ -82,17 +78,14 @@ def _xla_threads(root: Path, names: set[str]) -> list[int]:
 
 def _describe_difference(a: Path, b: Path) -> str:
     if a.suffix == ".npy":
-        try:
+        with suppress(ValueError):  # one of the files may not be an array
             return _describe_arrays(np.load(a, mmap_mode="r"), np.load(b, mmap_mode="r"))
-        except ValueError:  # one of the files is not an array
-            pass
-    sizes = a.stat().st_size, b.stat().st_size
-    ours, theirs = np.memmap(a, np.uint8, "r") if sizes[0] else (), np.memmap(b, np.uint8, "r") if sizes[1] else ()
-    common = min(sizes)
-    wrong = np.flatnonzero(np.asarray(ours[:common]) != np.asarray(theirs[:common]))
+    ours, theirs = np.fromfile(a, np.uint8), np.fromfile(b, np.uint8)
+    common = min(len(ours), len(theirs))
+    wrong = np.flatnonzero(ours[:common] != theirs[:common])
     first = int(wrong[0]) if len(wrong) else common
-    size = f"{sizes[0]} bytes" if sizes[0] == sizes[1] else f"{sizes[0]} and {sizes[1]} bytes"
-    line = f", line {1 + bytes(ours[:first]).count(10)}" if a.suffix in _TEXT else ""
+    size = f"{len(ours)} bytes" if len(ours) == len(theirs) else f"{len(ours)} and {len(theirs)} bytes"
+    line = f", line {1 + np.count_nonzero(ours[:first] == 10)}" if a.suffix in _TEXT else ""
     return f"{size}, the first difference at byte {first}{line}"
 
 

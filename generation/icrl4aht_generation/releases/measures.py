@@ -77,23 +77,28 @@ def teammate_facts(
     for layout in dict.fromkeys(layout for layout, _ in unknown):
         keys = [key for key in unknown if key[0] == layout]
         chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
-        kept, settings = artefacts / f".{layout}.teammates.json", _settings(layout, chosen)
+        kept = artefacts / f".{layout}.teammates.json"
+        settings = software_versions() | {
+            "version": version("icrl4aht-data"),
+            "layout": layout,
+            "teammates": [task.teammate for task in chosen],
+            "episodes": REFERENCE_EPISODES,
+        }
         measure = partial(_measure, get_layout(layout), chosen, suite, headroom)
         measured = measured_once(kept, settings, list[TeammateFacts], measure)
         found |= dict(zip(keys, measured, strict=True))
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
 
 
+def release_provenance(root: Path) -> dict[str, Provenance]:
+    """Return the provenance of a release by task id; empty if the folder is not a release."""
+    path = root / PROVENANCE
+    return read_provenance(path) if path.is_file() else {}
+
+
 def recorded_provenance(suite: Path) -> dict[str, Provenance]:
     """Return the provenance of the release whose teammates a suite is, by task id; empty for a profile's suite."""
-    path = suite.parent / PROVENANCE
-    return read_provenance(path) if suite.name == TEAMMATES and path.is_file() else {}
-
-
-def _settings(layout: str, tasks: Sequence[Task]) -> dict[str, Any]:
-    """Return the settings that measurements depend on."""
-    known = {"layout": layout, "teammates": [task.teammate for task in tasks], "episodes": REFERENCE_EPISODES}
-    return software_versions() | {"version": version("icrl4aht-data")} | known
+    return release_provenance(suite.parent) if suite.name == TEAMMATES else {}
 
 
 def _facts_of_draw(draw: Draw) -> TeammateFacts:

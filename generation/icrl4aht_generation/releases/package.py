@@ -18,8 +18,8 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
 from icrl4aht_data.format.info import LeftOutTask
-from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite, read_provenance
-from icrl4aht_data.format.schema import PROVENANCE, Kind, episode_ends
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
+from icrl4aht_data.format.schema import Kind, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
 from icrl4aht_data.writing.card import CURVES_FIGURE
@@ -36,7 +36,13 @@ from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.releases.histories import TaskHistories, select_histories
 from icrl4aht_generation.releases.labeller import choose_labeller
-from icrl4aht_generation.releases.measures import TeammateFacts, recorded_provenance, teammate_facts, unhosted_families
+from icrl4aht_generation.releases.measures import (
+    TeammateFacts,
+    recorded_provenance,
+    release_provenance,
+    teammate_facts,
+    unhosted_families,
+)
 
 
 def package_release(
@@ -71,7 +77,9 @@ def package_release(
         OptionError: if something else is at `target`, see `check_release_folder`, or no task has histories to keep.
     """
     check_release_folder(target, profile)
-    tasks = _by_task(works)
+    tasks: dict[str, list[Work]] = {}
+    for work in works:
+        tasks.setdefault(work.task.task_id, []).append(work)
     if facts is None:
         facts = teammate_facts((members[0].task for members in tasks.values()), artefacts, suite)
     headroom = {members[0].task.layout.name for task_id, members in tasks.items() if facts[task_id].matters}
@@ -101,14 +109,6 @@ def package_release(
         )
 
 
-def _by_task(works: Sequence[Work]) -> dict[str, list[Work]]:
-    """Return the units of work by task id."""
-    tasks: dict[str, list[Work]] = {}
-    for work in works:
-        tasks.setdefault(work.task.task_id, []).append(work)
-    return tasks
-
-
 def check_release_folder(target: Path, profile: Profile) -> None:
     """Check that nothing is at `target` but an unchanged release that was made with this profile.
 
@@ -117,8 +117,7 @@ def check_release_folder(target: Path, profile: Profile) -> None:
     """
     if not check_target(target, overwrite=True):
         return
-    path = target / PROVENANCE
-    profiles = {of_task.profile for of_task in read_provenance(path).values()} if path.is_file() else set()
+    profiles = {of_task.profile for of_task in release_provenance(target).values()}
     if profiles != {profile.name}:
         made = ", ".join(sorted(map(str, profiles - {None}))) or "no known profile"
         raise OptionError(
@@ -136,9 +135,7 @@ def bundle_release(release: Path) -> Path:
 
 def recorded_sources(release: Path) -> dict[str, str]:
     """Return the source of each task id from a release's provenance; empty if the folder is not a release."""
-    path = release / PROVENANCE
-    recorded = read_provenance(path) if path.is_file() else {}
-    return {task_id: made.source or "ppo" for task_id, made in recorded.items()}
+    return {task_id: made.source or "ppo" for task_id, made in release_provenance(release).items()}
 
 
 def _populations(task: Task, profile: Profile, suite: Path, recorded: Mapping[str, Provenance]) -> TeammateSuite | None:
@@ -222,10 +219,9 @@ def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: P
     def load() -> Iterator[NewHistory]:
         network, params, _ = load_policy(labeller.folder)
         for learner, stream, arrays in _recorded_histories(found):
-            (labels,) = relabel(task.layout, network, params, [arrays["state"]])
-            wanted = {"expert_actions": labels}
+            wanted = {"expert_actions": relabel(task.layout, network, params, arrays["state"])}
             if profile.oracle_actions:
-                (wanted["oracle_actions"],) = oracle_labels(task.layout, [arrays["state"]], [arrays["actions"]])
+                wanted["oracle_actions"] = oracle_labels(task.layout, arrays["state"], arrays["actions"])
             yield NewHistory(stream, arrays | wanted, learner)
 
     policies = expert_files(labeller.folder, labeller.sha256) if profile.policies else {}

@@ -12,7 +12,6 @@ import socket
 import struct
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -238,21 +237,6 @@ class TestFolder:
         with pytest.raises(OptionError, match="a file is where a folder is needed"):
             trained(tmp_path / "notes.txt")
 
-    @pytest.mark.parametrize(
-        ("stored", "asked", "refused"),
-        [
-            ({"layers": 1, "gone": False}, {"layers": 1}, None),  # a removed option that was not used
-            ({"layers": 1, "gone": True}, {"layers": 1}, r"model\.gone: the run has True, expected None"),
-            ({"layers": 1}, {"layers": 1, "width": 256}, None),  # a newer option with its default value
-            ({"layers": 1}, {"layers": 1, "width": 64}, r"model\.width: the run has 256, expected 64"),
-        ],
-    )
-    def test_runs_of_other_versions(self, through, tmp_path, stored, asked, refused):
-        shutil.copytree(through[0] / CHECKPOINTS, tmp_path / CHECKPOINTS)
-        (tmp_path / "config.json").write_text(json.dumps({**format_versions(), "model": stored}))
-        with pytest.raises(OptionError, match=refused) if refused else nullcontext():
-            open_run(tmp_path, {**format_versions(), "model": asked})
-
 
 class TestStep:
     @pytest.mark.slow
@@ -278,14 +262,6 @@ class TestStep:
         rates = [np.asarray(schedule(t)) for t in (0, 3, 5, 50, 100)]
         cosine = 1e-3 * (1 + np.cos(np.pi * (50 - 5) / 95)) / 2
         np.testing.assert_allclose(rates, [0.0, 6e-4, 1e-3, cosine, 0.0], rtol=1e-5, atol=1e-9)
-
-    def test_gradients_are_clipped(self):
-        optimizer = training_optimizer(dataclasses.replace(OPTIONS, clip=1.0, warmup=0.0))
-        params = {"w": jnp.zeros(4)}
-        for scale in (1e3, 1e6):
-            _, state = optimizer.update({"w": scale * jnp.ones(4)}, optimizer.init(params), params)
-            mean = np.asarray(jax.tree.leaves(state)[1])
-            np.testing.assert_allclose(np.linalg.norm(mean), 0.1, rtol=1e-5)  # (1 - b1) of norm 1
 
     def test_batches_that_cannot_be_divided(self):
         with pytest.raises(OptionError, match="batch_size = 4: expected a multiple of 3, 1 devices x 3 parts"):
@@ -340,30 +316,6 @@ class TestHeldOut:
         assert (len(split.train), len(split.histories)) == (4, 1)
         with pytest.raises(OptionError, match=r"every task of .* has one history: expected a task with two"):
             hold_out(dataset[3:5])
-
-    def test_a_teammate_of_both_sources_is_in_one_part(self, tmp_path, monkeypatch):
-        """Tasks of two sources have different ids even with one teammate."""
-        random_release(tmp_path / "r", layouts=("demo_wide",), teammates=4, streams=4, episodes=2)
-        dataset = load_icrl4aht(tmp_path / "r", obs="state")
-        mates = {name: f"mate {number % 2}" for number, name in enumerate(dataset.index.values("task_id"))}
-        monkeypatch.setattr(
-            dataset_module, "teammate_ids", lambda dataset, ids: [mates[dataset.index.entry(ids[0]).task_id]]
-        )
-        for seed in range(5):
-            split = hold_out(dataset, 0.3, seed)
-            assert split.teammates is not None
-            assert [len(part) for part in split if part is not None] == [6, 2, 8]
-            train, held, others = ({mates[n] for n in part.column("task_id").tolist()} for part in split if part)
-            assert held <= train
-            assert not train & others
-
-    def test_every_task_keeps_a_history(self, two_sources):
-        """A large share holds out all but one history; a small one affects some tasks only."""
-        dataset = load_icrl4aht(two_sources[0], source="noise", split="train", layout="demo_wide")
-        for share, held in ((0.9, 4), (0.5, 3), (0.01, 1)):
-            split = hold_out(dataset, share, validation=dataset[:1])
-            assert (len(split.train), len(split.histories)) == (6 - held, held)
-            assert len(set(split.train.column("task_id").tolist())) == 2
 
     def test_labels(self, two_sources):
         def job(method: str, **choice: Any) -> Any:
@@ -435,12 +387,12 @@ class TestHeldOut:
     @pytest.mark.parametrize(
         ("method", "context", "choice", "message"),
         [
-            ("ad", 121, {}, r"context = 121: the shortest history of .* has 120 steps; take fewer, or choose --source"),
-            ("dpt", 121, {}, r"context = 121: the shortest history of .* has 120 steps; take fewer"),
-            ("ad", 41, {"every": 3}, "context = 41, every = 3: every 3-th of the 6 episodes .* are 40 steps"),
+            ("ad", 121, {}, r"context = 121: with every = 1 .* history of .* has 120 steps for a window"),
+            ("dpt", 121, {}, r"context = 121: the shortest history has \d+ transitions; take fewer"),
+            ("ad", 41, {"every": 3}, "context = 41: with every = 3 and .* has 40 steps"),
             ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts of one part"),
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
-            ("ad", 40, {"curriculum": 0.5}, r"context = 40, curriculum = 0\.5: it begins with 30 steps"),
+            ("ad", 40, {"curriculum": 0.5}, r"context = 40: .* curriculum = 0\.5, .* has 30 steps"),
             ("amago_offline", 7, {"labels": "expert"}, "amago_offline learns from the histories' own actions"),
             ("ad", 7, {"layouts": ("demo_wide", "coord_simple"), "channels": "own"}, "channels = own: .*: leave out"),
             ("rl2", 7, {}, "rl2 learns by playing, not from histories"),

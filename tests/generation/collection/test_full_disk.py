@@ -6,18 +6,16 @@ import errno
 import json
 import os
 import shutil
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from icrl4aht_generation.collection import failures
-from icrl4aht_generation.collection.failures import FailureLog
-from icrl4aht_generation.collection.job import TaskOutcome
+from icrl4aht_generation.collection import job
+from icrl4aht_generation.collection.job import FailureLog, TaskOutcome
 from icrl4aht_generation.collection.record import array_shapes
 from icrl4aht_generation.collection.task import run_task
 from icrl4aht_generation.collection.task_folder import LEARNER, ArtefactWriter, DiskFullError, partial_folder
-from icrl4aht_generation.learners.resume import RunLog, StateFile
+from icrl4aht_generation.learners.resume import StateFile
 from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_generation.profiles.work import Work
 
@@ -82,22 +80,13 @@ def test_a_full_disk_keeps_the_saved_state(task: Given, tmp_path):
     assert StateFile(partial_folder(tmp_path / "task") / LEARNER).progress == 6
 
 
-def test_a_log_on_a_full_disk_is_an_error_once(tmp_path):
-    log = RunLog(tmp_path, lambda line: True)
-    log._metrics.close()
-    log._metrics = Path("/dev/full").open("a", encoding="utf-8")  # noqa: SIM115  `close` closes it
-    with pytest.raises(OSError, match="No space left"):
-        log.write({"update": 0})
-    log.close()
-
-
 def test_failures_wait_for_room(task, tmp_path, monkeypatch):
     def full(path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     log, outcome = FailureLog(tmp_path / "failed.jsonl"), TaskOutcome(task[0], "failed", 1, "DiskFullError: no room")
     with monkeypatch.context() as patch:
-        patch.setattr(failures, "atomic_write", full)
+        patch.setattr(job, "atomic_write", full)
         log.add(outcome)
         assert not log.is_written
     log.forget(["another"])

@@ -114,8 +114,8 @@ def test_actions_are_the_oracles_except_for_noise(arrays):
 
 
 def test_labels_are_those_of_an_oracle_that_watches_the_episode(arrays):
-    found = list(oracle_labels(LAYOUT, arrays["state"], arrays["actions"]))
-    np.testing.assert_array_equal(np.stack(found), arrays["oracle_actions"])
+    found = [oracle_labels(LAYOUT, *one) for one in zip(arrays["state"], arrays["actions"], strict=True)]
+    np.testing.assert_array_equal(found, arrays["oracle_actions"])
 
 
 def test_an_episode_is_a_function_of_its_numbers(arrays):

@@ -202,7 +202,7 @@ def labelled():
             rows.append(np.asarray(out[1][0]))
         return np.stack(rows, axis=1)
 
-    labels = list(curate.relabel(LAYOUT, network, params, states))
+    labels = [curate.relabel(LAYOUT, network, params, stream) for stream in states]
     ways = {"episode": {0, 100}, "step": set(range(200)), "never": {0}}
     return labels, {name: logits_with_memory_from(starts) for name, starts in ways.items()}
 
@@ -240,7 +240,7 @@ def test_oracle_labels_are_what_the_oracle_does():
     played = play(jax.random.key(1))
     states, taken = (np.asarray(array).swapaxes(0, 1) for array in (played.record, played.actions[..., EGO]))
     assert len(np.unique(taken)) == 6
-    labels = list(curate.oracle_labels(LAYOUT, states, taken.astype(np.int8)))
+    labels = [curate.oracle_labels(LAYOUT, *one) for one in zip(states, taken.astype(np.int8), strict=True)]
     assert [(label.shape, label.dtype) for label in labels] == [((200,), np.int8)] * envs
     np.testing.assert_array_equal(labels, taken)
 
@@ -253,6 +253,6 @@ def test_oracle_labels_follow_the_actions_that_the_ego_took():
     (record,) = start(LAYOUT, np.array([cells], np.uint8), np.zeros((1, 2), np.uint8), LAYOUT.recipe_items[:1])
     states = np.broadcast_to(record, (2, 200, len(record)))
     actions = np.repeat([[free], [STAY]], 200, axis=1).astype(np.int8)
-    moves, stays = curate.oracle_labels(LAYOUT, states, actions)
+    moves, stays = (curate.oracle_labels(LAYOUT, *one) for one in zip(states, actions, strict=True))
     assert moves[0] == stays[0] != STAY
     assert moves[1] == STAY != stays[1]

@@ -14,8 +14,7 @@ from types import SimpleNamespace
 import psutil
 import pytest
 from icrl4aht_generation.collection import job
-from icrl4aht_generation.collection.board import TaskBoard
-from icrl4aht_generation.collection.job import CollectionError
+from icrl4aht_generation.collection.job import CollectionError, TaskBoard
 from icrl4aht_generation.collection.options import CollectOptions
 from icrl4aht_generation.collection.run import collect_tasks
 from icrl4aht_generation.collection.task_folder import LEARNER, partial_folder

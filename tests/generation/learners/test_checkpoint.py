@@ -42,18 +42,6 @@ def test_rows_of_zeros_take_no_space(policy, tmp_path):
     assert (tmp_path / "p" / POLICY_WEIGHTS).stat().st_size < full / 3
 
 
-def test_complete_matrices_are_read_too(policy, tmp_path):
-    """Checkpoints of earlier versions, with rows of zeros, are read."""
-    network, params = policy
-    save_policy(tmp_path / "p", network, params, {})
-    path = tmp_path / "p" / POLICY_WEIGHTS
-    name, stored = flat_kernel(tmp_path / "p"), load_file(path)
-    complete = np.zeros(json.loads((tmp_path / "p" / POLICY_CARD).read_text())["shapes"][name], np.float32)
-    complete[stored.pop(f"{name}@rows")] = stored[name]
-    save_file(stored | {name: complete}, path)
-    assert equal(load_policy(tmp_path / "p")[1], params)
-
-
 @pytest.mark.parametrize(
     "change",
     [

@@ -99,13 +99,6 @@ def test_what_the_rules_exclude_is_not_a_number():
     assert np.argwhere(wrong).tolist() == [[1, 4]]
 
 
-@pytest.mark.parametrize(("kind", "other"), [("paper", "mlp"), ("mlp", "words")])
-def test_an_input_of_another_encoder_is_refused(kind, other):
-    seen = CompactView(other, (LAYOUT,))(jnp.asarray(RECORDS))
-    with pytest.raises(TypeError, match=f"encoder {kind}: expected observations or"):
-        encoder(kind, CompactView(kind, (LAYOUT,))).init(jax.random.key(0), seen)
-
-
 def test_widths_name_the_encoder():
     assert Widths() == Widths(encoder="paper")
     flat = replace(Widths(), encoder="mlp")

@@ -105,11 +105,6 @@ def small() -> Case:
     return make_case(Widths(pointwise=(6,), spatial=(3, 5), dense=11, gru=7, head=9))
 
 
-@pytest.fixture(scope="module")
-def apply(small):
-    return jax.jit(small.network.apply)
-
-
 def assert_close(found: Any, expected: Any, what: str = "") -> None:
     """Compare arrays, to `TOLERANCE` times the largest value."""
     size = np.abs(np.asarray(expected)).max()
@@ -149,18 +144,6 @@ def test_outputs_and_gradients_equal_the_plain_form(which, request):
     for (path, expected), leaf in zip(jax.tree.leaves_with_path(plain_gradient), jax.tree.leaves(found), strict=True):
         assert_close(leaf, expected, jax.tree_util.keystr(path))
     assert_close(to_hidden, plain_to_hidden)
-
-
-def test_a_sequence_with_a_reset_equals_two_sequences(small, apply):
-    cut = 2
-    none = jnp.zeros_like(small.reset)
-    hidden, logits, values = apply(small.params, small.hidden, small.obs, none.at[cut].set(True))
-    _, first_logits, first_values = apply(small.params, small.hidden, small.obs[:cut], none[:cut])
-    zero = small.network.initial_hidden(ENVS)
-    last, second_logits, second_values = apply(small.params, zero, small.obs[cut:], none[cut:])
-    np.testing.assert_allclose(logits, np.concatenate([first_logits, second_logits]), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(values, np.concatenate([first_values, second_values]), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(hidden, last, rtol=0, atol=1e-6)
 
 
 def test_initial_weights(small):

@@ -29,7 +29,7 @@ from icrl4aht_generation.learners.ppo import (
 from icrl4aht_generation.learners.rollout import Choice, Rollout
 from icrl4aht_generation.policy import Policy
 
-from icrl4aht_data.overcooked.actions import EGO, INTERACT, TEAMMATE
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.trees import same_bytes
@@ -94,13 +94,6 @@ def frozen(untrained) -> LearnerState:
     params = jax.tree.map(lambda w: w + rng.normal(size=w.shape).astype(np.float32) * 0.3, untrained.params)
     steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
     return untrained._replace(params=params, optimizer=counted(untrained.optimizer, steps))
-
-
-@pytest.fixture(scope="module")
-def learning(frozen) -> LearnerState:
-    """Return a learner in the middle of its schedule; otherwise equal to `frozen`."""
-    steps = CONFIG.updates * CONFIG.epochs * CONFIG.minibatches
-    return frozen._replace(optimizer=counted(frozen.optimizer, steps // 2))
 
 
 def counted(optimizer: Any, steps: int) -> Any:
@@ -272,17 +265,6 @@ def test_update_is_a_pure_function(update, played):
 # Episodes.
 
 
-def test_the_ego_is_scored_by_its_own_shaped_rewards(played):
-    """The scripted teammate only walks, so every shaped reward is the ego's; all are placements."""
-    joint = joined(played.rollouts)
-    assert joint.shaped.shape == (*joint.done.shape, 2)
-    assert set(np.unique(joint.shaped[..., EGO])) == {0, 3}
-    acted = joint.actions[..., EGO] == INTERACT
-    assert acted[joint.shaped[..., EGO] > 0].all()
-    assert (joint.actions[..., TEAMMATE] != INTERACT).all()
-    assert not joint.shaped[..., TEAMMATE].any()
-
-
 def test_the_teammates_parameters_are_in_the_state(update, frozen, played):
     """One compiled update serves every teammate of a family."""
     state, rollout, _ = update(frozen._replace(teammate={"turn": jnp.uint32(1)}))
@@ -319,22 +301,6 @@ def test_learning_rate_schedule():
     assert rates[0] == 0
     assert rates.argmax() == warm
     assert rates[-1] == 0
-
-
-def test_gradients_are_clipped_by_their_global_norm():
-    """Adam forgets the scale of its gradients but not their proportions: after one too large the next, at the bound,
-    moves as much as if both had been at the bound."""
-    bound = CONFIG.max_grad_norm
-    directions = {"a": jnp.float32(0.6), "b": jnp.float32(-0.8)}
-
-    def second(first: float) -> list[float]:
-        state = ppo_optimizer(CONFIG).init(directions)
-        for size in (first, bound):
-            change, state = ppo_optimizer(CONFIG).update(jax.tree.map(lambda x, s=size: x * s, directions), state)
-        return [float(x) for x in jax.tree.leaves(change)]
-
-    np.testing.assert_allclose(second(100.0), second(bound), rtol=1e-5)
-    assert abs(second(0.1 * bound)[0] / second(bound)[0] - 1) > 0.05
 
 
 # Configuration.

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -206,13 +207,13 @@ def test_checkpoints_keep_the_latest(tmp_path):
 
 
 def test_the_log_is_cut_after_what_was_saved(tmp_path):
-    with RunLog(tmp_path, lambda line: False) as log:
+    with closing(RunLog(tmp_path, lambda line: False)) as log:
         for update in range(4):
             log.write({"update": update}, {"update": update, "part": "b"}, timing={"update": update})
         log.sync()
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"update": 4, "half a li')
-    with RunLog(tmp_path, lambda line: line["update"] < 2) as log:
+    with closing(RunLog(tmp_path, lambda line: line["update"] < 2)) as log:
         log.write({"update": 2})
     metrics, timing = ((tmp_path / name).read_text().splitlines() for name in ("metrics.jsonl", "timing.jsonl"))
     assert [json.loads(line)["update"] for line in metrics] == [0, 0, 1, 1, 2]

@@ -47,9 +47,3 @@ def test_a_wrong_delivery_is_forgiven_as_long_as_rewards_are_shaped():
         )
         expected = REWARDS + np.array([forgiven] * 3 + [0] * 5, np.float32)
         np.testing.assert_allclose(found.reward, expected[:, None] + weight * (agents + 1), atol=1e-5)
-
-
-def test_nothing_is_forgiven_by_default():
-    view, slots = lambda records: records, np.arange(2)
-    found = sequences(view, rollout(), 0, slots, jnp.zeros((2, 8)), jnp.zeros(2), jnp.float32(1))  # type: ignore[arg-type]
-    np.testing.assert_allclose(found.reward, np.tile(REWARDS[:, None] + 1, (1, 2)))

@@ -48,7 +48,6 @@ from tests.helpers.paths import ROOT
 from tests.helpers.xla_flags import add_xla_flag
 
 LAYOUT = get_layout("cramped_up")
-"""Seed of the moment at which a run is killed."""
 SMOKE = load_profile("smoke").teammates
 EACH_ALGORITHM = pytest.mark.parametrize(
     "algorithm", ["lbrdiv", *(pytest.param(name, marks=pytest.mark.slow) for name in ALGORITHMS if name != "lbrdiv")]
@@ -151,7 +150,7 @@ def test_a_cards_return_is_that_checkpoints_own(trained):
     members = stacked([params for _, params, _ in loaded])
     responses = stacked([load_policy(folder / f"responses/m{m}")[1] for m in range(2)])
     for name, greedy in (("return", False), ("teammate_return", True)):
-        returns = cross_play.paired_returns(LAYOUT, loaded[0][0], responses, members, greedy=greedy)
+        returns = cross_play.cross_play_returns(LAYOUT, loaded[0][0], responses, members, greedy=greedy, paired=True)
         assert [card[name] for _, _, card in loaded] == returns.tolist()
 
 

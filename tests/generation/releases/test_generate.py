@@ -33,7 +33,6 @@ from icrl4aht_data.format.provenance import NearestTest
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.tiny import LEARNED, TINY, artefact
 
@@ -87,22 +86,6 @@ def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
     shutil.copy(tmp_path / "copy/checkpoints/c1/policy.json", tmp_path / "copy/checkpoints/c0/policy.json")
     profile = load_profile(str(built / "tiny.toml"))
     assert not artefacts.is_task_finished(tmp_path / "copy", profile.works()[0], profile)
-
-
-def test_an_artefact_of_an_earlier_version_is_made_again(built, tmp_path):
-    """Earlier artefacts had no folder of checkpoints."""
-    profile = load_profile(str(built / "tiny.toml"))
-    folder = tmp_path / "copy"
-    shutil.copytree(artefact(built / "a"), folder)
-    for name in ("policy.safetensors", "policy.json"):
-        (folder / "checkpoints/c4" / name).rename(folder / name)
-    shutil.rmtree(folder / "checkpoints")
-    metadata = json.loads((folder / METADATA).read_text())
-    del metadata["checkpoint_updates"]
-    names = [path.name for path in folder.glob("*.npy")] + ["metrics.jsonl", "policy.safetensors", "policy.json"]
-    metadata["files"] = {name: file_hash(folder / name) for name in names}
-    (folder / METADATA).write_text(json.dumps(metadata))
-    assert not artefacts.is_task_finished(folder, profile.works()[0], profile)
 
 
 def test_damaged_or_different_artefacts_are_unfinished(built, tmp_path):

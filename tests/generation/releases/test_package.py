@@ -112,10 +112,8 @@ def test_streams_of_both_learners_that_rise_are_kept(two_learners, profile, tmp_
     assert made.filter.before.return_end == pytest.approx((10 + 4 + 20 + 15 + 3 + 25) / 16, abs=1e-3)
     assert made.expert is not None
     assert made.expert.return_greedy == 7.0  # of the learner whose labeller earns more
-    states = [history.state[:] for history in dataset]
-    actions = [history.actions[:] for history in dataset]
-    labels = oracle_labels(LAYOUTS["demo_wide"], states, [taken.astype(np.int8) for taken in actions])
-    for history, wanted in zip(dataset, labels, strict=True):
+    for history in dataset:
+        wanted = oracle_labels(LAYOUTS["demo_wide"], history.state[:], history.actions[:].astype(np.int8))
         assert history.entry.has_oracle_actions
         np.testing.assert_array_equal(history.read("oracle_actions"), wanted)
     card = (root / "README.md").read_text()

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from icrl4aht_generation.learners.population.population import Assignment
+from icrl4aht_generation.learners.population.population import Algorithm, Assignment
 
 
 def pairs_assignment(members: int, environments: int) -> Assignment:
@@ -45,7 +45,7 @@ def pairs_assignment(members: int, environments: int) -> Assignment:
 
 
 @dataclass(frozen=True)
-class BRDiv:
+class BRDiv(Algorithm):
     """L(pi_k) = -w_SP J(pi_k, BR_k) + w_XP sum_{j != k} J(pi_k, BR_j), with w_SP = 1 + 2 w_XP (paper, App. B.1, BRDiv
     "Training Objective"); best responses maximize their return with their own confederate only.
 
@@ -60,14 +60,8 @@ class BRDiv:
     def assignment(self, environments: int) -> Assignment:
         return pairs_assignment(self.members, environments)
 
-    def init(self) -> Any:
-        return ()
-
     def weights(self, memory: Any) -> Float[Array, " terms"]:
         own = np.eye(self.members)
         # A best response learns nothing from another confederate: it has to be the best one to its own.
         confederates = own * (1 + 2 * self.cross_play_weight) - (1 - own) * self.cross_play_weight
         return jnp.asarray(np.concatenate([confederates.ravel(), own.ravel()]), jnp.float32)
-
-    def adapt(self, memory: Any, returns, seen) -> Any:
-        return memory

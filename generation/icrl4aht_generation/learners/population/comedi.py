@@ -21,13 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from icrl4aht_generation.learners.population.population import Assignment
+from icrl4aht_generation.learners.population.population import Algorithm, Assignment
 
 _SP, _XP, _MP_SELF, _MP_FROZEN = range(4)
 
 
 @dataclass(frozen=True)
-class CoMeDi:
+class CoMeDi(Algorithm):
     """L = -J_SP + alpha J_XP - beta J_MP (paper, App. B.1, CoMeDi "Training Objective"), where the partner of J_MP is
     the new member or the frozen one, each in half of the episodes.
 
@@ -65,13 +65,7 @@ class CoMeDi:
             starts_from=np.concatenate([np.full(3 * quarter, -1), 2 * quarter + np.arange(quarter)]),
         )
 
-    def init(self) -> Any:
-        return ()
-
     def weights(self, memory: Any) -> Float[Array, " terms"]:
         # Two terms of half the weight each, though the frozen member's is sampled by half as many slots.
         half = self.mixed_play_weight / 2
         return jnp.array([1.0, -self.cross_play_weight, half, half])
-
-    def adapt(self, memory: Any, returns, seen) -> Any:
-        return memory

@@ -11,11 +11,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from icrl4aht_generation.learners.population.population import Assignment
+from icrl4aht_generation.learners.population.population import Algorithm, Assignment
 
 
 @dataclass(frozen=True)
-class FCP:
+class FCP(Algorithm):
     """Fictitious co-play: each member plays with itself.
 
     Attributes:
@@ -31,11 +31,5 @@ class FCP:
         both = np.stack([member, member])
         return Assignment(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
 
-    def init(self) -> Any:
-        return ()
-
     def weights(self, memory: Any):
         return jnp.ones(self.members)
-
-    def adapt(self, memory: Any, returns, seen) -> Any:
-        return memory

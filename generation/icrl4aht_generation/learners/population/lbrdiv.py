@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from icrl4aht_generation.learners.population.brdiv import pairs_assignment
-from icrl4aht_generation.learners.population.population import Assignment
+from icrl4aht_generation.learners.population.population import Algorithm, Assignment
 
 _SELF_PLAY = 0.5  # fixed multiplier on the diagonals: a member's own self-play has the weight 1 in all
 
@@ -34,7 +34,7 @@ class Multipliers(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LBRDiv:
+class LBRDiv(Algorithm):
     """Maximise sum_i J(pi_i, BR_i) under J(pi_i, BR_i) >= J(pi_j, BR_i) + eps and J(pi_i, BR_i) >= J(pi_i, BR_j) + eps
     (paper, App. B.1, LBRDiv).
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -77,20 +77,20 @@ class Assignment(NamedTuple):
         return self.group[self.policy[0]] == self.group[self.policy[1]]
 
 
-class Algorithm(Protocol):
-    """Interface of the population algorithms. `memory` is a pytree of the algorithm, such as multipliers."""
+class Algorithm:
+    """Base class of the population algorithms. `memory` is a pytree of the algorithm, such as multipliers."""
 
     def assignment(self, environments: int) -> Assignment:
         """Return the pairing of policies, with this number of environments per member."""
-        ...
+        raise NotImplementedError
 
     def init(self) -> Any:
         """Return the memory before the first update."""
-        ...
+        return ()
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
         """Return the weight of each term in the objective that is maximized; negative to minimize a return."""
-        ...
+        raise NotImplementedError
 
     def adapt(self, memory: Any, returns: Float[Array, "P P"], seen: Bool[Array, "P P"]) -> Any:
         """Return the memory after an update.
@@ -101,7 +101,7 @@ class Algorithm(Protocol):
                 as the teammate.
             seen: whether there was such an episode.
         """
-        ...
+        return memory
 
 
 class PolicyGroup(NamedTuple):
