@@ -264,7 +264,7 @@ H3 = 'families = ["assembly_line"]'
         ("presets =", f"sampled = {{ {H3} }}\npresets =", "per_layout"),
         ("presets =", f"sampled = {{ {H3}, per_layout = 1, validation = 1 }}\npresets =", "validation"),
         ("total_steps = 32000", "total_steps = 13500", "total_steps"),
-        ("[ego]", "[ego", "TOML"),
+        ("[ego]", "[ego", r"Expected '\]' at the end of a table declaration \(at line 2"),
     ],
 )
 def test_faults_are_named_with_the_file(changed, old, new, named):

@@ -29,8 +29,8 @@ ACTING: tuple[Acting, ...] = ("cached", "exact")
 
 `exact` computes the complete context again at every step, as the paper's rolling buffer does. `cached` keeps the keys
 and values of each step. When the window of AD, Hybrid-AD or AMAGO-Offline is full, its oldest fifth is dropped and the
-rest is computed again: the window has between 4/5 K and K steps. The context of DPT changes only when an episode ends;
-`cached` computes it once for each episode, and acts exactly as `exact` does."""
+rest is computed again: the window has between 4/5 K and K steps. The context of DPT changes only when an episode ends,
+so both compute it once for each episode."""
 
 FORGETS = " (forgets)"
 """End of the name of an agent whose memory is cleared at the start of each episode."""

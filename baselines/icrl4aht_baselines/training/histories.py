@@ -86,7 +86,12 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     hidden = [get_layout(one).name for one in histories.hide_recipe]
     view, canonical = _view(dataset, histories.mirror, hidden), dataset.channels == "canonical"
     method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, view, canonical))
-    labels = _labels_of(method, histories.labels)
+    labels: Labels | None = histories.labels or ("expert" if method.data == "dpt" else None)
+    if labels is not None and not method.takes_labels:
+        raise OptionError(
+            f"labels = {labels}: {name} learns from the histories' own actions and rewards; leave out --labels, or "
+            f"train another method"
+        )
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
         part: number_layouts(
@@ -137,18 +142,6 @@ def _view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | 
     if changed:
         return changed_view(dataset.layouts, hidden)
     return None if dataset.obs == "state" else plain_view
-
-
-def _labels_of(method: Method, wanted: Labels | None) -> Labels | None:
-    """Return the labels that a method learns from, or None for one that learns from the histories' own actions."""
-    if method.data == "dpt":
-        return wanted or "expert"
-    if wanted is not None and not method.takes_labels:
-        raise OptionError(
-            f"labels = {wanted}: {method.name} learns from the histories' own actions and rewards; leave out --labels, "
-            f"or train another method"
-        )
-    return wanted
 
 
 def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:

@@ -73,9 +73,9 @@ def check_integers(
         OptionError: for anything else.
     """
     found = np.asarray(value)
-    fits = found.ndim == 1 if shape is None else found.shape == shape
     numeric = found.dtype.kind in "iu" and found.size > 0
-    if not fits or not (numeric or found.size == 0) or (numeric and not 0 <= found.min() <= found.max() <= highest):
+    fits = (found.ndim == 1 if shape is None else found.shape == shape) and (numeric or found.size == 0)
+    if not fits or (numeric and not 0 <= found.min() <= found.max() <= highest):
         values = f" and values {found.min()}..{found.max()}" if numeric else ""
         wanted = "(n,)" if shape is None else shape
         raise OptionError(

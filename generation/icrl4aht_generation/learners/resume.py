@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -245,8 +246,7 @@ class Checkpoints:
     @property
     def latest(self) -> int | None:
         """Step of the last checkpoint; None if there is none."""
-        steps = self.steps
-        return steps[-1] if steps else None
+        return max(self.steps, default=None)
 
     def at(self, step: int) -> StateFile:
         """Return the checkpoint of a step."""
@@ -313,10 +313,10 @@ class RunLog:
 
 def _cut(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
     lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
-    kept = next((number for number, line in enumerate(lines) if not _is_kept(line, keep)), len(lines))
-    if kept < len(lines):
+    kept = list(takewhile(lambda line: _is_kept(line, keep), lines))
+    if kept != lines:
         with atomic_write(path) as partial:
-            partial.write_bytes(b"".join(lines[:kept]))
+            partial.write_bytes(b"".join(kept))
 
 
 def _is_kept(line: bytes, keep: Callable[[dict[str, Any]], bool]) -> bool:

@@ -122,11 +122,6 @@ class PopulationRun:
             "code_version": version("icrl4aht-data"),
         }
 
-    @property
-    def settings_hash(self) -> str:
-        """Hash of the settings."""
-        return json_hash(self.settings)
-
     @cached_property
     def stages(self) -> list[Population]:
         """The stages of training, one after the other; CoMeDi trains one policy in each, the first by self-play."""
@@ -166,7 +161,7 @@ def is_population_finished(folder: Path, run: PopulationRun) -> bool:
     """Return whether a folder has this population under these settings, with all its files unchanged."""
     record = read_record(folder)
     try:
-        return record["settings_hash"] == run.settings_hash and hashes_hold(folder, record["files"])
+        return record["settings_hash"] == json_hash(run.settings) and hashes_hold(folder, record["files"])
     except (OSError, KeyError, TypeError):
         return False
 
@@ -328,7 +323,7 @@ class _PopulationTraining:
             for path in sorted(self.folder.rglob(name))
         }
         content = {
-            "settings_hash": self.run.settings_hash,
+            "settings_hash": json_hash(self.run.settings),
             "settings": self.run.settings,
             "software": software_versions(),
             "files": files,

@@ -102,10 +102,8 @@ def _named_errors(path: Path) -> Iterator[None]:
     """Name the file in errors about its content."""
     try:
         yield
-    except (ValueError, msgspec.ValidationError) as error:
+    except ValueError as error:  # also of msgspec, and of the parser of TOML
         raise OptionError(f"{path}: {error}") from error
-    except msgspec.DecodeError as error:
-        raise OptionError(f"{path}: not TOML: {error}") from error
 
 
 def _profile(name: str, content: _ProfileFile) -> Profile:

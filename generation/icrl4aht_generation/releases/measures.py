@@ -126,19 +126,11 @@ def _measure(
         for k, task in enumerate(heuristics):
             stay, random, oracle = (float(egos[ego][k]) for ego in ("stay", "random", "oracle"))
             returns[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES)
-    nearest = _nearest(layout, learned, suite)
+    nearest: dict[str, NearestTest] = {}
+    if learned and layout.name in TESTED_ON:  # other layouts have no test teammates
+        for task, near in zip(learned, nearest_test(layout, [_build(task, suite) for task in learned]), strict=True):
+            nearest[task.task_id] = NearestTest(near.teammate, round(near.distance, _DIGITS), near.behaviour)
     return [TeammateFacts(returns[task.task_id], nearest.get(task.task_id)) for task in tasks]
-
-
-def _nearest(layout: Layout, tasks: Sequence[Task], suite: Path) -> dict[str, NearestTest]:
-    """Return the nearest test teammate by task id; empty on layouts without training tasks."""
-    if not tasks or layout.name not in TESTED_ON:
-        return {}
-    near = nearest_test(layout, [_build(task, suite) for task in tasks])
-    return {
-        task.task_id: NearestTest(found.teammate, round(found.distance, _DIGITS), found.behaviour)
-        for task, found in zip(tasks, near, strict=True)
-    }
 
 
 def _build(task: Task, suite: Path) -> Any:
