@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
 
 from icrl4aht_baselines.agents.egos import AGENTS, find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
-from icrl4aht_baselines.plotting import plot_family_curves
+from icrl4aht_baselines.plotting import plot_return_curves
 from icrl4aht_baselines.report.page import write_page_with_episodes
-from icrl4aht_baselines.report.results import EvaluationRun, bundled_by_id, note_results, read_run
+from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, bundled_by_id, note_results, read_run
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
 from icrl4aht_baselines.training.seen import overlap_legend
 from icrl4aht_baselines.training.trainer import format_loss, train
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, family_order
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
@@ -33,15 +33,11 @@ from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.plotting import check_can_draw, plot_layout_curves
-from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 
 FLOOR = ("stay", "random")
 """Reference egos that an agent has to exceed before its return says anything."""
-
-FamilyReturns = dict[str, dict[str, np.ndarray]]
-"""Teammate family -> agent -> returns (U, E) of U pairs of a task and a seed in E episodes."""
 
 DEMO_LAYOUT = "demo_wide"
 _MODEL = ModelOptions(**SIZES["tiny"].model)
@@ -57,8 +53,6 @@ class DemoSettings:
     Attributes:
         root: folder of the release.
         model, training: AD's; by default of size tiny, with fewer steps than its own, chosen on validation tasks.
-        sources: sources of the histories to train on; all if empty.
-        labels: actions to learn: the labels of this kind, or None for those that were taken.
         tasks: tasks to evaluate on; None for the validation tasks of `DEMO_LAYOUT`.
         reference: bundled model to compare with; None for none.
         protocol, seeds: of the evaluation.
@@ -67,34 +61,24 @@ class DemoSettings:
     root: Path = MINI
     model: ModelOptions = _MODEL
     training: TrainOptions = _TRAINING
-    sources: tuple[str, ...] = ("noise",)
-    labels: Labels | None = "oracle"
     tasks: tuple[Task, ...] | None = None
     reference: str | None = "ad-reference"
     protocol: Protocol = _PROTOCOL
     seeds: Sequence[int] = range(10)
 
 
-class Lead(NamedTuple):
-    """Difference between an agent's mean return and that of the better of two reference egos with one family.
+def find_lead(returns: Mapping[str, np.ndarray], agent: str) -> MeanInterval:
+    """Return the difference of an agent's mean return to that of a reference ego, the one with the lower interval.
 
-    Attributes:
-        difference: per episode, with its 95 % bootstrap interval over pairs of a task and a seed.
-        better: whether the intervals of the differences to both reference egos are above 0.
+    Differences are paired, since episodes of a task and a seed start alike for all agents. The interval is over pairs
+    of a task and a seed; the agent earns more than both egos if it is above 0.
+
+    Args:
+        returns: agent -> mean returns (U, S) of U tasks and S seeds.
+        agent: the agent.
     """
-
-    difference: MeanInterval
-    better: bool
-
-
-def find_lead(returns: Mapping[str, np.ndarray], agent: str) -> Lead:
-    """Return an agent's lead with one family: agent -> returns (U, E).
-
-    Differences are paired, since episodes of a task and a seed start alike for all agents.
-    """
-    own = returns[agent].mean(axis=1)
-    differences = [mean_interval(own - returns[name].mean(axis=1)) for name in FLOOR]
-    return Lead(min(differences), all(found.low > 0 for found in differences))
+    differences = (mean_interval((returns[agent] - returns[name]).ravel()) for name in FLOOR)
+    return min(differences, key=lambda found: found.low)
 
 
 def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) -> Path:
@@ -145,10 +129,9 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
         f"no problem in {verified.files} files, {verified.chunks} chunks, {verified.transitions:,} transitions replayed"
     )
 
-    targets = f"{settings.labels} labels" if settings.labels else "the actions taken"
     model, training = settings.model, settings.training
     size = f"{model.layers} layers of width {model.width}, K = {training.context}"
-    say(4, f"training AD on {targets}, {size}: {training.steps} steps")
+    say(4, f"training AD on oracle labels, {size}: {training.steps} steps")
     _train_demo(out / "ad", settings)
     write(f"losses on training and held-out histories: {out / 'ad' / RUN_CURVES}")
 
@@ -157,26 +140,29 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
         tasks = tuple(task for task in bundled_by_id("validation").values() if task.layout.name == DEMO_LAYOUT)
     others = [*AGENTS, *([settings.reference] if settings.reference else [])]
     say(5, f"evaluating it and {', '.join(others)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
-    played = [_evaluate(name, out, tasks, settings) for name in (*others, str(out / "ad"))]
-    runs, agent = [run for run, _ in played], played[-1][0].agent
-    names = sorted(played[0][1], key=family_order)
-    families = {family: {run.agent: returns[family] for run, returns in played} for family in names}
-    leads = {family: find_lead(found, agent) for family, found in families.items()}
-    write(_lead_table(families, leads, agent))
+    runs = [_evaluate(name, out, tasks, settings) for name in (*others, str(out / "ad"))]
+    own, cells = runs[-1], [*runs[0].cells]
+    leads = {cell: find_lead({run.agent: run.returns[cell].mean for run in runs}, own.agent) for cell in cells}
+    better = f"{own.agent} - better of {' and '.join(FLOOR)}"
+    means = {
+        cell.family: {run.agent: f"{run.returns[cell].mean.mean():.1f}" for run in runs} | {better: lead.text(sign="+")}
+        for cell, lead in leads.items()
+    }
+    write(pd.DataFrame(means).T.to_string())
 
     say(6, "drawing the curves and the report")
-    title = f"{agent} on {DEMO_LAYOUT} with validation teammates: return in each episode of a task"
-    notes = {family: f"{_signed(lead.difference)} above {' and '.join(FLOOR)}" for family, lead in leads.items()}
-    plot_family_curves(families, agent, picture, title, notes)
+    models, egos = ([run for run in runs if (run.agent in AGENTS) == is_ego] for is_ego in (False, True))
+    levels = {cell.title: {run.agent: float(run.cells[cell].mean()) for run in egos} for cell in cells}
+    plot_return_curves({cell.title: {run.agent: run.cells[cell] for run in models} for cell in cells}, picture, levels)
     write_page_with_episodes(runs, page)
     write(f"return in each episode: {picture}\nreport: {page}")
     write(f"done in {time.perf_counter() - started:.0f} s\n")
-    write("\n".join([*overlap_legend(runs[-1].overlaps(runs[-1].cells)), *_conclusion(families, leads, agent)]))
+    write("\n".join([*overlap_legend(own.overlaps(cells)), *_conclusion(own, leads, len(settings.seeds))]))
     return page
 
 
 def _train_demo(folder: Path, settings: DemoSettings) -> None:
-    histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=settings.sources, labels=settings.labels)
+    histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=("noise",), labels="oracle")
     job = prepare("ad", settings.model, settings.training, histories)
     with progress_bars(unit="steps") as show:
 
@@ -186,49 +172,26 @@ def _train_demo(folder: Path, settings: DemoSettings) -> None:
         train(job.method, job.data, job.options, folder, job.about, done=done)
 
 
-def _evaluate(
-    name: str, out: Path, tasks: Sequence[Task], settings: DemoSettings
-) -> tuple[EvaluationRun, dict[str, np.ndarray]]:
-    """Evaluate an agent. Return its results, and its returns (U, E) with each family, see `FamilyReturns`."""
+def _evaluate(name: str, out: Path, tasks: Sequence[Task], settings: DemoSettings) -> EvaluationRun:
     agent = find_agent(name)
     folder = out / "results" / agent.name
     rules: Any = {"seeds": settings.seeds, "out": folder, "details": agent.details}
-    results = evaluate(agent.name, agent.make, tasks, settings.protocol, **rules)
+    evaluate(agent.name, agent.make, tasks, settings.protocol, **rules)
     note_results(folder, agent.run, tasks)
-    returns: dict[str, list[Any]] = defaultdict(list)
-    for task, result in zip(tasks, results, strict=True):
-        returns[task.teammate_family] += result.returns
-    return read_run(folder), {family: np.array(found) for family, found in returns.items()}
+    return read_run(folder)
 
 
-def _signed(found: MeanInterval) -> str:
-    return f"{found.mean:+.1f} (95 % interval {found.low:+.1f} to {found.high:+.1f})"
-
-
-def _lead_table(families: FamilyReturns, leads: Mapping[str, Lead], agent: str) -> str:
-    """Return text with a line per family: mean returns of all agents, and the lead of one of them."""
-    names = list(next(iter(families.values())))
-    widths = [max(9, len(name) + 2) for name in names]
-    head = "".join(f"{name:>{width}}" for name, width in zip(names, widths, strict=True))
-    lines = [f"family{head}   {agent} - better of {' and '.join(FLOOR)}"]
-    for family, returns in families.items():
-        means = "".join(f"{returns[name].mean():>{width}.1f}" for name, width in zip(names, widths, strict=True))
-        lines.append(f"{family:6}{means}   {_signed(leads[family].difference)}")
-    return "\n".join(lines)
-
-
-def _conclusion(families: FamilyReturns, leads: Mapping[str, Lead], agent: str) -> list[str]:
+def _conclusion(own: EvaluationRun, leads: Mapping[ResultCell, MeanInterval], seeds: int) -> list[str]:
     """Return what was measured and its limits, in a few lines; the last one is the verdict."""
-    own = {family: returns[agent] for family, returns in families.items()}
-    curve = np.mean([returns.mean(axis=0) for returns in own.values()], axis=0)
-    half, pairs = len(curve) // 2, ", ".join(f"{family} {len(returns)}" for family, returns in own.items())
-    better = [family for family, lead in leads.items() if lead.better]
-    others, floor = [family for family in leads if family not in better], " and ".join(FLOOR)
-    verdict = f"{agent} earns no more than {floor} with any of these families: {', '.join(others)}."
+    curve = np.mean([returns.mean(axis=0) for returns in own.cells.values()], axis=0)
+    half, floor = len(curve) // 2, " and ".join(FLOOR)
+    pairs = ", ".join(f"{cell.family} {len(returns) * seeds}" for cell, returns in own.cells.items())
+    better = [cell.family for cell, lead in leads.items() if lead.low > 0]
+    others = ", ".join(cell.family for cell, lead in leads.items() if not lead.low > 0)
+    verdict = f"{own.agent} earns no more than {floor} with any of these families: {others}."
     if better:
-        missed = f"; no more with {', '.join(others)}" if others else ""
-        count = f"{len(better)} of {len(leads)} families"
-        verdict = f"{agent} earns more than {floor} with {count}: {', '.join(better)}{missed}."
+        verdict = f"{own.agent} earns more than {floor} with {len(better)} of {len(leads)} families: "
+        verdict += ", ".join(better) + (f"; no more with {others}." if others else ".")
     return [
         f"Measured on {len(curve)} episodes of each task and seed ({pairs}). It is one training run: the intervals "
         f"leave out how much trainings differ. Validation tasks are for choosing models, so this is no test result.",

@@ -107,7 +107,6 @@ def smooth_returns(returns: Float[np.ndarray, " E"]) -> Float[np.ndarray, " E"]:
     return running_mean(returns, min(SMOOTHING, len(returns) // 10))
 
 
-_AGENT_COLOUR = "#1f5fa8"
 _REFERENCE_LINES = {"oracle": ("#2c8a4b", "--"), "random": ("#b0653a", ":"), "stay": ("#6b7280", "-.")}
 
 
@@ -153,39 +152,3 @@ def _plot_curve(axes: Any, label: str, color: str, returns: np.ndarray) -> list[
     axes.plot(episodes, raw, color=color, alpha=0.35, linewidth=0.7)
     axes.plot(episodes, curves.mean(axis=0), color=color, label=label, linewidth=1.6)
     return [float(min(low.min(), raw.min())), float(max(high.max(), raw.max()))]
-
-
-def plot_family_curves(
-    families: Mapping[str, Mapping[str, np.ndarray]], agent: str, path: Path, title: str, notes: Mapping[str, str]
-) -> None:
-    """Plot an agent's mean return in each episode with a 95 % band, and reference egos' mean returns as lines.
-
-    Args:
-        families: teammate family -> agent -> returns (U, E) of U pairs of a task and a seed in E episodes; a panel
-            each.
-        agent: the agent whose curve is drawn; the others are lines.
-        path: PNG file to write.
-        title: heading of the figure.
-        notes: teammate family -> text below the family's name.
-    """
-    figure = new_figure(3.5 * len(families) + 0.4, 3.7)
-    panels: Any = figure.subplots(1, len(families), squeeze=False, sharey=True)[0]
-    for axes, (family, returns) in zip(panels, families.items(), strict=True):
-        curves = returns[agent]
-        episodes, mean = np.arange(1, curves.shape[1] + 1), curves.mean(axis=0)
-        error = 1.96 * curves.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros(len(mean))
-        for name in (name for name in returns if name != agent):
-            colour, dashes = _REFERENCE_LINES.get(name, ("black", "-"))
-            axes.axhline(returns[name].mean(), color=colour, linestyle=dashes, linewidth=1.6, label=name)
-        axes.fill_between(episodes, mean - error, mean + error, color=_AGENT_COLOUR, alpha=0.18, linewidth=0)
-        axes.plot(episodes, mean, "o-", color=_AGENT_COLOUR, linewidth=2, markersize=3.5, label=agent)
-        axes.set_title(f"{family}\n{notes[family]}", fontsize=9)
-        axes.set_xlabel("episode within the task")
-        axes.set_xlim(0.5, len(episodes) + 0.5)
-        axes.xaxis.get_major_locator().set_params(integer=True)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.25)
-    panels[0].set_ylabel("return of an episode")
-    figure.suptitle(title, fontsize=11)
-    legend_below(figure)
-    save_figure(figure, path, dpi=130)
