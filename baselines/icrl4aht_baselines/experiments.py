@@ -13,7 +13,6 @@ Everything resumes: finished parts are kept, stopped ones continue, and folders 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -32,7 +31,7 @@ from icrl4aht_baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, Histo
 from icrl4aht_baselines.training.trainer import train
 from icrl4aht_data.benchmark.facts import TESTED_ON, track_of
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.dataset import load_icrl4aht
+from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
 from icrl4aht_data.format.schema import TASKS
 from icrl4aht_data.overcooked.channels import Channels
@@ -103,7 +102,7 @@ EXPERIMENTS = {
             for name, size in SIZES.items()
             if name in PAPER_SIZES
         ),
-        varies=("layers", "width"),
+        varies=("size", "layers", "width"),
     ),
     "ablate ta": Experiment(
         "Teammate actions and auxiliary losses",
@@ -242,44 +241,42 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
     experiment = EXPERIMENTS[name]
     for method in plan.methods:
         get_method(method)
-    names = [entry.name for entry in experiment.entries]
+    entries = {entry.name: entry for entry in experiment.entries}
     for value in plan.values:
-        if value not in names:
-            raise unknown(f"setting of {name}", value, names)
+        if value not in entries:
+            raise unknown(f"setting of {name}", value, entries)
     if plan.size not in SIZES:
         raise unknown("size", plan.size, SIZES)
-    if "layers" in experiment.varies and plan.size != ExperimentPlan.size:
-        raise OptionError(f"size = {plan.size}: `{name}` sets it; choose by --only, such as {names[0]}")
-    for option, value in (plan.train | plan.model).items():
-        if option in experiment.varies:
-            raise OptionError(f"{option} = {value}: `{name}` sets it; choose by --only, such as {names[0]}")
-    return [entry for entry in experiment.entries if not plan.values or entry.name in plan.values]
+    given = plan.train | plan.model | ({"size": plan.size} if plan.size != ExperimentPlan.size else {})
+    for option in given.keys() & experiment.varies:
+        first = next(iter(entries))
+        raise OptionError(f"{option} = {given[option]}: `{name}` sets it; choose by --only, such as {first}")
+    return [entry for entry in entries.values() if not plan.values or entry.name in plan.values]
+
+
+def _histories(plan: ExperimentPlan) -> tuple[Dataset, dict[str, tuple[str, ...]]]:
+    """Return the training histories that pass the plan's filters, and the filters."""
+    filters = HistoryOptions((), **plan.filters).filters
+    return filter_histories(load_icrl4aht(plan.root, split="train"), filters), filters
 
 
 def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[list[str], list[str]]:
     """Return the layouts to train on, or `ALL_LAYOUTS` for one model of all, and a note on those left out."""
-    dataset = load_icrl4aht(plan.root, split="train")
-    filters = HistoryOptions((), **plan.filters).filters
-    filter_histories(dataset, filters)  # a value that no history has is an error that names it
+    dataset, filters = _histories(plan)
     if ALL_LAYOUTS in plan.layouts:
         return list(HistoryOptions(plan.layouts).layouts), []
-    available = []
-    for layout in dataset.layouts:
-        with suppress(EmptySelectionError):
-            filter_histories(dataset.filter(layout=layout.name), filters)
-            available.append(layout.name)
-    release = plan.root or "the bundled mini release"
-    kind = "training histories" + "".join(f" of {name} {' and '.join(values)}" for name, values in filters.items())
-    wanted = tuple(get_layout(name).name for name in plan.layouts)
+    available = [layout.name for layout in dataset.layouts]
+    wanted = [get_layout(name).name for name in plan.layouts]
     for name in wanted:
         if name not in TESTED_ON:
             raise unknown("training layout", name, TESTED_ON)
     missing = [name for name in wanted or experiment.layouts if name not in available]
     names = [name for name in wanted or experiment.layouts if name in available]
+    kind = "training histories" + "".join(f" of {name} {' and '.join(values)}" for name, values in filters.items())
     if not names or (wanted and missing):
         raise EmptySelectionError(
-            f"{release}: no {kind} on {', '.join(missing)}; it has {', '.join(sorted(available)) or 'none'}: choose "
-            f"among them, or give a --root that has the others"
+            f"{plan.root or 'the bundled mini release'}: no {kind} on {', '.join(missing)}; it has "
+            f"{', '.join(sorted(available))}: choose among them, or give a --root that has the others"
         )
     return names, [f"left out, the release has no {kind} of them: {', '.join(missing)}"] if missing else []
 
@@ -287,32 +284,30 @@ def _training_layouts(experiment: Experiment, plan: ExperimentPlan) -> tuple[lis
 def _test_tasks(experiment: Experiment, plan: ExperimentPlan, layout: str) -> list[Task]:
     """Return the tasks that a model trained on a layout, or on `ALL_LAYOUTS`, is evaluated on."""
     if layout == ALL_LAYOUTS:
-        filters = HistoryOptions((), **plan.filters).filters
-        dataset = filter_histories(load_icrl4aht(plan.root, split="train"), filters)
+        dataset, _ = _histories(plan)
         names = [name for name in TESTED_ON if name in {layout.name for layout in dataset.layouts}]
         if not names:
             raise EmptySelectionError(f"{dataset!r}: none of its layouts is a training layout of the benchmark")
         return [task for name in names for task in _test_tasks(experiment, plan, name)]
+    if experiment.held_out and plan.split:
+        raise OptionError(
+            f"split = {plan.split}: this experiment has tasks of its own, those of the suite's held-out teammates; "
+            f"leave --split out"
+        )
+    split = plan.split or "test"
+    played_on = TESTED_ON.get(layout, layout) if split == "test" else layout
     if experiment.held_out:
-        if plan.split:
-            raise OptionError(
-                f"split = {plan.split}: this experiment has tasks of its own, those of the suite's held-out teammates; "
-                f"leave --split out"
-            )
         tasks = held_out_tasks(plan.suite, layout, plan.root)
     else:
-        split = plan.split or "test"
-        played_on = TESTED_ON.get(layout, layout) if split == "test" else layout
         tasks = [task for task in bundled_tasks(track_of(played_on), split) if task.layout.name == played_on]
-        if not tasks:
-            raise EmptySelectionError(f"no {split} tasks on {played_on}: choose another --layout, or --split test")
+    if not tasks:
+        raise EmptySelectionError(f"no {split} tasks on {played_on}: choose another --layout, or --split test")
     available = dict.fromkeys(task.teammate_family for task in tasks)
     for family in plan.families:
         if family not in available:
             raise unknown("teammate family of these tasks", family, available)
-    return limit_tasks(
-        [task for task in tasks if not plan.families or task.teammate_family in plan.families], plan.tasks
-    )
+    chosen = [task for task in tasks if not plan.families or task.teammate_family in plan.families]
+    return limit_tasks(chosen, plan.tasks)
 
 
 def held_out_tasks(suite: Path | None, layout: str, root: str | None = None) -> list[Task]:
@@ -376,15 +371,13 @@ def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: Exper
 def _train_entry(
     job: TrainingTask, name: str, plan: ExperimentPlan, folder: Path, progress: ExperimentProgress
 ) -> None:
-    what, steps = f"{job.method.label} {name}: training steps", job.options.steps
-
     def done(step: int, loss: float | None) -> None:
-        progress(what, step, steps)
+        progress(f"{job.method.label} {name}: training steps", step, job.options.steps)
 
     done(0, None)
     watched: Any = {"tensorboard": plan.tensorboard, "save_minutes": plan.save_minutes, "done": done}
     train(job.method, job.data, job.options, folder / "run", job.about, **watched)
-    done(steps, None)
+    done(job.options.steps, None)
 
 
 def _evaluate_entry(
