@@ -45,12 +45,7 @@ def test_curves_of_cells_share_their_axes(tmp_path, drawn):
     panels = {cell.title: {run.name: run.cells[cell] for run in runs} for cell in runs[0].cells}
     plotting.plot_return_curves(panels, tmp_path / "curves.png")
     (figure,) = drawn
-    assert [axes.get_title() for axes in shown(figure)] == [
-        "demo_wide, H1",
-        "demo_wide, H2",
-        "demo_wide, H3",
-        "demo_wide, H4",
-    ]
+    assert [axes.get_title() for axes in shown(figure)] == [f"demo_wide, H{number}" for number in range(1, 5)]
     assert len(figure.legends) == 1
     assert len({axes.get_ylim() for axes in shown(figure)}) == 1
     low, high = shown(figure)[0].get_ylim()

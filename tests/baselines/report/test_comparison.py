@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.report import comparison
-from icrl4aht_baselines.report.cards import published_table
 from icrl4aht_baselines.report.comparison import (
     FORGETS,
     UNSEEN,
@@ -22,10 +21,9 @@ from icrl4aht_baselines.report.comparison import (
     unseen_table,
     write_stored,
 )
-from icrl4aht_baselines.report.results import BLOCKS, CellReturns, ResultCell, cell_rows, published_cells, results_table
+from icrl4aht_baselines.report.results import BLOCKS, CellReturns, ResultCell, cell_rows, results_table
 from icrl4aht_baselines.report.scores import cell_headroom, open_cells
 
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.commands.cli import cli
 from tests.helpers.paths import ROOT
 
@@ -76,6 +74,7 @@ def test_the_summary_has_scores_and_rising_cells():
     assert "| 18 of 20 |" in rising and flat == "| `flat`‡ |  |  |  | 0 of 0 |  |  |"
     (opening,) = summary(stored_of({"a": everywhere(0.0, gain=2.0)}))
     assert f"| {stays - 2:.1f} to {stays + 1:.1f}, +3.0 (+3.0 to +3.0) |" in opening
+    assert summary(StoredResults()) == [], "a protocol without results"
 
 
 def test_the_page_has_a_column_for_each_current_model():
@@ -141,17 +140,3 @@ def test_the_command(tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     assert "| `a` | 0.50" in (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
     assert (tmp_path / "page" / "results.png").stat().st_size > 10_000
-
-
-def test_the_papers_methods_and_the_reference_egos():
-    egos = {"stay": 1.0, "random": 2.0, "oracle": 3.5}
-    line = published_table({"demo_wide": dict.fromkeys(HEURISTICS, egos)}).splitlines()[2]
-    paper = [
-        np.mean([published_cells(name)["demo_wide"][one][0] for one in HEURISTICS]) for name in ("random", "AD", "DPT")
-    ]
-    assert line == f"| demo_wide | 1.0 | 2.0 | {' | '.join(f'{value:z.1f}' for value in paper)} | 3.5 | 4 of 4 |"
-
-
-@pytest.mark.parametrize("protocol", ["seeded", "published"])
-def test_tables_of_a_protocol_without_results_are_empty(protocol):
-    assert summary_table(StoredResults().protocol(protocol), protocol).count("\n") == 1

@@ -34,14 +34,8 @@ def file(tmp_path_factory) -> Path:
     runs += [evaluated_run("AD", variant=("K", k), protocol="published") for k in (250, 500)]
     runs.append(evaluated_run("AD+TA+next_obs-" + "x" * 60, protocol="published"))
     shown = tuple(ShownEpisode(number, 20.0 * number, folder / "a.gif") for number in (1, 100))
-    pairs = [
-        EpisodePair(
-            ResultCell("demo_wide", "H1"),
-            "AD with H1/t0 on demo_wide",
-            "Task 0123456789abcdef, protocol published",
-            shown,
-        )
-    ]
+    caption = "Task 0123456789abcdef, protocol published"
+    pairs = [EpisodePair(ResultCell("demo_wide", "H1"), "AD with H1/t0 on demo_wide", caption, shown)]
     write_page(runs, folder / "report.html", pairs, ["left out: runs/" + "y" * 60])
     return folder / "report.html"
 

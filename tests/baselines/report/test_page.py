@@ -68,12 +68,7 @@ def test_the_page_is_complete_and_fetches_nothing(tmp_path):
     assert (found.outside, found.open, found.images) == ([], [], ["data:image/gif"] * 2)
     for section in ("summary", "curves", "episodes", "tables", "settings", "paper"):
         assert f'<section id="{section}">' in text and f'href="#{section}"' in text
-    parts = [
-        "left out: &lt;nothing&gt;",
-        "H1 &amp; an ego",
-        "Episode 2: return 40",
-        "No picture: &lt;its run&gt; is gone",
-    ]
+    parts = ["left out: &lt;nothing&gt;", "H1 &amp; an ego", "Episode 2: return 40", "&lt;its run&gt; is gone"]
     parts += ["paper 12.5 ± 11.3", "the paper's AD", "AD, K = 250", 'name="viewport"', "prefers-color-scheme: dark"]
     assert [part for part in parts if part not in text] == []
     assert text.count("<table") == text.count("<caption>") and "url(" not in text and "@import" not in text
@@ -141,11 +136,7 @@ def test_curves_share_their_axes_and_may_have_one_episode():
 
 def trained(run: EvaluationRun, **model) -> EvaluationRun:
     """Return the results with a training record that lists the layouts in the agent's name."""
-    histories = {
-        "root": "hf://datasets/you/icrl4aht@v1",
-        "layouts": list(run.sources[0].layouts),
-        "data_version": "1.0.0",
-    }
+    histories = {"root": "hf://datasets/you/icrl4aht@v1", "layouts": [*run.sources[0].layouts], "data_version": "1.0.0"}
     histories |= {"sizes": {"train": 14}, "queries": 201, "every": 1, "labels": "oracle"}
     config = {"method": "dpt", "model": model, "train": {"seed": 3}, "package_version": "0", "histories": histories}
     content = {"config": config, "manifest_sha256": "ab12", "run_hash": json.dumps(config)}
@@ -167,16 +158,11 @@ def test_trained_models_have_cards(tmp_path):
         "It is one run, of seed 3",
     ]
     assert [part for part in parts if part not in card] == []
-    assert card.count("* † the agent was trained with other teammates of this family") == 2, (
-        "below the table, in limits"
-    )
+    assert card.count("* † the agent was trained with other teammates of this family") == 2, "at the table, in limits"
     own = [make_task("teammate", "validation", "demo_wide", TEST_TASKS[0].teammate, number) for number in (1, 2)]
     card = model_card(first, "dpt-reference", "python -m x", [evaluated_run("AD", tasks=own)], {"a/b.png": "A curve"})
-    assert (
-        "\n# dpt-reference, trained on" in card
-        and "| method | dpt |\n" in card
-        and "| made by | `python -m x` |" in card
-    )
+    parts = ["\n# dpt-reference, trained on", "| method | dpt |\n", "| made by | `python -m x` |"]
+    assert [part for part in parts if part not in card] == []
     assert "### Validation tasks, seeded\n" in card and "## Curves\n\nA curve:\n\n![b](a/b.png)\n" in card
     (both,) = merge([first, trained(evaluated_run("AD", ("asymm_right",), trained_on=None, acting="cached"), layers=2)])
     card = model_card(both)
@@ -187,12 +173,8 @@ def test_trained_models_have_cards(tmp_path):
 def test_headroom_cards_name_cells_without_headroom(tmp_path):
     values = {"stay": (40.0, 0.0), "random": (35.0, 0.0), "oracle": (40.5, 39.9)}
     runs = []
-    for agent, returns in values.items():
-        parts = [
-            evaluated_run(agent, (layout,), value - 1)
-            for layout, value in zip(("coord_simple", "demo_wide"), returns, strict=True)
-        ]
-        runs += merge(parts)
+    for agent, (simple, wide) in values.items():
+        runs += merge([evaluated_run(agent, ("coord_simple",), simple - 1), evaluated_run(agent, value=wide - 1)])
     write_headroom_cards(runs, tmp_path)
     content = json.loads((tmp_path / "headroom.json").read_text())
     assert content["seeded"]["demo_wide"]["H1"] == {"stay": 0.0, "random": 0.0, "oracle": 39.9}
