@@ -404,5 +404,4 @@ def _evaluate_entry(
         details=details,
         played=counted(progress, what, len(tasks) * plan.seeds * protocol.episodes),
     )
-    own = experiment.held_out or (plan.split or "test") != "test"
-    note_results(folder / "results", folder / "run", tasks if own else ())
+    note_results(folder / "results", folder / "run", tasks)

@@ -311,7 +311,7 @@ class _Steps:
                     details=agent.details,
                     played=counted(self.show, f"{name}-{self.track}, {kind}", len(tasks) * seeds * played.episodes),
                 )
-            note_results(folder, run, () if kind.startswith("test") else tasks)
+            note_results(folder, run, tasks)
             found[kind] = folder
         return found
 

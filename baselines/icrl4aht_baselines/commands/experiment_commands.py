@@ -9,7 +9,6 @@ from typing import Any
 
 import click
 from icrl4aht_generation.teammates.instances import INSTANCES, published_task
-from rich.console import Console
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.commands.options import find_ego
@@ -19,8 +18,6 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
-
-_console = Console(soft_wrap=True)
 
 
 def _experiment_command(name: str, text: str, *own: Callable[[Any], Any], usage: Sequence[str] = ()) -> click.Command:
@@ -137,7 +134,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
     with progress_bars(unit="tasks") as show:
         runs = measure_headroom(out, protocol, show)
     for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
-        _console.print(f"wrote {path}")
+        click.echo(f"wrote {path}")
 
 
 @click.command("drift")

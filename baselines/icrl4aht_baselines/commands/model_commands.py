@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.commands.options import find_ego
@@ -21,8 +20,6 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.options import Share
 from icrl4aht_data.utils.progress import progress_bars
-
-_console = Console(soft_wrap=True)
 
 
 @click.command(
@@ -108,7 +105,7 @@ def collect_command(
     with progress_bars(unit="episodes") as show:
         options: Any = {"labeller": other, "overwrite": overwrite, "progress": show}
         collect_release(ego, teammates, config, out, **options)
-    _console.print(f"wrote {out}; `icrl4aht-data show {out}` describes it")
+    click.echo(f"wrote {out}; `icrl4aht-data show {out}` describes it")
 
 
 @click.command(
@@ -186,18 +183,18 @@ def reference_command(
             outcomes.append(make_reference(name, of_track, out, show, evaluates, teacher))
         others = [make_reference(names[0], one, out, show, finished=run) for one, run in kept.items()]
     for found in outcomes:
-        _console.print(f"{found.name}, {found.track}: {found.run}", highlight=False)
+        click.echo(f"{found.name}, {found.track}: {found.run}")
         for kind, folder in found.results.items():
-            _console.print(f"  {kind}: {folder}", highlight=False)
+            click.echo(f"  {kind}: {folder}")
     if bundle:
         for found in outcomes:
             sampled = not RECIPES[found.name].greedy
             target = bundle_run(found.run, bundle, found.track, sampled=sampled)
-            _console.print(f"bundled: {target}", highlight=False)
+            click.echo(f"bundled: {target}")
         in_order = sorted([*others, *outcomes], key=lambda found: list(TRACKS).index(found.track))
-        _console.print(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}", highlight=False)
+        click.echo(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}")
     if times := describe_times(out):
-        _console.print(times, highlight=False)
+        click.echo(times)
 
 
 @click.command(
@@ -227,7 +224,7 @@ def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, 
     if store:
         comparison.write_stored(comparison.results_file(), stored)
     for path in comparison.write_comparison(stored, out):
-        _console.print(f"wrote {path}")
+        click.echo(f"wrote {path}")
 
 
 @click.command("models")

@@ -7,7 +7,6 @@ from typing import Any
 
 import click
 from icrl4aht_generation.teammates.instances import published_task
-from rich.console import Console
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.commands.options import find_ego
@@ -23,8 +22,7 @@ from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars
-
-_console = Console(soft_wrap=True)
+from icrl4aht_data.utils.text import counted_noun
 
 
 @click.command(
@@ -108,11 +106,10 @@ def evaluate_command(
         shared.check_alone("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
     evaluate(ego.name, ego.make, chosen, rules, seeds=seeds_of_tasks, suite=suite, out=out, details=ego.details)
-    note_results(out, ego.run, chosen if manifest or split != "test" else ())
+    note_results(out, ego.run, chosen)
     for line in summary_lines([read_run(out)]):
         click.echo(line)
-    noun = "result" if len(chosen) == 1 else "results"
-    _console.print(f"{len(chosen)} {noun} in {out}; `icrl4aht-data report {out}` shows them")
+    click.echo(f"{counted_noun(len(chosen), 'result')} in {out}; `icrl4aht-data report {out}` shows them")
 
 
 @click.command("report")
@@ -184,7 +181,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     task = published_task(layout, teammate)
     (shown,) = save_episodes({1: out}, task, find_ego("--ego", ego).make, get_protocol(protocol), seed=seed)
     mate = f"{task.teammate_family}/t{task.teammate['theta_id']}"
-    _console.print(f"{ego} with {mate}: return {shown.earned:g}; wrote {out}")
+    click.echo(f"{ego} with {mate}: return {shown.earned:g}; wrote {out}")
 
 
 @click.command(
@@ -264,7 +261,7 @@ def train_command(
     if plays and machines["processes"] > 1:
         raise click.UsageError(f"--processes {machines['processes']}: {method} is trained by one process on one device")
     job, options, description = shared.prepare_training(method, size, model, train, play, choice, manifests)
-    _console.print(description, highlight=False)
+    click.echo(description)
     with progress_bars(unit="steps") as show:
 
         def done(step: int, loss: float | None) -> None:
@@ -275,8 +272,9 @@ def train_command(
         if init is not None:
             watched["params"] = start_from(init, job.method, job.about)
         run_training(job.method, job.data, options, folder, job.about, **watched)
-    noun = "step" if options.steps == 1 else "steps"
-    _console.print(f"{options.steps} {noun} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it")
+    click.echo(
+        f"{counted_noun(options.steps, 'step')} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it"
+    )
     if not can_draw():
         click.echo(f"{RUN_CURVES} was not drawn, matplotlib is not installed: {install_command('plot')}")
 
@@ -289,6 +287,8 @@ def demo_command(out: Path) -> None:
     Loads, samples and verifies it, trains a small AD model, compares it with the reference egos on validation tasks,
     draws its return in each episode, and writes a report of one page.
     """
+    from rich.console import Console
+
     from icrl4aht_baselines.demo import run_demo
 
-    run_demo(out, _console)
+    run_demo(out, Console(soft_wrap=True))

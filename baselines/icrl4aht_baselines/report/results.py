@@ -284,7 +284,7 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
         results: folder of the results.
         run: run folder of the evaluated model, if it was trained here. Its path, settings, their hash and the hash of
             its data's manifest are written to run.json.
-        tasks: the tasks played, if they are not the published test tasks; added to tasks.jsonl.
+        tasks: the tasks played; those that are no published test tasks are added to tasks.jsonl.
 
     Raises:
         OptionError: if `run` is not a run on learning histories.
@@ -302,11 +302,12 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
         }
         with atomic_write(results / TRAINED_RUN) as partial:
             write_json(partial, content)
-    if tasks:
+    own = {task.task_id: task for task in tasks if task.task_id not in bundled_by_id("test")}
+    if own:
         path = results / OWN_TASKS
         known = {task.task_id: task for task in read_tasks(path)} if path.exists() else {}
         with atomic_write(path) as partial:
-            write_tasks(partial, (known | {task.task_id: task for task in tasks}).values())
+            write_tasks(partial, (known | own).values())
 
 
 def read_run(folder: Path) -> EvaluationRun:
