@@ -272,9 +272,8 @@ def train_command(
         if init is not None:
             watched["params"] = start_from(init, job.method, job.about)
         run_training(job.method, job.data, options, folder, job.about, **watched)
-    click.echo(
-        f"{counted_noun(options.steps, 'step')} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it"
-    )
+    trained = counted_noun(options.steps, "step")
+    click.echo(f"{trained} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it")
     if not can_draw():
         click.echo(f"{RUN_CURVES} was not drawn, matplotlib is not installed: {install_command('plot')}")
 

@@ -1,4 +1,4 @@
-"""Stored results of reference models, `cards/results.json`, and docs/results.md, which compares them.
+"""Stored results of reference models, `cards/results.csv`, and docs/results.md, which compares them.
 
 Shapes: U tasks, S seeds with which each was played.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -17,9 +17,9 @@ import pandas as pd
 from icrl4aht_baselines.agents.egos import FORGETS
 from icrl4aht_baselines.report.results import (
     AGENT_COLUMNS,
-    BLOCKS,
     CELL_COLUMNS,
     ENDS,
+    TABLE_COLUMNS,
     CellReturns,
     ResultCell,
     cell_rows,
@@ -28,7 +28,6 @@ from icrl4aht_baselines.report.results import (
     published_cells,
     published_instances,
     read_run,
-    results_table,
     returns_by_cell,
 )
 from icrl4aht_baselines.report.scores import PAPER_METHODS, cell_headroom, mean_of, normalise, open_cells
@@ -38,7 +37,7 @@ from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import new_figure, save_figure
-from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.files import atomic_write, write_json
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
 from icrl4aht_data.utils.text import counted_noun
 
@@ -51,9 +50,12 @@ UNSEEN = "unseen"
 """Protocol name of results on rearranged layouts, see `icrl4aht_baselines.online.unseen`; a task for each version."""
 
 
+_Text = Literal["about", "ablations", "commits"]
+
+
 @dataclass(frozen=True)
 class StoredResults:
-    """Results of several agents, `cards/results.json`.
+    """Results of several agents, `cards/results.csv` and the texts of `cards/results.json`.
 
     Attributes:
         table: the results, see `results`. Entries of ablations are stored like agents, with the experiment's name
@@ -63,7 +65,7 @@ class StoredResults:
         commits: agent or ablation -> commit of this repository whose code made it, if later code cannot.
     """
 
-    table: pd.DataFrame = field(default_factory=lambda: results_table([]))
+    table: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=TABLE_COLUMNS))
     about: dict[str, str] = field(default_factory=dict)
     ablations: dict[str, dict[str, str]] = field(default_factory=dict)
     commits: dict[str, str] = field(default_factory=dict)
@@ -74,62 +76,32 @@ class StoredResults:
         return {str(agent): returns_by_cell(agents[agent]) for agent in [*self.about, *agents] if agent in agents}
 
 
-class _StoredCell(msgspec.Struct):
-    """The returns of an agent in a cell; the returns of a block are a list for each task."""
-
-    agent: str
-    protocol: str
-    layout: str
-    family: str
-    kind: str
-    overlaps: list[str]
-    mean: list[list[float]]
-    first: list[list[float]]
-    last: list[list[float]]
-    opening: list[list[float]]
-
-
-class _StoredFile(msgspec.Struct):
-    about: dict[str, str]
-    ablations: dict[str, dict[str, str]]
-    commits: dict[str, str]
-    cells: list[_StoredCell]
-
-
 def results_file() -> Path:
-    """Return the path of the stored results."""
+    """Return the path of the stored results: the texts; the table is next to it, in results.csv."""
     return card_file("published.json").with_name("results.json")
 
 
 def read_stored(path: Path) -> StoredResults:
-    """Return stored results; none if there is no file.
+    """Return stored results, texts in a JSON file and a table of the same name; none if there is no such file.
 
     Raises:
-        OptionError: if the file is damaged.
+        OptionError: if a file is damaged.
     """
     if not path.is_file():
         return StoredResults()
     try:
-        content = msgspec.json.decode(path.read_bytes(), type=_StoredFile)
-    except msgspec.DecodeError as error:
-        raise OptionError(f"{path}: not stored results: {error}; restore the file") from error
-    rows = []
-    for one in content.cells:
-        cell, blocks = ResultCell(one.layout, one.family, one.kind), {name: getattr(one, name) for name in BLOCKS}
-        rows += cell_rows((one.agent, one.protocol), cell, blocks, one.overlaps)
-    return StoredResults(results_table(rows), content.about, content.ablations, content.commits)
+        texts = msgspec.json.decode(path.read_bytes(), type=dict[_Text, dict[str, Any]])
+        return StoredResults(pd.read_csv(path.with_suffix(".csv"), keep_default_na=False)[TABLE_COLUMNS], **texts)
+    except (OSError, ValueError, KeyError) as error:
+        raise OptionError(f"{path}: not stored results: {error!r}; restore it and {path.stem}.csv") from error
 
 
 def write_stored(path: Path, stored: StoredResults) -> None:
-    """Write stored results, rounded to three digits; a line for each cell of an agent."""
-    cells = []
-    for (agent, protocol), table in stored.table.groupby(AGENT_COLUMNS, sort=False):
-        for cell, returns in returns_by_cell(table).items():
-            blocks = {name: np.round(getattr(returns, name), 3).tolist() for name in BLOCKS}
-            cells.append(_StoredCell(str(agent), str(protocol), *cell, list(returns.overlaps), **blocks))
-    text = msgspec.json.encode(_StoredFile(stored.about, stored.ablations, stored.commits, cells))
+    """Write stored results, rounded to three digits."""
+    with atomic_write(path.with_suffix(".csv")) as partial:
+        stored.table.round(3).to_csv(partial, index=False, lineterminator="\n")
     with atomic_write(path) as partial:
-        partial.write_bytes(text.replace(b'{"agent"', b'\n{"agent"') + b"\n")
+        write_json(partial, {name: getattr(stored, name) for name in get_args(_Text)})
 
 
 def add_results(stored: StoredResults, folder: Path, about: str) -> StoredResults:
@@ -165,7 +137,7 @@ def add_unseen(stored: StoredResults, returns: Mapping[str, Mapping[tuple[str, s
     for agent, cells in returns.items():
         for cell, values in cells.items():
             rows += cell_rows((agent, UNSEEN), ResultCell(*cell), episode_blocks(values[:, None]))
-    return _replace_rows(stored, results_table(rows))
+    return _replace_rows(stored, pd.DataFrame(rows, columns=TABLE_COLUMNS))
 
 
 def _replace_rows(stored: StoredResults, table: pd.DataFrame) -> StoredResults:
@@ -321,8 +293,8 @@ def unseen_table(stored: StoredResults) -> str:
     Returns are means over versions and families; normalised ones (return - `stay`) / (`oracle` - `stay`), mean over
     layouts. Intervals are over the versions. Without `stay` and `oracle` there are no normalised ones.
     """
-    rows = stored.table[(stored.table["protocol"] == UNSEEN) & (stored.table["block"] == "mean")]
-    families = rows.groupby(["agent", "layout", "task"], sort=False)["return"].mean()
+    rows = stored.table[stored.table["protocol"] == UNSEEN]
+    families = rows.groupby(["agent", "layout", "task"], sort=False)["mean"].mean()
     versions: Any = {key: of.to_numpy() for key, of in families.groupby(level=["agent", "layout"], sort=False)}
     layouts, body = sorted(rows["layout"].unique()), []
     for agent in rows["agent"].unique():

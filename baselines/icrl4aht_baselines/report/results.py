@@ -1,11 +1,11 @@
 """Results of evaluation as one table.
 
-A table of results is a data frame with a row for each task, seed and block of episodes:
+A table of results is a data frame with a row for each task and seed, and a column for each block of episodes:
 
     agent, protocol, layout, family, kind   the agent, and the cell of the task, see `ResultCell`
     task, seed                              id of the task, or its number in stored results; seed, or its number
-    block                                   mean: all episodes; first, last: up to 20 at each end; opening: episode 1
-    return                                  mean return of the team in an episode of the block
+    mean, first, last, opening              mean return of the team in all episodes, in up to 20 at each end, and in the
+                                            first one
     overlap                                 overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
 
 Tasks of different kinds never share a cell, since the paper's numbers and the headroom are of published test tasks.
@@ -55,6 +55,7 @@ BLOCKS = ("mean", "first", "last", "opening")
 
 CELL_COLUMNS = ["layout", "family", "kind"]
 AGENT_COLUMNS = ["agent", "protocol"]
+TABLE_COLUMNS = [*AGENT_COLUMNS, *CELL_COLUMNS, "overlap", "task", "seed", *BLOCKS]
 
 TASK_KINDS = {
     "test": "",
@@ -126,11 +127,11 @@ class CellReturns(NamedTuple):
 
 def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
     """Return the returns of one agent under one protocol, cells in the paper's order."""
-    found: dict[ResultCell, dict[str, Any]] = defaultdict(dict)
-    for (*key, block), rows in table.groupby([*CELL_COLUMNS, "block"], sort=False):
-        values = rows["return"].to_numpy().reshape(rows["task"].nunique(), -1)
-        found[ResultCell(*map(str, key))] |= {str(block): values, "overlaps": tuple(rows["overlap"].iloc[0].split())}
-    return {cell: CellReturns(**found[cell]) for cell in in_order(found)}
+    found = {}
+    for key, rows in table.groupby(CELL_COLUMNS, sort=False):
+        blocks = [rows[name].to_numpy().reshape(rows["task"].nunique(), -1) for name in BLOCKS]
+        found[ResultCell(*map(str, key))] = CellReturns(*blocks, tuple(rows["overlap"].iloc[0].split()))
+    return {cell: found[cell] for cell in in_order(found)}
 
 
 class ResultSource(NamedTuple):
@@ -233,43 +234,36 @@ class EvaluationRun:
         return f"{self.label} ({self.protocol})"
 
 
-def results_table(rows: Sequence[tuple[Any, ...]]) -> pd.DataFrame:
-    """Return rows of `cell_rows` as a table."""
-    names = [*AGENT_COLUMNS, *CELL_COLUMNS, "task", "seed", "block", "return", "overlap"]
-    return pd.DataFrame(rows, columns=names)
-
-
 def cell_rows(
     agent: tuple[str, str],
     cell: ResultCell,
-    blocks: Mapping[str, Any],
+    returns: Sequence[Any],
     overlaps: Iterable[str] = (),
     tasks: Sequence[str] = (),
     seeds: Sequence[int] = (),
 ) -> list[tuple[Any, ...]]:
-    """Return the rows of a table for one cell.
+    """Return the rows of a table for one cell, with a value for each of `TABLE_COLUMNS`.
 
     Args:
         agent: agent and protocol.
         cell: the cell.
-        blocks: block -> returns (tasks, seeds).
+        returns: of each block, in the order of `BLOCKS`, (tasks, seeds).
         overlaps: see the module's docstring.
         tasks, seeds: names of the tasks and seeds; numbers by default.
     """
-    marks = " ".join(overlaps)
+    blocks, marks = np.stack(returns, axis=-1).tolist(), " ".join(overlaps)
     return [
-        (*agent, *cell, tasks[row] if tasks else row, seeds[column] if seeds else column, block, float(value), marks)
-        for block, values in blocks.items()
-        for row, of_task in enumerate(values)
-        for column, value in enumerate(of_task)
+        (*agent, *cell, marks, tasks[row] if tasks else row, seeds[column] if seeds else column, *values)
+        for row, of_task in enumerate(blocks)
+        for column, values in enumerate(of_task)
     ]
 
 
-def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the mean returns of each block, (...), of the returns of all episodes, (..., episodes)."""
+def episode_blocks(returns: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the mean returns of each of `BLOCKS`, (...), of the returns of all episodes, (..., episodes)."""
     count = end_episodes(returns.shape[-1])
     first, last = returns[..., :count].mean(axis=-1), returns[..., -count:].mean(axis=-1)
-    return {"mean": returns.mean(axis=-1), "first": first, "last": last, "opening": returns[..., 0]}
+    return returns.mean(axis=-1), first, last, returns[..., 0]
 
 
 def end_episodes(episodes: int) -> int:
@@ -365,7 +359,7 @@ def as_run(
         rows += cell_rows(agent, cell, episode_blocks(returns), overlaps, names, seeds)
     sources = tuple(ResultSource(where, settings, trained, own, seen[track]) for track, own in tracks.items())
     variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
-    return EvaluationRun(*agent, results_table(rows), cells, variant, sources=sources)
+    return EvaluationRun(*agent, pd.DataFrame(rows, columns=TABLE_COLUMNS), cells, variant, sources=sources)
 
 
 def _find_seen(

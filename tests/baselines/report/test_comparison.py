@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.report import comparison
@@ -21,7 +22,7 @@ from icrl4aht_baselines.report.comparison import (
     unseen_table,
     write_stored,
 )
-from icrl4aht_baselines.report.results import BLOCKS, CellReturns, ResultCell, cell_rows, results_table
+from icrl4aht_baselines.report.results import BLOCKS, TABLE_COLUMNS, CellReturns, ResultCell, cell_rows
 from icrl4aht_baselines.report.scores import cell_headroom, open_cells
 
 from icrl4aht_data.commands.cli import cli
@@ -50,9 +51,9 @@ def stored_of(
         row
         for agent, cells in agents.items()
         for cell, of in cells.items()
-        for row in cell_rows((agent, protocol), cell, {name: getattr(of, name) for name in BLOCKS}, overlaps)
+        for row in cell_rows((agent, protocol), cell, of[: len(BLOCKS)], overlaps)
     ]
-    return StoredResults(results_table(rows), dict.fromkeys(agents, "a model"), **texts)
+    return StoredResults(pd.DataFrame(rows, columns=TABLE_COLUMNS), dict.fromkeys(agents, "a model"), **texts)
 
 
 def summary(stored: StoredResults) -> list[str]:
