@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from icrl4aht_generation.layouts.grids import rows_of
-from icrl4aht_generation.layouts.solvable import delivery_fault, faced_cells
+from icrl4aht_generation.layouts.solvable import faced_cells, is_easy
 
 MORE_FIXTURES = (4, 6)
 """Least and most fixtures besides those that a dish needs: one pile of each ingredient and of plates, a pot, a goal."""
@@ -26,8 +26,7 @@ _ARRANGEMENTS = 60  # tries with one choice of fixtures
 def furnished(rooms: np.ndarray, rng: np.random.Generator) -> Kitchen | None:
     """Return a kitchen with these rooms and random fixtures, recipes and starts.
 
-    One agent can bring all ingredients of each recipe to a pot, and one of them, the same or the other, can serve its
-    soup: the scripted experts hand nothing over on counters.
+    They are such that the scripted experts can deliver, see `is_easy`.
 
     Args:
         rooms: bool (2, H, W), the floor of each agent; the same one if they share a room.
@@ -45,7 +44,7 @@ def furnished(rooms: np.ndarray, rng: np.random.Generator) -> Kitchen | None:
     for _ in range(_ARRANGEMENTS):
         grid.flat[walls] = "W"
         grid.flat[rng.permutation(walls)[: len(fixtures)]] = fixtures
-        if delivery_fault(grid, reach, recipes, handover=False) is None:
+        if is_easy(grid, reach, recipes):
             break
     else:
         return None

@@ -6,6 +6,8 @@ Shapes: `H` rows, `W` columns, `P` pots.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
+from string import digits
 
 import numpy as np
 
@@ -25,9 +27,29 @@ def check_solvable(layout: Layout) -> None:
     Raises:
         OptionError: if they cannot; says what is missing.
     """
-    fault = delivery_fault(grid_of(layout), faced_cells(agent_rooms(layout)), layout.recipes, handover=True)
+    fault = _delivery_fault(grid_of(layout), faced_cells(agent_rooms(layout)), layout.recipes)
     if fault:
         raise OptionError(f"layout {layout.name}: {fault}; change the map or the recipes")
+
+
+def is_easy(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> bool:
+    """Return whether one agent can deliver every recipe alone, or one can only cook them and the other only serve them.
+
+    The scripted experts need that: they hand nothing over on counters, and cook in each pot that they reach.
+
+    Args:
+        grid: the map, str (H, W).
+        reach: bool (2, H, W), the cells that each agent can face.
+        recipes: triples of ingredient ids.
+    """
+    ingredients = {str(ingredient) for recipe in recipes for ingredient in recipe}
+    letters = [set(grid[faced].tolist()) for faced in reach]
+    for cook, server in product((0, 1), repeat=2):
+        can = letters[cook] >= {"P", *ingredients} and letters[server] >= {"P", "B", "X"}
+        pots_shared = not (reach[cook] & ~reach[server] & (grid == "P")).any()
+        if can and pots_shared and (cook == server or not letters[server] & set(digits)):
+            return True
+    return False
 
 
 def faced_cells(rooms: np.ndarray) -> np.ndarray:
@@ -35,19 +57,9 @@ def faced_cells(rooms: np.ndarray) -> np.ndarray:
     return np.stack([neighbours(room) & ~room for room in rooms])
 
 
-def delivery_fault(
-    grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, int, int]], *, handover: bool
-) -> str | None:
-    """Return why some recipe cannot be delivered, or None if each can.
-
-    Args:
-        grid: the map, str (H, W).
-        reach: bool (2, H, W), the cells that each agent can face.
-        recipes: triples of ingredient ids.
-        handover: whether agents use counters to hand items over, and fill one pot with ingredients from both. Without,
-            one agent brings a recipe's ingredients, and one, the same or the other, serves the soup.
-    """
-    counters = handover and bool((reach.all(axis=0) & (grid == "W")).any())
+def _delivery_fault(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> str | None:
+    """Return why some recipe cannot be delivered, or None if each can; for the arguments see `is_easy`."""
+    counters = bool((reach.all(axis=0) & (grid == "W")).any())
 
     def agents_with(letter: str) -> np.ndarray:
         """Return bool (2,), the agents that can face a fixture."""
@@ -70,10 +82,6 @@ def delivery_fault(
         for ingredient, agents in brought.items():
             if not any((pot & agents).any() for pot in served):
                 return f"ingredient {ingredient} cannot reach a pot whose soup can be delivered"
-        if handover:
-            full = [all((pot & agents).any() for agents in brought.values()) for pot in served]
-        else:
-            full = [np.logical_and.reduce([pot, *brought.values()]).any() for pot in served]
-        if not any(full):
+        if not any(all((pot & agents).any() for agents in brought.values()) for pot in served):
             return f"the ingredients of recipe {recipe} cannot reach the same pot"
     return None

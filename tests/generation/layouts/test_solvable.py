@@ -7,7 +7,7 @@ import re
 import pytest
 from icrl4aht_generation.layouts import check_solvable
 from icrl4aht_generation.layouts.grids import agent_rooms, grid_of
-from icrl4aht_generation.layouts.solvable import delivery_fault, faced_cells
+from icrl4aht_generation.layouts.solvable import faced_cells, is_easy
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
@@ -56,12 +56,16 @@ def test_unsolvable(rows, recipes, reason):
 
 
 @pytest.mark.parametrize(
-    ("rows", "fault"),
+    ("rows", "easy"),
     [
-        (HANDOVER, "no soup can reach a goal on a plate"),
-        (TWO_FILL, "the ingredients of recipe (0, 1, 1) cannot reach the same pot"),
+        (HANDOVER, False),
+        (TWO_FILL, False),
+        (("W0WPW", "1A AX", "WWBWW"), True),
+        (("W01WWWW", "WA P AX", "W  W  B", "WWWWWWW"), True),  # one agent only cooks, the other only serves
+        (("W01WWWW", "WA P AX", "W  W 0B", "WWWWWWW"), False),  # the one that serves would fill the pot as well
+        (("W01PWWWW", "WA PW AX", "WPWP  BW", "WWWWWWWW"), False),  # the one that cooks has a pot of its own
     ],
 )
-def test_generated_layouts_need_no_handover(rows, fault):
+def test_scripted_experts_can_deliver(rows, easy):
     layout = kitchen(rows, MIXED)
-    assert delivery_fault(grid_of(layout), faced_cells(agent_rooms(layout)), MIXED, handover=False) == fault
+    assert is_easy(grid_of(layout), faced_cells(agent_rooms(layout)), MIXED) == easy
