@@ -12,6 +12,7 @@ from jaxtyping import Bool
 
 from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.rules import CORRECT
 from icrl4aht_data.overcooked.state import swapped
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import oracle
@@ -44,7 +45,7 @@ def _delivers(layout: Layout) -> bool:
         carry = init_rollout(env, players, jax.random.split(key, count))
         return roll_out(env, players, carry, env.max_steps, key)[1].reward.max()
 
-    return bool(play(jax.random.key(0)) > 0)
+    return bool(play(jax.random.key(0)) >= CORRECT)
 
 
 def _if_playing(policy: Policy) -> Policy:
