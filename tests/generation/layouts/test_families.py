@@ -5,11 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
+from itertools import cycle
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_generation.layouts import canonical_map, check_solvable, find_generated, generate_layouts, split_of
+from icrl4aht_generation.layouts import (
+    canonical_map,
+    check_solvable,
+    families,
+    find_generated,
+    generate_layouts,
+    split_of,
+)
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS
 from icrl4aht_generation.layouts.fixtures import FREE_COUNTERS
 from icrl4aht_generation.layouts.grids import agent_rooms, grid_of, symmetric_images
@@ -156,7 +164,8 @@ def test_bad_arguments():
 def test_a_family_says_how_many_layouts_it_has(monkeypatch):
     few = generate_layouts("rooms", 0, 3)
     kitchens = [(one.rows, one.recipes, False) for one in few]
-    monkeypatch.setitem(LAYOUT_FAMILIES, "few", lambda seed: iter(kitchens * 400))
+    monkeypatch.setattr(families, "MOST_REPEATS", 20)
+    monkeypatch.setitem(LAYOUT_FAMILIES, "few", lambda seed: cycle(kitchens))
     with pytest.raises(OptionError, match="family few, seed 0: it has 3 layouts, expected 4; ask for fewer"):
         generate_layouts("few", 0, 4)
     trained = sum(split_of(one) == "train" for one in few)
