@@ -72,14 +72,6 @@ def test_shipped_profiles_load(name):
         assert work.task.split == "train" or (work.task.split, work.source) == ("validation", "noise")
 
 
-def test_every_task_has_a_seed_and_an_id_of_its_own(changed):
-    tasks = [work.task for work in load_profile(changed("keep = 8", "keep = 8")).works()]
-    assert len(tasks) > 1
-    assert len({task.seed for task in tasks}) == len(tasks)
-    assert len({task.task_id for task in tasks}) == len(tasks)
-    assert len({(task.layout_name, json.dumps(task.teammate["theta"])) for task in tasks}) == len(tasks)
-
-
 def test_paper_profile_has_the_papers_numbers():
     profile = load_profile("paper")
     ego = profile.ego

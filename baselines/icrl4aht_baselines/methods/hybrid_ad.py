@@ -11,7 +11,6 @@ from icrl4aht_generation.learners.network import GRU
 from jaxtyping import Array, Float
 
 from icrl4aht_baselines.methods.ad import action_method
-from icrl4aht_baselines.methods.options import ModelOptions
 
 
 class RecurrentTrunk(nn.Module):
@@ -60,9 +59,7 @@ class RecurrentTrunk(nn.Module):
         return self.norm(x), jnp.concatenate(last_states, axis=-1)
 
 
-def _make_trunk(options: ModelOptions) -> RecurrentTrunk:
-    return RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
-
-
-hybrid_ad = action_method("hybrid_ad", "Hybrid-AD", _make_trunk)
+hybrid_ad = action_method(
+    "hybrid_ad", "Hybrid-AD", lambda options: RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
+)
 """Maker of Hybrid-AD; 913,310 parameters at C = 40 channels."""

@@ -266,8 +266,8 @@ def _sampler(
         )
     if options.context > steps:
         raise OptionError(
-            f"context = {options.context}: with every = {every} and curriculum = {histories.curriculum:g}, the "
-            f"shortest history of {dataset!r} has {steps} steps for a window; take fewer, or choose longer histories"
+            f"context = {options.context}: the shortest history of {dataset!r} has {steps} steps for a window, with "
+            f"every = {every} and curriculum = {histories.curriculum:g}; take fewer, or choose longer histories"
         )
     return dataset.ad(length=options.context, every=every, **shared)
 

@@ -41,9 +41,11 @@ def read_config(folder: Path) -> dict[str, Any]:
     except (IndexFormatError, KeyError, TypeError) as error:
         raise OptionError(f"{folder}: not a run: expected {CONFIG} with run_format ({error})") from error
     if found != RUN_FORMAT:
+        writer, reader = config.get("package_version"), format_versions()["package_version"]
+        other = f", or use this run with version {writer} of this package, which wrote it" if writer != reader else ""
         raise OptionError(
-            f"{path}: run_format {found!r}, expected {RUN_FORMAT}: train again into another folder (another --out), or "
-            f"use version {config.get('package_version')} of this package, which wrote this run"
+            f"{path}: run_format {found!r}, but version {reader} of this package reads run_format {RUN_FORMAT} only: "
+            f"train again into another folder (another --out){other}"
         )
     return config
 

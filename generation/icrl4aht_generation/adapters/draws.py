@@ -7,12 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import Entry
 from icrl4aht_generation.collection.noise_rollout import noisy_episode_keys
 from icrl4aht_generation.collection.task import learner_key
 from icrl4aht_generation.env import Environment
@@ -41,8 +39,18 @@ def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[
     """
     recorded = dataset.reset_options(history_id, episode)["state"]
     entry = dataset.index.entry(history_id)
-    key, number = _key(dataset, entry, episode)
-    env = Environment(dataset.history_task(history_id).layout)
+    task, number = dataset.history_task(history_id), episode
+    ego = dataset.provenance.get(task.task_id, Provenance()).ego
+    if entry.source == "noise":  # noise histories play each episode in an environment of its own
+        key, number = noisy_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
+    elif entry.source == "ppo" and ego is not None:
+        key = stream_keys(learner_key(Work(task, learner=entry.learner)), ego["environments"])[entry.env_idx]
+    else:
+        raise NotStoredError(
+            f"{dataset.root}: history {history_id}, source {entry.source}: its keys are not known; take "
+            f"dataset.reset_options, which needs none"
+        )
+    env = Environment(task.layout)
     drawn = np.asarray(env.first_record(key[None], jnp.array([number])))[0]
     if not np.array_equal(drawn, recorded):
         raise NotStoredError(
@@ -50,17 +58,3 @@ def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[
             f"{episode}: other code made it; take dataset.reset_options, which needs no keys"
         )
     return {"key": np.asarray(jax.random.key_data(key)), "episode": number}
-
-
-def _key(dataset: Dataset, entry: Entry, episode: int) -> tuple[Key[Array, ""], int]:
-    """Return the key of the environment that an episode was played in, and the episode's number there."""
-    task = dataset.history_task(entry.history_id)
-    if entry.source == "noise":  # noise histories play each episode in an environment of its own
-        return noisy_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
-    ego = dataset.provenance.get(task.task_id, Provenance()).ego
-    if entry.source != "ppo" or ego is None:
-        raise NotStoredError(
-            f"{dataset.root}: history {entry.history_id}, source {entry.source}: its keys are not known; take "
-            f"dataset.reset_options, which needs none"
-        )
-    return stream_keys(learner_key(Work(task, learner=entry.learner)), ego["environments"])[entry.env_idx], episode

@@ -216,7 +216,10 @@ class ArtefactWriter:
         jax.block_until_ready((rollout, metrics))
         began = time.perf_counter()
         record_rollout(self._histories, number, rollout)
-        line = {"update": number, "step": (number + 1) * self._config.steps_per_update} | _finite(metrics)
+        line = {"update": number, "step": (number + 1) * self._config.steps_per_update}
+        line |= {name: float(value) for name, value in metrics.items()}
+        if not line.get("episodes", 1):
+            line.pop("return", None)  # no episode ended, so there is no mean return
         now = time.perf_counter()
         self._recording += now - began
         seconds = now - self._started
@@ -265,10 +268,3 @@ def last_timing(folder: Path) -> dict[str, float] | None:
         with suppress(OSError, ValueError, IndexError):
             return json.loads(path.read_text(encoding="utf-8").splitlines()[-1])
     return None
-
-
-def _finite(metrics: dict[str, Any]) -> dict[str, float]:
-    values = {name: float(value) for name, value in metrics.items()}
-    if not values.get("episodes", 1):
-        values.pop("return", None)  # no episode ended, so there is no mean return
-    return values

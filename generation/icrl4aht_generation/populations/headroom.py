@@ -44,10 +44,11 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceE
         mates = [build_learned(layout, folder) for folder in folders]
         partners = [build_learned(layout, _partner(folder), "sampled") for folder in folders]
         returns = reference_returns(layout, mates)
-        self_play = [_paired_return(layout, ego, mate) for ego, mate in zip(partners, mates, strict=True)]
-        for k, task in enumerate(own):
+        for k, (task, ego, mate) in enumerate(zip(own, partners, mates, strict=True)):
+            play = _compiled(layout, ego._replace(params=()), mate._replace(params=()))
+            self_play = float(np.asarray(play(ego.params, mate.params)).mean())
             stay, random, oracle = (float(returns[name][k]) for name in ("stay", "random", "oracle"))
-            found[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES, self_play[k])
+            found[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES, self_play)
     return found
 
 
@@ -55,11 +56,6 @@ def _partner(folder: Path) -> Path:
     """Return the folder of the policy that a checkpoint, m<k>/c<n>, was trained with."""
     response = folder.parent.parent / RESPONSES / folder.parent.name
     return response if response.is_dir() else folder
-
-
-def _paired_return(layout: Layout, ego: Policy, mate: Policy) -> float:
-    play = _compiled(layout, ego._replace(params=()), mate._replace(params=()))
-    return float(np.asarray(play(ego.params, mate.params)).mean())
 
 
 @lru_cache(maxsize=8)

@@ -70,7 +70,11 @@ def teammate_facts(
     for key, members in groups.items():
         draw, made = find_draw(key[0], members[0].teammate), recorded.get(members[0].task_id)
         if draw is not None:
-            found[key] = _facts_of_draw(draw)
+            near = NearestTest(draw.nearest, draw.distance, draw.behaviour)
+            if draw.other_distance < draw.distance:
+                near = NearestTest(draw.other, draw.other_distance, draw.behaviour)
+            egos = ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES)
+            found[key] = TeammateFacts(egos, near)
         elif made is not None and made.references is not None:
             found[key] = TeammateFacts(made.references, made.nearest_test)
     unknown = [key for key in groups if key not in found]
@@ -99,13 +103,6 @@ def release_provenance(root: Path) -> dict[str, Provenance]:
 def recorded_provenance(suite: Path) -> dict[str, Provenance]:
     """Return the provenance of the release whose teammates a suite is, by task id; empty for a profile's suite."""
     return release_provenance(suite.parent) if suite.name == TEAMMATES else {}
-
-
-def _facts_of_draw(draw: Draw) -> TeammateFacts:
-    near = NearestTest(draw.nearest, draw.distance, draw.behaviour)
-    if draw.other_distance < draw.distance:
-        near = NearestTest(draw.other, draw.other_distance, draw.behaviour)
-    return TeammateFacts(ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES), near)
 
 
 def _measure(

@@ -83,17 +83,6 @@ def test_entries_give_the_loss_and_gradient_of_observations(lite):
     assert_equal_results(found, loss_and_gradient(plain, params, batch_of(lite[0], "ad", "uint8")), params)
 
 
-def test_words_start_from_the_parameters_of_the_paper():
-    """Names, shapes and initial values agree, so one checkpoint serves both encoders."""
-    kinds: Any = ("paper", "words", "mlp")
-    paper, words, mlp = (encoder.WindowEncoder(8, kind, pointwise=(8,), spatial=(8,)) for kind in kinds)
-    obs = jnp.arange(25 * 45).reshape(5, 5, 45) % 3
-    params = paper.init(jax.random.key(3), obs)
-    jax.tree.map(np.testing.assert_array_equal, params, words.init(jax.random.key(3), obs))
-    np.testing.assert_array_equal(paper.apply(params, obs), words.apply(params, obs))
-    assert (25 * 45, 64) in [leaf.shape for leaf in jax.tree.leaves(jax.eval_shape(mlp.init, jax.random.key(0), obs))]
-
-
 @pytest.mark.parametrize("collide", [False, True])
 def test_equal_observations_are_in_one_group(monkeypatch, collide):
     """If hashes collide, each observation is its own group."""

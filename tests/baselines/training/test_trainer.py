@@ -147,10 +147,6 @@ class TestResume:
         config = read_config(folder)
         assert (config["train"]["steps"], config["method"]) == (7, "amago_offline")
 
-    def test_tensorboard_enabled_later_has_the_complete_log(self, through):
-        trained(through[0], tensorboard=True)
-        assert {step for _, step, *_ in scalars(through[0])} == {2, 3, 4, 6, 7}
-
     def test_tensorboard_that_is_not_installed(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "tensorboardX", None)
         with pytest.raises(OptionError, match=re.escape(f"needs tensorboardX: {install_command('tensorboard')}")):
@@ -387,12 +383,12 @@ class TestHeldOut:
     @pytest.mark.parametrize(
         ("method", "context", "choice", "message"),
         [
-            ("ad", 121, {}, r"context = 121: with every = 1 .* history of .* has 120 steps for a window"),
+            ("ad", 121, {}, r"context = 121: the shortest history of .* has 120 steps for a window"),
             ("dpt", 121, {}, r"context = 121: the shortest history has \d+ transitions; take fewer"),
-            ("ad", 41, {"every": 3}, "context = 41: with every = 3 and .* has 40 steps"),
+            ("ad", 41, {"every": 3}, "context = 41: .* has 40 steps .* every = 3 and"),
             ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts of one part"),
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
-            ("ad", 40, {"curriculum": 0.5}, r"context = 40: .* curriculum = 0\.5, .* has 30 steps"),
+            ("ad", 40, {"curriculum": 0.5}, r"context = 40: .* has 30 steps .* curriculum = 0\.5;"),
             ("amago_offline", 7, {"labels": "expert"}, "amago_offline learns from the histories' own actions"),
             ("ad", 7, {"layouts": ("demo_wide", "coord_simple"), "channels": "own"}, "channels = own: .*: leave out"),
             ("rl2", 7, {}, "rl2 learns by playing, not from histories"),

@@ -15,7 +15,6 @@ from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.releases.check import compare_rebuilds
 
-from icrl4aht_data.errors import OptionError
 from tests.helpers.tiny import TINY, artefact, start
 
 COLLECT = """
@@ -132,14 +131,6 @@ def test_a_partial_of_other_settings_is_started_again(built, task, tmp_path, mon
         with pytest.raises(KeyboardInterrupt):
             run_task((task[0], profile), folder)
     assert firsts == [3, 0]
-
-
-def test_a_damaged_state_is_an_error(task, tmp_path):
-    partial = partial_folder(tmp_path / "task")
-    partial.mkdir()
-    (partial / LEARNER).write_bytes(b"junk")
-    with pytest.raises(OptionError, match=r"learner\.safetensors: not a state of this training: .*start again"):
-        run_task(task, tmp_path / "task")
 
 
 def test_a_finished_task_is_unchanged(built, task, tmp_path):

@@ -60,17 +60,6 @@ def test_the_best_streams_are_kept_best_first(built):
     assert kept == np.argsort(-scores, kind="stable")[:3].tolist()
 
 
-def test_entries_say_where_they_come_from(built):
-    root = built / "a" / "lite"
-    entry = load_icrl4aht(root).entries[0]
-    assert (entry.teammate_family, entry.teammate_kind, entry.split) == ("H4", "utility_greedy", "train")
-    assert entry.has_expert_actions
-    provenance = json.loads((root / "meta" / "provenance.json").read_text())[entry.task_id]
-    assert provenance["ego"]["environments"] == 8
-    assert provenance["streams_kept"] == 3
-    assert "## Limits" in (root / "README.md").read_text()
-
-
 def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
     folder = artefact(built / "a")
     metadata = json.loads((folder / METADATA).read_text())
