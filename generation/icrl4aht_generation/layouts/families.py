@@ -11,18 +11,18 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_generation.layouts.fixtures import Kitchen
+from icrl4aht_generation.layouts.fixtures import LayoutDraw
 from icrl4aht_generation.layouts.grids import canonical_map
 from icrl4aht_generation.layouts.rearranged import MOST_REPEATS, draw_rearranged
 from icrl4aht_generation.layouts.rooms import draw_rooms
 from icrl4aht_generation.layouts.templates import draw_templates, has_tested_rooms
 
-LAYOUT_FAMILIES: dict[str, Callable[[int], Iterator[Kitchen]]] = {
+LAYOUT_FAMILIES: dict[str, Callable[[int], Iterator[LayoutDraw]]] = {
     "rearranged": draw_rearranged,
     "templates": draw_templates,
     "rooms": draw_rooms,
 }
-"""Family -> function that yields the kitchens of a seed."""
+"""Family -> function that yields the layouts of a seed without their names."""
 
 LAYOUT_SPLITS = {"train": 0.8, "validation": 0.1, "test": 0.1}
 """Split -> share of the layouts that may be trained on; the others are divided equally among the last two."""
@@ -86,9 +86,9 @@ def _numbered(family: str, seed: int) -> Iterator[Layout]:
     """Yield the different layouts of a family with their names, until many draws in a row repeat earlier ones."""
     known = {canonical_map(get_layout(name)) for name in LAYOUT_NAMES}
     number = repeats = 0
-    for kitchen in LAYOUT_FAMILIES[family](seed):
+    for drawn in LAYOUT_FAMILIES[family](seed):
         name = f"{family}-{seed}-{number}"
-        layout = Layout(name, name, *kitchen)
+        layout = Layout(name, name, *drawn)
         canonical = canonical_map(layout)
         repeats += 1
         if canonical not in known:

@@ -1,4 +1,4 @@
-"""Fixtures, recipes and starts of new kitchens, drawn for given rooms. Shapes: `H` rows, `W` columns."""
+"""Fixtures, recipes and starts of new layouts, drawn for given rooms. Shapes: `H` rows, `W` columns."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ MORE_FIXTURES = (4, 6)
 FREE_COUNTERS = 2
 """Least number of counters that remain; in small rooms there are fewer fixtures for that."""
 
-Kitchen = tuple[tuple[str, ...], tuple[tuple[int, int, int], ...], bool]
-"""Arguments of a `Layout` after its names: map, recipes, delivery indicator."""
+LayoutDraw = tuple[tuple[str, ...], tuple[tuple[int, int, int], ...], bool]
+"""Arguments of a `Layout` after its names: the map, recipes, and whether it has the delivery indicator."""
 
 _INGREDIENT_IDS = 4  # ids 0 to 3 have canonical channels
 _MOST = {"P": 3, "L": 2}  # most copies of a fixture; others have no limit
 _ARRANGEMENTS = 60  # tries with one choice of fixtures
 
 
-def furnished(rooms: np.ndarray, rng: np.random.Generator) -> Kitchen | None:
-    """Return a kitchen with these rooms and random fixtures, recipes and starts.
+def furnished(rooms: np.ndarray, rng: np.random.Generator) -> LayoutDraw | None:
+    """Return a layout with these rooms and random fixtures, recipes and starts.
 
     They are such that the scripted experts can deliver, see `is_easy`.
 
@@ -33,7 +33,7 @@ def furnished(rooms: np.ndarray, rng: np.random.Generator) -> Kitchen | None:
         rng: source of the draws.
 
     Returns:
-        The kitchen, or None if the rooms have too few walls, or no arrangement was found.
+        The layout, or None if the rooms have too few walls, or no arrangement was found.
     """
     reach = faced_cells(rooms)
     walls = np.flatnonzero(reach.any(axis=0))
@@ -57,7 +57,7 @@ def furnished(rooms: np.ndarray, rng: np.random.Generator) -> Kitchen | None:
 
 
 def _draw_fixtures(walls: int, rng: np.random.Generator) -> tuple[list[str], tuple[tuple[int, int, int], ...]]:
-    """Return the letters of a kitchen's fixtures, and its recipes: 2 to 4 of two ingredients, or 2 to 10 of three."""
+    """Return the letters of fixtures, and recipes: 2 to 4 of two ingredients, or 2 to 10 of three."""
     types = sorted(rng.choice(_INGREDIENT_IDS, rng.integers(2, 4), replace=False).tolist())
     dishes = list(combinations_with_replacement(types, 3))
     chosen = rng.choice(len(dishes), rng.integers(2, len(dishes) + 1), replace=False)

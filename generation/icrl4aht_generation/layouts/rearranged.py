@@ -12,7 +12,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import FOUR_RECIPES, LAYOUT_NAMES, TRACKS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_generation.layouts.fixtures import Kitchen
+from icrl4aht_generation.layouts.fixtures import LayoutDraw
 from icrl4aht_generation.layouts.grids import agent_rooms, grid_of, neighbours, rows_of
 
 MOST_REPEATS = 1000
@@ -52,7 +52,7 @@ def rearranged_layouts(layout: Layout, count: int) -> list[Layout]:
     return found
 
 
-def draw_rearranged(seed: int) -> Iterator[Kitchen]:
+def draw_rearranged(seed: int) -> Iterator[LayoutDraw]:
     """Yield the rearranged versions of the layout track's training layouts, one of each in turn.
 
     With seed 0 those of each are the `rearranged_layouts`.

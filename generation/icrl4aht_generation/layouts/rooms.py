@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icrl4aht_generation.layouts.fixtures import Kitchen, furnished
+from icrl4aht_generation.layouts.fixtures import LayoutDraw, furnished
 from icrl4aht_generation.layouts.grids import canonical_floor, neighbours, room_around
 from icrl4aht_generation.layouts.templates import published_rooms
 
@@ -18,18 +18,18 @@ MOST_ROWS, MOST_COLUMNS = 9, 11
 _FEWEST_CELLS = 6  # of a room for two agents
 
 
-def draw_rooms(seed: int) -> Iterator[Kitchen]:
-    """Yield kitchens, of the three kinds in turn, none with the rooms of a published layout."""
+def draw_rooms(seed: int) -> Iterator[LayoutDraw]:
+    """Yield layouts, of the three kinds in turn, none with the rooms of a published layout."""
     rng = np.random.default_rng([seed, *b"rooms"])
     published = published_rooms(tested=False) | published_rooms(tested=True)
     while True:
         for draw in (_shared_room, _two_rooms, _ring):
-            kitchen = None
-            while kitchen is None:
+            drawn = None
+            while drawn is None:
                 rooms = np.stack(draw(rng))
                 if canonical_floor(rooms[0] | rooms[1]) not in published:
-                    kitchen = furnished(rooms, rng)
-            yield kitchen
+                    drawn = furnished(rooms, rng)
+            yield drawn
 
 
 def _shared_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -25,7 +25,7 @@ _COLOURS = 128
 def save_sheet(path: Path, layouts: Sequence[Layout]) -> None:
     """Write a PNG with a picture of each layout at its start, and its name, split and number of recipes.
 
-    The agents stand on their starts, ego blue and teammate red; walls that no agent can face are grey.
+    The agents are on their starts, ego blue and teammate red; walls that no agent can face are grey.
 
     Raises:
         OptionError: if Pillow is missing.

@@ -78,10 +78,10 @@ def _delivery_fault(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple
     if not served:
         return "no soup can reach a goal on a plate"
     for recipe in recipes:
-        brought = {ingredient: agents_given(agents_with(str(ingredient))) for ingredient in sorted(set(recipe))}
-        for ingredient, agents in brought.items():
+        available = {ingredient: agents_given(agents_with(str(ingredient))) for ingredient in sorted(set(recipe))}
+        for ingredient, agents in available.items():
             if not any((pot & agents).any() for pot in served):
                 return f"ingredient {ingredient} cannot reach a pot whose soup can be delivered"
-        if not any(all((pot & agents).any() for agents in brought.values()) for pot in served):
+        if not any(all((pot & agents).any() for agents in available.values()) for pot in served):
             return f"the ingredients of recipe {recipe} cannot reach the same pot"
     return None

@@ -9,7 +9,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TESTED_ON
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_generation.layouts.fixtures import Kitchen, furnished
+from icrl4aht_generation.layouts.fixtures import LayoutDraw, furnished
 from icrl4aht_generation.layouts.grids import agent_rooms, canonical_floor, symmetric_images
 
 
@@ -44,14 +44,14 @@ def has_tested_rooms(layout: Layout) -> bool:
     return _floor(layout) in published_rooms(tested=True)
 
 
-def draw_templates(seed: int) -> Iterator[Kitchen]:
-    """Yield kitchens, every second one with rooms that may be trained on, see `published_rooms`."""
+def draw_templates(seed: int) -> Iterator[LayoutDraw]:
+    """Yield layouts, every second one with rooms that may be trained on, see `published_rooms`."""
     rng = np.random.default_rng([seed, *b"templates"])
     groups = [list(published_rooms(tested).values()) for tested in (False, True)]
     while True:
         for group in groups:
-            kitchen = None
-            while kitchen is None:
+            drawn = None
+            while drawn is None:
                 images = group[rng.integers(len(group))]
-                kitchen = furnished(images[rng.integers(len(images))], rng)
-            yield kitchen
+                drawn = furnished(images[rng.integers(len(images))], rng)
+            yield drawn

@@ -84,7 +84,7 @@ def test_every_layout_is_solvable(family, drawn):
 
 @pytest.mark.parametrize("family", ["templates", "rooms"])
 def test_fixtures_and_recipes(family, drawn):
-    """Fixtures are on walls that an agent can face; a kitchen has 4 to 6 more than it needs, in small rooms fewer."""
+    """Fixtures are on walls that an agent can face; a layout has 4 to 6 more than it needs, in small rooms fewer."""
     shown = set()
     for layout in drawn[family]:
         grid, types = grid_of(layout), layout.ingredients
@@ -163,9 +163,9 @@ def test_bad_arguments():
 
 def test_a_family_says_how_many_layouts_it_has(monkeypatch):
     few = generate_layouts("rooms", 0, 3)
-    kitchens = [(one.rows, one.recipes, False) for one in few]
+    draws = [(one.rows, one.recipes, False) for one in few]
     monkeypatch.setattr(families, "MOST_REPEATS", 20)
-    monkeypatch.setitem(LAYOUT_FAMILIES, "few", lambda seed: cycle(kitchens))
+    monkeypatch.setitem(LAYOUT_FAMILIES, "few", lambda seed: cycle(draws))
     with pytest.raises(OptionError, match="family few, seed 0: it has 3 layouts, expected 4; ask for fewer"):
         generate_layouts("few", 0, 4)
     trained = sum(split_of(one) == "train" for one in few)

@@ -1,4 +1,4 @@
-"""Kitchens in which a recipe cannot be delivered are refused with the reason, and others are not."""
+"""Layouts in which a recipe cannot be delivered are refused with the reason, and others are not."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HANDOVER = ("W01WPWWW", "WA W  XW", "W  W A W", "WBWWWWWW")
 TWO_FILL = ("W0WPW1WW", "WA P AXW", "W  W  BW", "WWWWWWWW")
 
 
-def kitchen(rows: tuple[str, ...], recipes=ZERO) -> Layout:
+def made(rows: tuple[str, ...], recipes=ZERO) -> Layout:
     return Layout("mine", "mine", rows, recipes)
 
 
@@ -35,7 +35,7 @@ def test_published_layouts_are_solvable(layout):
     ],
 )
 def test_solvable(rows, recipes):
-    check_solvable(kitchen(rows, recipes))
+    check_solvable(made(rows, recipes))
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_solvable(rows, recipes):
 )
 def test_unsolvable(rows, recipes, reason):
     with pytest.raises(OptionError, match=re.escape(f"layout mine: {reason}; change the map or the recipes")):
-        check_solvable(kitchen(rows, recipes))
+        check_solvable(made(rows, recipes))
 
 
 @pytest.mark.parametrize(
@@ -67,5 +67,5 @@ def test_unsolvable(rows, recipes, reason):
     ],
 )
 def test_scripted_experts_can_deliver(rows, easy):
-    layout = kitchen(rows, MIXED)
+    layout = made(rows, MIXED)
     assert is_easy(grid_of(layout), faced_cells(agent_rooms(layout)), MIXED) == easy
