@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, teammate_id
 from icrl4aht_data.environments import make_environment
-from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError, unknown
+from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError, check_choice, unknown
 from icrl4aht_data.fetch import ReleaseLocation, open_root
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
@@ -189,8 +189,7 @@ class Dataset(Selection):
             OptionError: if `validation` is not between 0 and 1, there is only one teammate, or every task has only
                 one history.
         """
-        if by not in SPLIT_BY:
-            raise unknown("split by", by, SPLIT_BY)
+        check_choice("split by", by, SPLIT_BY)
         share, seed = (
             check_number("validation", validation, Annotated[float, Meta(gt=0, lt=1)]),
             check_int("seed", seed, 0),

@@ -139,6 +139,16 @@ class MixedSplitsWarning(UserWarning):
     """A sampler draws training histories together with validation or test histories."""
 
 
+def check_choice(what: str, found: object, valid: Iterable[str]) -> None:
+    """Check that a value is one of the valid names.
+
+    Raises:
+        UnknownNameError: if it is not; lists the valid names and suggests the nearest.
+    """
+    if found not in tuple(valid):
+        raise unknown(what, found, valid)
+
+
 _LISTED, _COMPARED = 50, 1000  # numbers of valid names that an error lists, and that are searched for the nearest
 
 

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
-from icrl4aht_data.errors import NotStoredError, OptionError, unknown
+from icrl4aht_data.errors import NotStoredError, OptionError, check_choice
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -221,10 +221,8 @@ def render_observations(
             an argument that is not rows.
         NotStoredError: for rows without state records, as in a release of observations.
     """
-    if channels not in CHANNELS:
-        raise unknown("channels", channels, CHANNELS)
-    if obs not in RENDERED:
-        raise unknown("obs", obs, RENDERED)
+    check_choice("channels", channels, CHANNELS)
+    check_choice("obs", obs, RENDERED)
     if isinstance(rows, Mapping) and isinstance(rows.get("layout"), str):
         return render_observations([rows], channels=channels, obs=obs)[0]
     layouts, canonical = [get_layout(name) for name in _column(rows, "layout")], channels == "canonical"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 
-from icrl4aht_data.errors import unknown
+from icrl4aht_data.errors import check_choice, unknown
 from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS
 from icrl4aht_data.utils.plugins import Plugins
 
@@ -169,9 +169,7 @@ def check_membership(track: object, split: object, layout: object) -> None:
     Raises:
         UnknownNameError: lists the valid names and the nearest.
     """
-    if not isinstance(track, str) or track not in TRACKS:
-        raise unknown("track", track, TRACKS)
-    if not isinstance(split, str) or split not in SPLITS:
-        raise unknown("split", split, SPLITS)
+    check_choice("track", track, TRACKS)
+    check_choice("split", split, SPLITS)
     if layout not in TRACKS[track][split] and layout not in (names := track_layouts(track, split)):
         raise unknown(f"layout of the {split} split of track {track}", layout, names)

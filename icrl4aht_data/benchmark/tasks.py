@@ -29,7 +29,7 @@ from icrl4aht_data.benchmark.facts import (
     check_membership,
     kind_family,
 )
-from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, unknown
+from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, check_choice, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import is_inside, json_hash, parse_json, read_lines
 
@@ -156,10 +156,8 @@ def manifest_path(track: str, split: str, teammates: Literal["", "diverse"] = ""
     Raises:
         UnknownNameError: for an unknown track or split.
     """
-    if track not in TRACKS:
-        raise unknown("track", track, TRACKS)
-    if split not in SPLITS:
-        raise unknown("split", split, SPLITS)
+    check_choice("track", track, TRACKS)
+    check_choice("split", split, SPLITS)
     return Path(__file__).parent.parent / "manifests" / f"{'_'.join(filter(None, (track, teammates, split)))}.jsonl"
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import DTypeLike
 
-from icrl4aht_data.errors import LabelsMissingError, NotStoredError, OptionError, unknown
+from icrl4aht_data.errors import LabelsMissingError, NotStoredError, OptionError, check_choice
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
 from icrl4aht_data.overcooked.channels import Channels, observation_shape, to_canonical
 from icrl4aht_data.overcooked.fast_observe import fast_observe
@@ -145,8 +145,7 @@ class History(FieldArrays):
         return fast_observe(layout, self.read("state", start, stop), out, canonical=canonical)
 
     def _field(self, name: str) -> Field:
-        if name not in FIELDS:
-            raise unknown("field", name, FIELDS)
+        check_choice("field", name, FIELDS)
         field = FIELDS[name]
         if field.row == "state" and self.kind in field.absent:
             raise NotStoredError(

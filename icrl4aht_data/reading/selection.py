@@ -15,6 +15,7 @@ from icrl4aht_data.errors import (
     OptionError,
     PositionTypeError,
     UnknownNameError,
+    check_choice,
     unknown,
 )
 from icrl4aht_data.fetch import ReleaseLocation
@@ -70,12 +71,9 @@ class ReadOptions:
     channels: Channels = "own"
 
     def __post_init__(self) -> None:
-        if self.obs not in OBS:
-            raise unknown("obs", self.obs, OBS)
-        if self.cache not in CACHE_MODES:
-            raise unknown("cache", self.cache, CACHE_MODES)
-        if self.channels not in CHANNELS:
-            raise unknown("channels", self.channels, CHANNELS)
+        check_choice("obs", self.obs, OBS)
+        check_choice("cache", self.cache, CACHE_MODES)
+        check_choice("channels", self.channels, CHANNELS)
         check_int("threads", self.threads, 1)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar, Un
 
 import numpy as np
 
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
@@ -127,8 +127,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
     ) -> None:
         self.queries = check_int("queries", queries, 1)
         super().__init__(dataset, batch_size=batch_size, length=context, **options)
-        if order not in CONTEXT_ORDERS:
-            raise unknown("order", order, CONTEXT_ORDERS)
+        check_choice("order", order, CONTEXT_ORDERS)
         self.labels = check_labels(dataset, labels)
         ranges = (
             map(self._transitions, self._draws.steps(i)) for i in (0, 2**62)

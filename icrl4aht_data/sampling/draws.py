@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.random import Philox  # np.random is imported late, on first use; a fork must not interrupt that
 
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.utils.options import check_int
 
@@ -179,8 +179,7 @@ def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
         UnknownNameError, OptionError: unless they are a known name, or H numbers, none negative and not all 0.
     """
     if isinstance(weights, str):
-        if weights not in WEIGHTS:
-            raise unknown("weights", weights, WEIGHTS)
+        check_choice("weights", weights, WEIGHTS)
         return weights
     try:
         numbers = np.asarray(weights, np.float64)

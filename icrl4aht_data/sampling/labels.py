@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from icrl4aht_data.errors import LabelsMissingError, WeakLabelsWarning, unknown
+from icrl4aht_data.errors import LabelsMissingError, WeakLabelsWarning, check_choice
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import are_labels_weak
 from icrl4aht_data.reading.history import LABELS, Labels
@@ -23,8 +23,7 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
         UnknownNameError: for labels that do not exist.
         LabelsMissingError: if a history does not have them; names the labels that the selection has.
     """
-    if labels not in LABELS:
-        raise unknown("labels", labels, LABELS)
+    check_choice("labels", labels, LABELS)
     has = {name: dataset.has_labels(name) for name in LABELS}
     if has[labels].all():
         return labels

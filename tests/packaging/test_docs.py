@@ -28,7 +28,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.commands.cli import all_verbs, cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.schema import FIELDS, ENTRY_HINTS, Field, Kind
+from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, Field, Kind
 from icrl4aht_data.overcooked import state
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_positions
 from icrl4aht_data.overcooked.layouts import LAYOUTS
