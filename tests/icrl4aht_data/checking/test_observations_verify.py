@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,14 @@ import pytest
 from click.testing import CliRunner
 
 from icrl4aht_data import verify_release
-from icrl4aht_data.checking.report import Level
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import HISTORIES
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import make_tasks
+from tests.helpers.spoiled import problems, spoil
 
 
 @pytest.fixture
@@ -27,11 +26,7 @@ def copy(converted_release, tmp_path) -> Path:
     return shutil.copytree(converted_release, tmp_path / "copy")
 
 
-def problems(root: Path, level: Level = "full") -> list[str]:
-    return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
-
-
-def spoiled(published_folder, tmp_path: Path, name: str, index: Any, value: Any) -> Path:
+def written(published_folder, tmp_path: Path, name: str, index: Any, value: Any) -> Path:
     """Write the first history as a release with valid hashes and spoiled content."""
     arrays = {key: array.copy() for key, array in published_folder[1][0].items()}
     arrays[name][index] = value
@@ -51,18 +46,13 @@ class TestVerify:
 
     def test_deep_finds_an_impossible_observation(self, published_folder, tmp_path):
         first = 2 * (7 + get_layout("demo_wide").ingredient_types)
-        root = spoiled(published_folder, tmp_path, "obs", (33, slice(None), slice(None), first), 1)  # walls everywhere
+        root = written(published_folder, tmp_path, "obs", (33, slice(None), slice(None), first), 1)  # walls everywhere
         assert problems(root) == []
         (found,) = problems(root, level="deep")
         assert found.endswith("obs: 1 steps do not show demo_wide from any cell of the ego's, first step 33")
 
     def test_an_index_with_wrong_numbers(self, copy):
-        path = copy / "meta" / "histories.jsonl"
-        lines = [json.loads(line) for line in path.read_text().splitlines()]
-        lines[0]["score"] += 1
-        lines[1]["episodes"] -= 1
-        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-        write_manifest(copy)
+        spoil(copy, HISTORIES, lambda c: (c[0].update(score=c[0]["score"] + 1), c[1].update(episodes=5)))
         found = problems(copy)
         assert any("history 0: score: the index says" in line for line in found), found
         assert any("history 1: dones: expected 5 episodes of 20 steps, found 6" in line for line in found), found

@@ -15,24 +15,20 @@ from click.testing import CliRunner
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
-from icrl4aht_data.checking.report import Level
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.format.chunks import chunk_table_path
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance
-from icrl4aht_data.format.schema import HISTORIES, Kind
+from icrl4aht_data.format.schema import HISTORIES, INFO, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing import release
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.shard_writer import metadata_lines
 from tests.helpers.random_releases import SHARD, make_tasks, random_history, random_release
-
-
-def problems(root, level: Level = "full"):
-    return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
+from tests.helpers.spoiled import problems, spoil
 
 
 def test_a_valid_release(lite_or_full):
@@ -107,11 +103,11 @@ def test_no_folder(tmp_path):
     assert "no such folder" in problems(tmp_path / "nowhere")[0]
 
 
-def rewritten(tmp_path, spoil, kind: Kind = "lite"):
+def rewritten(tmp_path, change, kind: Kind = "lite"):
     """Write a release with valid hashes and spoiled content."""
     (task,) = make_tasks(["demo_simple"])
     arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
-    new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, spoil(arrays))])
+    new = NewTask(task, Provenance(), 1, lambda: [NewHistory(0, change(arrays))])
     return write_release(tmp_path / "spoiled", kind, [new], data_version="0.0.1", card="", kept_steps=20)
 
 
@@ -134,24 +130,22 @@ def test_expert_returns_match_the_provenance(tmp_path, name, value):
             7,
         )
         assert not problems(folder)
-    line = json.loads((root / HISTORIES).read_text()) | {name: value}
-    (root / HISTORIES).write_text(json.dumps(line) + "\n")
-    write_manifest(root)
+    spoil(root, HISTORIES, lambda lines: lines[0].update({name: value}))
     (problem,) = problems(root)
     assert f"history 0: {name} {value}, but meta/provenance.json has" in problem
 
 
 def at(name, index, value):
-    def spoil(arrays):
+    def change(arrays):
         changed = arrays[name].copy()
         changed[index] = value(changed[index]) if callable(value) else value
         return arrays | {name: changed}
 
-    return spoil
+    return change
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("change", "message"),
     [
         (at("actions", 7, 6), "actions: expected 0..5, found"),
         (at("teammate_actions", 7, -1), "teammate_actions: expected 0..5, found -1..5"),
@@ -164,19 +158,15 @@ def at(name, index, value):
         (at("episode_end_state", (1, 6), 5), "episode_end_state has an impossible recipe"),
     ],
 )
-def test_values_out_of_range(tmp_path, spoil, message):
-    root = rewritten(tmp_path, spoil)
+def test_values_out_of_range(tmp_path, change, message):
+    root = rewritten(tmp_path, change)
     for level in ("full", "deep"):
         found = problems(root, level)
         assert any(message in line for line in found), found
 
 
-def test_an_unspoiled_rewrite_is_valid(tmp_path):
-    assert problems(rewritten(tmp_path, lambda arrays: arrays), level="deep") == []
-
-
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("change", "message"),
     [
         (at("rewards", 33, 20), "replay: 1 rewards differ, first at step 33: rules 0.0, found 20.0"),
         (at("state", (45, 3), lambda facing: (facing + 1) % 4), "do not lead to the recorded next state"),
@@ -189,8 +179,8 @@ def test_an_unspoiled_rewrite_is_valid(tmp_path):
         ),
     ],
 )
-def test_deep_finds_impossible_transitions(tmp_path, spoil, message):
-    root = rewritten(tmp_path, spoil)
+def test_deep_finds_impossible_transitions(tmp_path, change, message):
+    root = rewritten(tmp_path, change)
     assert problems(root) == [], "only --deep looks at the physics"
     found = problems(root, level="deep")
     assert any(message in line for line in found), found
@@ -221,36 +211,12 @@ def test_a_chunk_table_of_another_shard(damaged):
     assert any("the index implies 42 chunks, the chunk table has 28" in line for line in found), found
 
 
-def spoil_index(root, change):
-    """Change the parsed index lines, and write a valid manifest."""
-    spoil_lines(root / "meta" / "histories.jsonl", change)
-    write_manifest(root)
-
-
-def spoil_lines(path, change):
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    change(lines)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-
-
-def swap(lines):
-    lines[0], lines[1] = lines[1], lines[0]
-
-
-def twice(lines):
-    lines[1]["env_idx"] = lines[0]["env_idx"]
-
-
-def foreign(lines):
-    lines[0]["layout"] = "test_simple"
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (swap, "line 1: history_id 1: ids count up from 0, expected 0"),
-        (twice, "history 1: stream 0 of its task appears twice"),
-        (foreign, "line 1: obs_shape"),
+        (lambda lines: lines.reverse(), "line 1: history_id 11: ids count up from 0, expected 0"),
+        (lambda lines: lines[1].update(env_idx=lines[0]["env_idx"]), "history 1: stream 0 of its task appears twice"),
+        (lambda lines: lines[0].update(layout="test_simple"), "line 1: obs_shape"),
         (lambda lines: lines[0].update(score=lines[0]["score"] + 1), "history 0: score: the index says"),
         (lambda lines: lines[1].update(seed=77), "history 1: index and task"),
         (lambda lines: lines[2].update(task_id="unknown"), "history 2: its task 'unknown' is missing"),
@@ -261,16 +227,15 @@ def foreign(lines):
     ],
 )
 def test_false_index_lines_are_found(damaged, change, message):
-    spoil_index(damaged, change)
+    spoil(damaged, HISTORIES, change)
     assert any(message in problem for problem in problems(damaged)), problems(damaged)
 
 
 def test_lost_shards_with_their_lines(tmp_path):
     random_release(tmp_path / "r", layouts=("cramped_up",), teammates=1, streams=2, shard_histories=1)
     assert problems(tmp_path / "r") == []
-    info = tmp_path / "r" / "meta" / "info.json"
-    info.write_text(json.dumps(json.loads(info.read_text()) | {"histories": 1}))
-    spoil_index(tmp_path / "r", lambda lines: lines.pop())
+    spoil(tmp_path / "r", INFO, lambda content: content.update(histories=1))
+    spoil(tmp_path / "r", HISTORIES, lambda lines: lines.pop())
     found = problems(tmp_path / "r")
     assert any("00001-of-00002.h5: the name of" in problem for problem in found), found
 
@@ -284,11 +249,7 @@ def test_equal_histories_of_a_task(tmp_path):
 
 
 def test_other_episode_lengths_than_stated(damaged):
-    path = damaged / "meta" / "info.json"
-    content = json.loads(path.read_text())
-    content["environment"]["kept_steps"] = 40
-    path.write_text(json.dumps(content))
-    write_manifest(damaged)
+    spoil(damaged, INFO, lambda content: content["environment"].update(kept_steps=40))
     assert any("expected 6 episodes of 40 steps, found 6 in 120 steps" in p for p in problems(damaged))
 
 

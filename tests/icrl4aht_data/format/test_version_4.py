@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.random_releases import SHARD, make_tasks, random_history, random_release
+from tests.helpers.spoiled import problems, spoiled
 
 SCRIPT = ExpertLabels(None, "the oracle's", return_greedy=40.0, episodes=200)
 SOURCES = ("noise", "ppo", "ppo", "noise")
@@ -56,22 +56,6 @@ def lite_mixed(tmp_path_factory) -> Path:
         noise["nearest_test"]["behaviour"] = 3
 
     return spoiled(root, root.with_name("complete"), PROVENANCE, complete)
-
-
-def spoiled(source: Path, target: Path, name: str, change: Callable[[Any], object]) -> Path:
-    """Copy a release, change one file of meta/ and write a matching manifest."""
-    shutil.copytree(source, target)
-    path, text = target / name, (source / name).read_text()
-    content = [json.loads(line) for line in text.splitlines()] if name.endswith("jsonl") else json.loads(text)
-    change(content)
-    lines = content if isinstance(content, list) else [content]
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    write_manifest(target)
-    return target
-
-
-def problems(root: Path) -> str:
-    return "\n".join(f"{finding.file}: {finding.problem}" for finding in verify_release(root, level="deep").findings)
 
 
 def test_arrays_round_trip(mixed):
@@ -167,7 +151,7 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
     ],
 )
 def test_false_values_are_found(lite_mixed, tmp_path, name, change, message):
-    found = problems(spoiled(lite_mixed, tmp_path / "release", name, change))
+    found = "\n".join(problems(spoiled(lite_mixed, tmp_path / "release", name, change), "deep"))
     assert message in found
 
 
@@ -193,7 +177,7 @@ def test_false_arrays_are_found(tmp_path, change, message):
     change(arrays)
     new = NewTask(task, Provenance(source="noise"), 1, lambda: [NewHistory(0, arrays)])
     root = write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
-    assert message in "\n".join(finding.problem for finding in verify_release(root).findings)
+    assert message in "\n".join(problems(root))
 
 
 def test_a_learner_that_provenance_does_not_have_is_not_written(tmp_path):
@@ -250,7 +234,7 @@ def test_left_out_tasks_are_checked(lite_mixed, tmp_path, change, message):
 def test_a_left_out_task_has_no_histories(lite_mixed, tmp_path):
     task_id = load_icrl4aht(lite_mixed).entries[0].task_id
     root = left_out(shutil.copytree(lite_mixed, tmp_path / "r"), replace(LEFT_OUT, task_id=task_id))
-    assert f"left_out: task '{task_id}' has histories in the index" in problems(root)
+    assert f"left_out: task '{task_id}' has histories in the index" in "\n".join(problems(root))
 
 
 def test_a_task_of_another_source_is_not_combined(tmp_path):

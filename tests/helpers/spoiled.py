@@ -1,0 +1,37 @@
+"""Releases with false values under a valid manifest, and what `verify_release` says about them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from icrl4aht_data import verify_release
+from icrl4aht_data.checking.report import Level
+from icrl4aht_data.format.manifest import write_manifest
+
+Change = Callable[[Any], Any]
+
+
+def problems(root: Path, level: Level = "full") -> list[str]:
+    """Return the problems of a release as texts `<file>: <problem>`."""
+    return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
+
+
+def spoil(root: Path, name: str, change: Change) -> None:
+    """Change the content of a JSON or JSONL file of a release, and write a matching manifest."""
+    path, is_lines = root / name, name.endswith("jsonl")
+    text = path.read_text()
+    content = [json.loads(line) for line in text.splitlines()] if is_lines else json.loads(text)
+    change(content)
+    path.write_text("".join(json.dumps(line) + "\n" for line in content) if is_lines else json.dumps(content))
+    write_manifest(root)
+
+
+def spoiled(source: Path, target: Path, name: str, change: Change) -> Path:
+    """Copy a release and change one of its files, see `spoil`."""
+    shutil.copytree(source, target)
+    spoil(target, name, change)
+    return target
