@@ -122,8 +122,7 @@ def check_references(
 def check_shard_sizes(origin: ReleaseLocation, index: Index, shards: list[str], report: Report) -> None:
     """Check that local and remote shards have the sizes that meta/info.json records."""
     known = set(report.findings)  # `check_files` has the sizes of very large shards
-    paths = {name: resolve_inside(index.root, name) for name in shards}
-    sizes = {name: path.stat().st_size for name, path in paths.items() if path.exists()}
+    sizes = {name: path.stat().st_size for name in shards if (path := resolve_inside(index.root, name)).exists()}
     if origin.remote is not None:
         try:
             sizes |= origin.remote.sizes(name for name in shards if name not in sizes)

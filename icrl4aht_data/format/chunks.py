@@ -43,11 +43,6 @@ def chunk_table_name(shard: str) -> str:
     return f"meta/chunks/{shard.removeprefix('data/').removesuffix('.h5')}.npy"
 
 
-def chunk_table_path(root: Path, shard: str) -> Path:
-    """Return the path of a shard's chunk table below the release folder `root`."""
-    return root / chunk_table_name(shard)
-
-
 def read_table(path: Path) -> np.ndarray:
     """Return a chunk table (rows,) of `CHUNK_DTYPE`, memory-mapped because it may be large.
 

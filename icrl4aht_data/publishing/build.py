@@ -85,11 +85,19 @@ def build_release(
     with atomic_folder(target, overwrite=overwrite, sources=[source]) as root:
         for number, name in enumerate(kept, start=1):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
-            _copy(source / name, root / name, link)
+            if link:
+                with suppress(OSError):  # hard links do not work across file systems, nor on all of them
+                    os.link(source / name, root / name)
+            if not (root / name).exists():
+                shutil.copyfile(source / name, root / name)
             advance("copying", number, len(kept))
         _keep_source_card(source, root)
         dataset = load_icrl4aht(source)
-        _add_figures(dataset, root)
+        (root / CURVES_FIGURE).parent.mkdir()
+        plot_layout_curves(dataset, root / CURVES_FIGURE)
+        plot_layouts(dataset.layouts, root / LAYOUTS_FIGURE)
+        tested = evaluated_on(layout.name for layout in dataset.layouts)
+        plot_headroom(read_headroom(HEADROOM_PROTOCOL), tested, root / HEADROOM_FIGURE)
         _add_parquet(dataset, root, advance)
         for folder in sorted((root / TEAMMATES).glob("*/")):
             (folder / RELEASE_CARD).write_text(teammate_card(folder), encoding="utf-8")
@@ -162,27 +170,11 @@ def _is_made_here(name: str) -> bool:
     return is_card or name in (CARD_TABLES, CROISSANT, *_COPIED_TEXTS) or name.startswith(folders)
 
 
-def _copy(source: Path, target: Path, link: bool) -> None:
-    if link:
-        with suppress(OSError):  # hard links do not work across file systems, nor on all of them
-            os.link(source, target)
-            return
-    shutil.copyfile(source, target)
-
-
 def _keep_source_card(source: Path, root: Path) -> None:
     """Store the source's card as `SOURCE_CARD`, unless it is generated (starts with YAML) or one is already stored."""
     text = read_text(source / RELEASE_CARD) if (source / RELEASE_CARD).is_file() else ""
     if text and not text.startswith("---\n") and not (root / SOURCE_CARD).exists():
         (root / SOURCE_CARD).write_text(text, encoding="utf-8")
-
-
-def _add_figures(dataset: Dataset, root: Path) -> None:
-    (root / CURVES_FIGURE).parent.mkdir()
-    plot_layout_curves(dataset, root / CURVES_FIGURE)
-    plot_layouts(dataset.layouts, root / LAYOUTS_FIGURE)
-    tested = evaluated_on(layout.name for layout in dataset.layouts)
-    plot_headroom(read_headroom(HEADROOM_PROTOCOL), tested, root / HEADROOM_FIGURE)
 
 
 def _add_parquet(dataset: Dataset, root: Path, advance: NamedProgress) -> None:

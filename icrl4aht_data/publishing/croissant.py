@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import datetime
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,6 +71,18 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)  # pyright: ignore[reportArgumentType]  # it parses addresses
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # raised by libraries that mlcroissant is built on
+        files = [
+            mlc.FileObject(
+                ctx=context,
+                id=name,
+                name=name,
+                content_url=name,
+                content_size=f"{(root / name).stat().st_size} B",
+                encoding_formats=[_FORMATS.get(Path(name).suffix, "text/plain")],
+                sha256=digests[name],
+            )
+            for name in sorted(digests)
+        ]
         sets, records = zip(*_tables(context, info), strict=True)
         return mlc.Metadata(
             ctx=context,
@@ -88,88 +100,54 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             cite_as=card_file("citation.bib").read_text(encoding="utf-8").strip(),
             creators=[mlc.Organization(ctx=context, name="The icrl4aht-data authors")],
             keywords=["reinforcement learning", "in-context learning", "ad-hoc teamwork", "Overcooked"],
-            distribution=[*_files(context, root, digests), *sets],
+            distribution=[*files, *sets],
             record_sets=list(records),
         ).to_json()
-
-
-def _files(context: mlcroissant.Context, root: Path, digests: Mapping[str, str]) -> list[mlcroissant.FileObject]:
-    import mlcroissant as mlc
-
-    return [
-        mlc.FileObject(
-            ctx=context,
-            id=name,
-            name=name,
-            content_url=name,
-            content_size=f"{(root / name).stat().st_size} B",
-            encoding_formats=[_FORMATS.get(Path(name).suffix, "text/plain")],
-            sha256=digests[name],
-        )
-        for name in sorted(digests)
-    ]
 
 
 def _tables(
     context: mlcroissant.Context, info: ReleaseInfo
 ) -> Iterator[tuple[mlcroissant.FileSet, mlcroissant.RecordSet]]:
     """Yield file and record sets of the Parquet index and, if there are any, of the Parquet episodes."""
-    texts = card_texts("index")
-    columns = [(name, texts[name], _TYPES[hint], "3" if hint == _SHAPE else None) for name, hint in ENTRY_HINTS.items()]
+    import mlcroissant as mlc
+
+    texts = card_texts("index") | episode_texts()
+    columns = [
+        (name, card_texts("index")[name], _TYPES[hint], "3" if hint == _SHAPE else None)
+        for name, hint in ENTRY_HINTS.items()
+    ]
     said = "One record per learning history: what it is, and where its arrays are stored."
-    yield _table(context, PARQUET_INDEX, "histories", said, ["history_id"], columns)
+    tables = [(PARQUET_INDEX, "histories", said, ["history_id"], columns)]
     if info.kind in KINDS:
         lengths = {"steps": info.environment.kept_steps, "width": record_width(list(map(get_layout, info.layouts)))}
-        texts, types = episode_texts(), {"s": "TEXT", "i": "INTEGER", "u": "INTEGER", "f": "FLOAT"}
+        types = {"s": "TEXT", "i": "INTEGER", "u": "INTEGER", "f": "FLOAT"}
         columns = [
             (name, texts[name], types[dtype[0]], ",".join(str(lengths[axis]) for axis in shape) or None)
             for name, (dtype, shape) in EPISODE_COLUMNS.items()
         ]
         said = "One record per episode: its history's names, returns, actions, rewards, labels, state records."
-        yield _table(context, PARQUET_EPISODES, "episodes", said, ["history_id", "episode"], columns)
-
-
-def _table(
-    context: mlcroissant.Context,
-    folder: str,
-    name: str,
-    description: str,
-    key: Sequence[str],
-    columns: Iterable[tuple[str, str, str, str | None]],
-) -> tuple[mlcroissant.FileSet, mlcroissant.RecordSet]:
-    """Return the file set and the record set of a folder of Parquet files.
-
-    Args:
-        context: the context of all objects.
-        folder: folder of Parquet files with equal columns, in folders by layout.
-        name: name of the record set.
-        description: description of the record set.
-        key: names of the columns that identify a record.
-        columns: name, description, Croissant's type, and lengths of lists or None, of each column.
-    """
-    import mlcroissant as mlc
-
-    files = mlc.FileSet(
-        ctx=context,
-        id=f"{folder}-files",
-        name=folder,
-        description=f"The {name}, one row each, in files for each layout and split.",
-        encoding_formats=[_FORMATS[".parquet"]],
-        includes=[f"{folder}/*/*.parquet"],
-    )
-    fields = [
-        mlc.Field(
+        tables.append((PARQUET_EPISODES, "episodes", said, ["history_id", "episode"], columns))
+    for folder, name, said, key, columns in tables:
+        files = mlc.FileSet(
             ctx=context,
-            id=f"{name}/{column}",
-            name=column,
-            description=text,
-            data_types=[getattr(mlc.DataType, kind)],
-            is_array=True if shape else None,
-            array_shape=shape,
-            source=mlc.Source(ctx=context, file_set=f"{folder}-files", extract=mlc.Extract(ctx=context, column=column)),
+            id=f"{folder}-files",
+            name=folder,
+            description=f"The {name}, one row each, in files for each layout and split.",
+            encoding_formats=[_FORMATS[".parquet"]],
+            includes=[f"{folder}/*/*.parquet"],
         )
-        for column, text, kind, shape in columns
-    ]
-    keys = [f"{name}/{column}" for column in key]
-    records = mlc.RecordSet(ctx=context, id=name, name=name, description=description, key=keys, fields=fields)
-    return files, records
+        fields = [
+            mlc.Field(
+                ctx=context,
+                id=f"{name}/{column}",
+                name=column,
+                description=text,
+                data_types=[getattr(mlc.DataType, kind)],
+                is_array=True if shape else None,
+                array_shape=shape,
+                source=mlc.Source(ctx=context, file_set=files.id, extract=mlc.Extract(ctx=context, column=column)),
+            )
+            for column, text, kind, shape in columns
+        ]
+        keys = [f"{name}/{column}" for column in key]
+        yield files, mlc.RecordSet(ctx=context, id=name, name=name, description=said, key=keys, fields=fields)

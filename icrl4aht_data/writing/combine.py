@@ -20,6 +20,9 @@ from icrl4aht_data.writing.release import NewTask, write_release
 from icrl4aht_data.writing.release_folder import as_path, check_target
 from icrl4aht_data.writing.stored import release_tasks, stored_task
 
+_OF_ONE_RELEASE = re.compile(r"\A---\n(?s:.*?)\n---\n|^!\[.*\n\n?", re.MULTILINE)
+"""YAML front matter and pictures of a card, which do not work in a combined one."""
+
 
 def combine_releases(
     target: str | Path,
@@ -51,6 +54,10 @@ def combine_releases(
     check_target(target, overwrite, roots)
     datasets = [load_icrl4aht(root) for root in roots]
     _check_compatible(datasets)
+    versions = {dataset.info.data_version for dataset in datasets}
+    if data_version is None and len(versions) > 1:
+        raise OptionError(f"data versions {', '.join(sorted(versions))}: say which one the combination has")
+    data_version = data_version or versions.pop()
     first, tasks = datasets[0].info, _tasks(datasets)
     written = {new.task.task_id for new in tasks}
     left_out = dict.fromkeys(task for dataset in datasets for task in dataset.info.left_out)
@@ -58,7 +65,7 @@ def combine_releases(
         target,
         first.kind,
         tasks,
-        data_version=data_version or _common_version(datasets),
+        data_version=data_version,
         source_card=_source_card(datasets),
         kept_steps=first.environment.kept_steps,
         left_out=[task for task in left_out if task.task_id not in written],
@@ -100,13 +107,6 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
     return tasks
 
 
-def _common_version(datasets: Sequence[Dataset]) -> str:
-    versions = {dataset.info.data_version for dataset in datasets}
-    if len(versions) > 1:
-        raise OptionError(f"data versions {', '.join(sorted(versions))}: say which one the combination has")
-    return versions.pop()
-
-
 def _source_card(datasets: Sequence[Dataset]) -> str:
     """Return a card that lists the releases with the hashes of their manifests, followed by their cards."""
     parts, cards = [], []
@@ -117,11 +117,6 @@ def _source_card(datasets: Sequence[Dataset]) -> str:
             f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}\n"
         )
         names = [RELEASE_CARD] + [name for name in listed if name == SOURCE_CARD]
-        cards += [_card_text(read_text(dataset.origin.file(name))) for name in names]
+        cards += [_OF_ONE_RELEASE.sub("", read_text(dataset.origin.file(name))) for name in names]
     heading = "# ICRL4AHT learning histories, combined\n\nMade of these releases. Their cards follow.\n\n"
     return f"{heading}{''.join(parts)}\n" + "\n".join(cards)
-
-
-def _card_text(card: str) -> str:
-    """Return a card without YAML front matter and pictures, which do not work in a combined card."""
-    return re.sub(r"\A---\n(?s:.*?)\n---\n|^!\[.*\n\n?", "", card, flags=re.MULTILINE)

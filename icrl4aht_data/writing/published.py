@@ -356,13 +356,10 @@ class _PublishedHistory:
             raise PublishedFormatError(f"{self.where}: missing, but the index names it")
         missing = [name for name in dict.fromkeys(("obs", *self.field_names())) if name not in present]
         if missing:
-            remedy = "the index lists it; complete the file or correct the index"
-            if "state" in missing:
-                remedy = (
-                    f"a {self.kind} release is made of state records, which observations do not determine; "
-                    f"convert with `--to {OBSERVATIONS}`"
-                )
-            raise PublishedFormatError(f"{self.where}: missing {', '.join(missing)}: {remedy}")
+            raise PublishedFormatError(
+                f"{self.where}: missing {', '.join(missing)}: complete the file or correct the index; without state "
+                f"records, convert with `--to {OBSERVATIONS}`"
+            )
 
     def read(self, name: str) -> np.ndarray:
         """Return one array in the field's compact dtype: (T, ...), or (E, S) for `episode_end_state`.

@@ -19,7 +19,7 @@ from icrl4aht_data.format.chunks import (
     DEFLATE_LEVEL,
     chunk_hash,
     chunk_locations,
-    chunk_table_path,
+    chunk_table_name,
     encode_chunk,
 )
 from icrl4aht_data.format.schema import CHUNK_DTYPE, FORMAT_VERSION, Entry, Field, Kind
@@ -56,7 +56,7 @@ def write_shard(
         entries: index entries of the histories, each with its position in the shard (`h5_group`, `h5_row`).
         histories: the chunks of each entry's history, see `encode_history`.
     """
-    path, table_path = root / shard, chunk_table_path(root, shard)
+    path, table_path = root / shard, root / chunk_table_name(shard)
     path.parent.mkdir(parents=True, exist_ok=True)
     table_path.parent.mkdir(parents=True, exist_ok=True)
     layout = get_layout(entries[0].layout)

@@ -22,7 +22,7 @@ from icrl4aht_data.errors import (
     ShardTruncatedError,
     UnknownNameError,
 )
-from icrl4aht_data.format.chunks import chunk_table_path
+from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.manifest import write_manifest
 from tests.helpers.random_releases import SHARD
 
@@ -172,7 +172,7 @@ def test_truncated_shard(damaged, share):
 def test_every_flipped_bit_in_a_chunk_is_caught(damaged):
     path = damaged / SHARD
     data = path.read_bytes()
-    table = np.load(chunk_table_path(damaged, SHARD))
+    table = np.load(damaged / chunk_table_name(SHARD))
     rng = np.random.default_rng(0)
     for row in rng.choice(np.count_nonzero(table["rows"]), 40):
         spoiled = bytearray(data)
@@ -195,7 +195,7 @@ def test_index_and_shard_disagree(damaged):
 
 
 def test_chunk_table_faults(damaged):
-    path = chunk_table_path(damaged, SHARD)
+    path = damaged / chunk_table_name(SHARD)
     table = np.load(path)
     np.save(path, table[1:])
     with pytest.raises(ShardMismatchError):

@@ -18,7 +18,7 @@ from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import ReleaseError
-from icrl4aht_data.format.chunks import chunk_table_path
+from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, Kind
@@ -204,8 +204,8 @@ def test_observations_that_differ_from_the_state(tmp_path, monkeypatch):
 def test_a_chunk_table_of_another_shard(damaged):
     other = damaged.with_name("other")
     random_release(other, streams=2)
-    table = chunk_table_path(damaged, SHARD)
-    shutil.copy(chunk_table_path(other, SHARD), table)
+    table = damaged / chunk_table_name(SHARD)
+    shutil.copy(other / chunk_table_name(SHARD), table)
     write_manifest(damaged)
     found = problems(damaged)
     assert any("the index implies 42 chunks, the chunk table has 28" in line for line in found), found
@@ -275,7 +275,7 @@ def test_no_damage_makes_verify_raise(damaged, flips, texts):
 
 
 def test_chunk_offsets_beyond_any_file(damaged):
-    path = chunk_table_path(damaged, SHARD)
+    path = damaged / chunk_table_name(SHARD)
     table = np.load(path)
     table["offset"][3] = 2**63 + 5
     np.save(path, table)
@@ -293,7 +293,7 @@ def test_a_group_where_a_dataset_should_be(damaged):
 
 def cover_again(root):
     """Correct the chunk table's rows of the bytes between the chunks, and the manifest."""
-    path = chunk_table_path(root, SHARD)
+    path = root / chunk_table_name(SHARD)
     table = np.load(path)
     chunks = table[table["rows"] > 0]
     np.save(path, np.concatenate([chunks, metadata_lines((root / SHARD).read_bytes(), chunks)]))
@@ -330,7 +330,7 @@ class TestCommand:
     def test_damaged(self, damaged):
         path = damaged / SHARD
         data = bytearray(path.read_bytes())
-        data[int(np.load(chunk_table_path(damaged, SHARD))["offset"][0])] ^= 1
+        data[int(np.load(damaged / chunk_table_name(SHARD))["offset"][0])] ^= 1
         path.write_bytes(data)
         result = CliRunner().invoke(cli, ["verify", str(damaged)])
         assert result.exit_code == 1

@@ -12,7 +12,7 @@ import pytest
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import ShardCorruptError
 from icrl4aht_data.format import chunks
-from icrl4aht_data.format.chunks import check_chunk, chunk_hash, chunk_table_path, decode_chunk, encode_chunk
+from icrl4aht_data.format.chunks import check_chunk, chunk_hash, chunk_table_name, decode_chunk, encode_chunk
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import CHUNK_DTYPE
 from icrl4aht_data.reading.shard import Shards
@@ -97,7 +97,7 @@ def test_a_chunk_is_compared_with_its_row():
 def test_every_row_has_the_hash_of_its_bytes(lite):
     root, _ = lite
     for shard in load_icrl4aht(root).info.shards:
-        table, data = np.load(chunk_table_path(root, shard)), (root / shard).read_bytes()
+        table, data = np.load(root / chunk_table_name(shard)), (root / shard).read_bytes()
         assert table.dtype == CHUNK_DTYPE
         assert not table["rows"][-1], "the bytes between the chunks come last"
         for row in table:
@@ -126,7 +126,7 @@ def test_a_forged_release_with_its_own_hashes_does_not_share_a_cache(stored, tmp
     """The cache must tell apart two releases whose CRC-32 checksums agree."""
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
     forged = forge(stored, tmp_path / "forged", "other actions")
-    path, (row, number) = chunk_table_path(tmp_path / "forged", SHARD), actions_row(stored)
+    path, (row, number) = tmp_path / "forged" / chunk_table_name(SHARD), actions_row(stored)
     table, data = np.load(path), (tmp_path / "forged" / SHARD).read_bytes()
     start = int(row["offset"])
     table["hash"][number] = np.frombuffer(chunk_hash(data[start : start + int(row["size"])]), np.uint8)

@@ -149,9 +149,9 @@ class TestFaults:
                 r"group /2: dones: expected an end every 20 steps, found 4 .*\[5, 19, 39\].*--kept",
             ),
             (put("/2/dones", slice(None), 0), r"group /2: dones: expected an end every 20 steps, found 0 in 60 steps"),
-            (drop("/1/obs"), r"histories\.h5, group /1: missing obs: the index lists it"),
+            (drop("/1/obs"), r"histories\.h5, group /1: missing obs: complete the file"),
             (drop("/1/rewards"), r"group /1: missing rewards"),
-            (drop("/1/expert_actions"), r"group /1: missing expert_actions: the index lists it"),
+            (drop("/1/expert_actions"), r"group /1: missing expert_actions: complete the file"),
             (drop("/3"), r"group /3: missing, but the index names it"),
             (replace("/3", np.zeros(4)), r"group /3: missing"),
             (

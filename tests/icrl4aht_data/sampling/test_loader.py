@@ -10,7 +10,7 @@ import pytest
 
 from icrl4aht_data import Curriculum, load_icrl4aht
 from icrl4aht_data.errors import ShardCorruptError, UnknownNameError
-from icrl4aht_data.format.chunks import chunk_table_path
+from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.sources import choose_cache
 from icrl4aht_data.writing.convert import to_release
@@ -84,7 +84,7 @@ class TestCaches:
             "ICRL4AHT_CACHE_DIR", str(tmp_path / "cache")
         )  # drops cached arrays of the undamaged release
         data = bytearray((damaged / SHARD).read_bytes())
-        data[int(np.load(chunk_table_path(damaged, SHARD))["offset"][0])] ^= 1
+        data[int(np.load(damaged / chunk_table_name(SHARD))["offset"][0])] ^= 1
         (damaged / SHARD).write_bytes(data)
         sampler = load_icrl4aht(damaged, layout="coord_simple", cache=cache).ad(batch_size=64, length=9)
         with pytest.raises(ShardCorruptError, match="chunk 0 of state in history 0"):

@@ -86,7 +86,7 @@ def test_published_files_with_faults(published, tmp_path):
         group: Any = file["/3"]
         group["obs"][5] += 1
         del file["/1/state"]
-    fails(r"histories\.h5, group /1: missing state: a lite release is made of state records")
+    fails(r"histories\.h5, group /1: missing state: complete the file")
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
         file["/1/state"] = file["/0/state"]
     fails(r"group /1: obs is not what state shows")
