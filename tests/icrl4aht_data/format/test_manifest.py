@@ -21,30 +21,16 @@ from tests.helpers.random_releases import SHARD
 from tests.robustness.limits import permissions_count
 
 
-@pytest.mark.parametrize("name", [HISTORIES, INFO, PROVENANCE, TASKS])
-def test_no_flipped_bit_of_meta_is_read(damaged, name):
+@pytest.mark.parametrize("name", [HISTORIES, INFO, PROVENANCE, TASKS, chunk_table_name(SHARD)])
+def test_no_flipped_bit_is_read(damaged, name):
     """Flipped bits are found even if the modification time is restored."""
     path, rng = damaged / name, np.random.default_rng(0)
     right, before = path.read_bytes(), path.stat()
-    for _ in range(40):
+    for _ in range(30):
         flip_bit(path, int(rng.integers(len(right))), int(rng.integers(8)))
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-        with pytest.raises(
-            IndexFormatError, match=rf"{path}: expected sha256 \w{{64}} as {MANIFEST} says, found \w{{64}}"
-        ):
-            load_icrl4aht(damaged)
-        path.write_bytes(right)
-    load_icrl4aht(damaged)
-
-
-def test_no_flipped_bit_of_a_chunk_table_is_read(damaged):
-    path, rng = damaged / chunk_table_name(SHARD), np.random.default_rng(0)
-    right = path.read_bytes()
-    for _ in range(20):
-        flip_bit(path, int(rng.integers(len(right))), int(rng.integers(8)))
-        dataset = load_icrl4aht(damaged)
-        with pytest.raises(ChunkTableError, match=rf"{path}: expected sha256"):
-            dataset[0].read("actions")
+        with pytest.raises(ReleaseError, match=rf"{path}: expected sha256 \w{{64}} as {MANIFEST} says, found \w{{64}}"):
+            load_icrl4aht(damaged)[0].read("actions")
         path.write_bytes(right)
     load_icrl4aht(damaged)[0].read("actions")
 

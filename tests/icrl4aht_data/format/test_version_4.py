@@ -123,7 +123,6 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
             lambda c: c[5].update(env_idx=2),
             "5: env_idx: expected less than the 2 environments",
         ),
-        (HISTORIES, lambda c: c[0].update(learner=-1), "Expected `int` >= 0"),
         (HISTORIES, lambda c: c[1].update(source="ppo"), "histories 0 and 1, of one task: unlike ['source']"),
         (
             HISTORIES,
@@ -131,7 +130,6 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
             "source: expected 'ppo' as in the index",
         ),
         (HISTORIES, lambda c: c[0].update(has_oracle_actions=False), "the index implies"),
-        (PROVENANCE, lambda c: last(c).update(learners=0), "Expected `int` >= 1"),
         (
             PROVENANCE,
             lambda c: last(c).update(streams_recorded=2),
@@ -143,8 +141,6 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
         (PROVENANCE, lambda c: first(c)["noise"].update(end=[0.2, 0.1]), "noise.end: expected a range [least, most]"),
         (PROVENANCE, lambda c: first(c)["noise"].update(power=2), "Expected `array"),
         (PROVENANCE, lambda c: first(c)["references"].pop("stay"), "missing required field `stay`"),
-        (PROVENANCE, lambda c: first(c)["references"].update(oracle="much"), "Expected `float`, got `str`"),
-        (PROVENANCE, lambda c: first(c)["nearest_test"].update(distance=1.5), "Expected `float` <= 1"),
         (PROVENANCE, lambda c: first(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
         (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="no"), "matching regex"),
         (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise histories"),

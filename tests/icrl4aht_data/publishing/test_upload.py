@@ -202,11 +202,8 @@ def test_an_unreachable_hub(published, tmp_path):
     with hub_server(tmp_path / "hub") as hub:
         hub.close()
         for dry_run in (True, False):
-            with pytest.raises(
-                UploadError, match=r"us/histories at http://.*; nothing was sent: run the same"
-            ) as error:
+            with pytest.raises(UploadError, match=r"us/histories at http://.*; nothing was sent: run the same"):
                 upload_release(published, ADDRESS, dry_run=dry_run)
-            assert "kept" not in str(error.value)
 
 
 def test_a_changed_repository_gets_no_tag(hub, published, tmp_path):

@@ -180,9 +180,6 @@ def test_converting_again(lite, tmp_path):
     to_published(dataset, out)
     before = contents(out)
     assert before.keys() == {"histories.h5", "histories_index.jsonl", "tasks.jsonl", "provenance.json"}
-    with pytest.raises(OptionError, match="exists; give another folder, or replace it by --overwrite"):
-        to_published(dataset, out)
-    assert contents(out) == before
     (tmp_path / ".out.partial").mkdir()  # an interrupted conversion
     (tmp_path / ".out.partial" / "histories.h5").write_bytes(before["histories.h5"][:1000])
     to_published(dataset.filter(layout="demo_wide"), out, overwrite=True)
