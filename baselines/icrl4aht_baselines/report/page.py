@@ -223,7 +223,9 @@ def _settings_table(runs: Sequence[EvaluationRun]) -> dict[str, list[str]]:
     for label, source in [(run.label, source) for run in runs for source in run.sources]:
         shown = {"agent": label, "layouts": ", ".join(source.layouts), "results": source.folder}
         shown |= {"settings hash": json_hash(source.settings), "in training": describe_training(source.seen)}
-        columns.append(pd.json_normalize(source.settings | {"run": source.trained or {}} | shown).iloc[0])
+        trained = dict(source.trained or {})
+        record = shown | source.settings | trained.pop("config", {}) | trained
+        columns.append(pd.json_normalize(record).iloc[0])
     frame = pd.concat(columns, axis=1).fillna("")
-    frame = frame[~frame.index.str.endswith(TRAINED_ON) & (frame != "").any(axis=1)]
+    frame = frame[~frame.index.str.contains(f"{TRAINED_ON}|groups|selections") & (frame != "").any(axis=1)]
     return {str(name): [str(value) for value in row] for name, row in frame.iterrows()}
