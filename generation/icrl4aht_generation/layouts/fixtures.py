@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from icrl4aht_generation.layouts.grids import rows_of
-from icrl4aht_generation.layouts.solvable import faced_cells, is_easy
+from icrl4aht_generation.layouts.solvable import faced_cells, is_easy, waiting_cells
 
 MORE_FIXTURES = (4, 6)
 """Least and most fixtures besides those that a dish needs: one pile of each ingredient and of plates, a pot, a goal."""
@@ -26,7 +26,8 @@ _ARRANGEMENTS = 60  # tries with one choice of fixtures
 def furnished(rooms: np.ndarray, rng: np.random.Generator) -> LayoutDraw | None:
     """Return a layout with these rooms and random fixtures, recipes and starts.
 
-    They are such that the scripted experts can deliver, see `is_easy`.
+    They are such that the scripted experts can deliver, see `is_easy` and `waiting_cells`. In a shared room, one of the
+    agents starts on a cell of the latter.
 
     Args:
         rooms: bool (2, H, W), the floor of each agent; the same one if they share a room.
@@ -40,20 +41,17 @@ def furnished(rooms: np.ndarray, rng: np.random.Generator) -> LayoutDraw | None:
     fixtures, recipes = _draw_fixtures(len(walls), rng)
     if len(fixtures) + FREE_COUNTERS > len(walls):
         return None
-    grid = np.where(rooms.any(axis=0), " ", "W")
+    grid, shared = np.where(rooms.any(axis=0), " ", "W"), np.array_equal(*rooms)
     for _ in range(_ARRANGEMENTS):
         grid.flat[walls] = "W"
         grid.flat[rng.permutation(walls)[: len(fixtures)]] = fixtures
-        if is_easy(grid, reach, recipes):
-            break
-    else:
-        return None
-    if np.array_equal(*rooms):
-        starts = rng.choice(np.flatnonzero(rooms[0]), 2, replace=False)
-    else:
-        starts = [rng.choice(np.flatnonzero(room)) for room in rooms]
-    grid.flat[starts] = "A"
-    return rows_of(grid), recipes, bool(rng.integers(2))
+        first = waiting_cells(grid, rooms[0], recipes) if shared else np.flatnonzero(rooms[0])
+        if len(first) and (shared or is_easy(grid, reach, recipes)):
+            start = rng.choice(first)
+            second = np.flatnonzero(rooms[1])
+            grid.flat[[start, rng.choice(second[second != start])]] = "A"
+            return rows_of(grid), recipes, bool(rng.integers(2))
+    return None
 
 
 def _draw_fixtures(walls: int, rng: np.random.Generator) -> tuple[list[str], tuple[tuple[int, int, int], ...]]:

@@ -33,7 +33,7 @@ def check_solvable(layout: Layout) -> None:
 
 
 def is_easy(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> bool:
-    """Return whether one agent can deliver every recipe alone, or one can only cook them and the other only serve them.
+    """Return whether in two rooms one agent can deliver every recipe, or one can only cook and the other only serve.
 
     The scripted experts need that: they hand nothing over on counters, and cook in each pot that they reach.
 
@@ -42,7 +42,7 @@ def is_easy(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, in
         reach: bool (2, H, W), the cells that each agent can face.
         recipes: triples of ingredient ids.
     """
-    ingredients = {str(ingredient) for recipe in recipes for ingredient in recipe}
+    ingredients = _ingredient_letters(recipes)
     letters = [set(grid[faced].tolist()) for faced in reach]
     for cook, server in product((0, 1), repeat=2):
         can = letters[cook] >= {"P", *ingredients} and letters[server] >= {"P", "B", "X"}
@@ -50,6 +50,31 @@ def is_easy(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, in
         if can and pots_shared and (cook == server or not letters[server] & set(digits)):
             return True
     return False
+
+
+def waiting_cells(grid: np.ndarray, room: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> np.ndarray:
+    """Return the cells of a shared room on which one agent can wait while the other delivers every recipe alone.
+
+    Others are the only cell from which something that a recipe needs can be reached. No cell may cut the room in two.
+
+    Args:
+        grid: the map, str (H, W).
+        room: bool (H, W), the floor of both agents.
+        recipes: triples of ingredient ids.
+
+    Returns:
+        Flat cell numbers, int (cells,), ascending.
+    """
+    free = room.copy()
+    for letter in sorted({*_NEEDED, *_ingredient_letters(recipes)}):
+        access = neighbours(grid == letter) & room
+        if access.sum() == 1:
+            free &= ~access
+    return np.flatnonzero(free)
+
+
+def _ingredient_letters(recipes: Sequence[tuple[int, int, int]]) -> set[str]:
+    return {str(ingredient) for recipe in recipes for ingredient in recipe}
 
 
 def faced_cells(rooms: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import re
 import pytest
 from icrl4aht_generation.layouts import check_solvable
 from icrl4aht_generation.layouts.grids import agent_rooms, grid_of
-from icrl4aht_generation.layouts.solvable import faced_cells, is_easy
+from icrl4aht_generation.layouts.solvable import faced_cells, is_easy, waiting_cells
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
@@ -69,3 +69,11 @@ def test_unsolvable(rows, recipes, reason):
 def test_scripted_experts_can_deliver(rows, easy):
     layout = made(rows, MIXED)
     assert is_easy(grid_of(layout), faced_cells(agent_rooms(layout)), MIXED) == easy
+
+
+def test_cells_on_which_an_agent_can_wait():
+    layout = made(("W00WW", "BA AX", "W   W", "WPPWW"))
+    cells = waiting_cells(grid_of(layout), agent_rooms(layout)[0], ZERO)
+    assert cells.tolist() == [7, 11, 12, 13], "not next to the only plates or the goal"
+    full = made(("WR20W", "P  AW", "L A B", "W1XWW"), ((0, 1, 2),))
+    assert len(waiting_cells(grid_of(full), agent_rooms(full)[0], full.recipes)) == 0
