@@ -173,11 +173,8 @@ def _check(entry: Entry, number: int, checked: set[tuple[Any, ...]]) -> None:
     if key in checked:
         return
     checked.add(key)
-    for name, value in zip(_STRINGS, key, strict=False):
-        try:
-            check_name(value)
-        except IndexFormatError as error:
-            raise IndexFormatError(f"field {name!r}: {error}") from error
+    for value in _names(entry):
+        check_name(value)
     check_membership(entry.track, entry.split, entry.layout)
     check_family(entry.teammate_family)
     expected = get_layout(entry.layout).obs_shape

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import shutil
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
@@ -124,9 +125,14 @@ def check_valid(root: Path, advance: NamedProgress = lambda what, done, total: N
         read_info(root)  # raises a helpful error if the folder is not a release
     report = verify_release(root, advance=advance)
     if not report.ok:
-        first = "; ".join(f"{finding.file}: {finding.problem}" for finding in report.findings[:3])
-        more = f"; and {len(report.findings) - 3} more" if len(report.findings) > 3 else ""
-        raise ReleaseError(f"{root}: not valid: {first}{more}; see `icrl4aht-data verify`")
+        found = first_of([f"{finding.file}: {finding.problem}" for finding in report.findings])
+        raise ReleaseError(f"{root}: not valid: {found}; see `icrl4aht-data verify`")
+
+
+def first_of(problems: Sequence[str]) -> str:
+    """Return the first three problems as text, and the number of others."""
+    more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
+    return "; ".join(problems[:3]) + more
 
 
 def teammate_card(folder: Path) -> str:

@@ -14,7 +14,7 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError, UploadError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.publishing.build import check_valid
+from icrl4aht_data.publishing.build import check_valid, first_of
 from icrl4aht_data.utils.hashes import file_hash, git_hash
 
 if TYPE_CHECKING:
@@ -128,8 +128,8 @@ def _plan(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str], pri
     if commit is not None:
         if differences := _differences(_tree(api, plan.repo, commit), folder, hashes):
             raise UploadError(
-                f"{plan.repo}: tag {plan.tag} has other content: {_some(differences)}; tags do not move: give the data "
-                "another data version"
+                f"{plan.repo}: tag {plan.tag} has other content: {first_of(differences)}; tags do not move: give the "
+                "data another data version"
             )
         return replace(plan, done="already there", commit=commit)
     if private and not api.repo_info(plan.repo, repo_type="dataset").private:
@@ -158,8 +158,8 @@ def _send(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str]) -> 
     commit = api.repo_info(repo, repo_type="dataset").sha or "main"
     if differences := _differences(_tree(api, repo, commit), folder, hashes):
         raise UploadError(
-            f"{repo}: after the upload, commit {commit} is not the release: {_some(differences)}; it was not tagged; "
-            "run the same command again"
+            f"{repo}: after the upload, commit {commit} is not the release: {first_of(differences)}; it was not "
+            "tagged; run the same command again"
         )
     api.create_tag(repo, tag=plan.tag, revision=commit, repo_type="dataset")
     return replace(plan, done="uploaded", commit=commit)
@@ -189,11 +189,6 @@ def _differences(tree: Mapping[str, RepoFile], folder: Path, hashes: Mapping[str
         if found != expected:
             differences.append(f"{name}: expected hash {expected}, found {found}")
     return differences
-
-
-def _some(differences: list[str]) -> str:
-    more = f"; and {len(differences) - 3} more" if len(differences) > 3 else ""
-    return "; ".join(differences[:3]) + more
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.environments import environment_spec
 from icrl4aht_data.errors import NotStoredError, OptionError
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import FIELDS, PROVENANCE
+from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, PROVENANCE
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.fast_observe import fast_observe
@@ -37,7 +37,7 @@ from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 from icrl4aht_data.writing.stored import HistoryProgress, with_source
 
 _NAME = re.compile(r"[\w.-]+-v\d+")
-_LABELS = {"expert_actions": "expert_action", "oracle_actions": "oracle_action"}
+_INFOS = {name: name.removesuffix("s") for name in ACTION_FIELDS if name != "actions"}
 
 
 def to_minari(
@@ -136,24 +136,21 @@ def _buffers(history: History, steps: int, canonical: bool) -> Iterator[Any]:
     from minari.data_collector import EpisodeBuffer
 
     layout = get_layout(history.entry.layout)
-    labels = {name: info for name, info in _LABELS.items() if history.entry.has(FIELDS[name])}
-    arrays = {name: history.read(name) for name in ("state", "actions", "rewards", *labels)}
-    teammate = history.read("teammate_actions") if history.entry.has_teammate_actions else None
-    ends = history.read("episode_end_state")
-    for episode, end in enumerate(ends):
+    infos = {name: info for name, info in _INFOS.items() if history.entry.has(FIELDS[name])}
+    arrays = {name: history.read(name) for name in ("state", "actions", "rewards", *infos)}
+    for episode, end in enumerate(history.read("episode_end_state")):
         part = {name: array[episode * steps : (episode + 1) * steps] for name, array in arrays.items()}
         state = np.concatenate([part["state"], end[None]])
         observations = np.empty((len(state), *observation_shape(layout, canonical)), np.uint8)
-        infos = {"state": state}
-        infos |= {info: np.append(part[name], -1).astype(np.int8) for name, info in labels.items()}
-        if teammate is not None:
-            played = teammate[episode * steps : (episode + 1) * steps]
-            infos["teammate_action"] = np.insert(played.astype(np.int8), 0, -1)
+        padding = {name: (1, 0) if name == "teammate_actions" else (0, 1) for name in infos}
+        padded = {
+            info: np.pad(part[name].astype(np.int8), padding[name], constant_values=-1) for name, info in infos.items()
+        }
         yield EpisodeBuffer(
             observations=fast_observe(layout, state, observations, canonical=canonical),  # type: ignore[arg-type]
             actions=part["actions"].astype(np.int64),  # type: ignore[arg-type]
             rewards=part["rewards"].astype(np.float32),  # type: ignore[arg-type]
             terminations=[False] * steps,
             truncations=[False] * (steps - 1) + [True],
-            infos=infos,
+            infos={"state": state, **padded},
         )
