@@ -55,7 +55,8 @@ def is_easy(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, in
 def waiting_cells(grid: np.ndarray, room: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> np.ndarray:
     """Return the cells of a shared room on which one agent can wait while the other delivers every recipe alone.
 
-    Others are the only cell from which something that a recipe needs can be reached. No cell may cut the room in two.
+    Others are the only cell from which a pot, or something else that a recipe needs, can be reached. If there is
+    another pot, the scripted expert may still wait for this one. No cell may cut the room in two.
 
     Args:
         grid: the map, str (H, W).
@@ -66,8 +67,12 @@ def waiting_cells(grid: np.ndarray, room: np.ndarray, recipes: Sequence[tuple[in
         Flat cell numbers, int (cells,), ascending.
     """
     free = room.copy()
-    for letter in sorted({*_NEEDED, *_ingredient_letters(recipes)}):
-        access = neighbours(grid == letter) & room
+    needed = [grid == letter for letter in ("X", "B", *_ingredient_letters(recipes))]
+    for pot in np.flatnonzero(grid == "P"):
+        needed.append(np.zeros_like(room))
+        needed[-1].flat[pot] = True
+    for fixtures in needed:
+        access = neighbours(fixtures) & room
         if access.sum() == 1:
             free &= ~access
     return np.flatnonzero(free)
