@@ -18,19 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from icrl4aht_data.overcooked.actions import DOWN, INTERACT, LEFT, RIGHT, STAY, UP
-from icrl4aht_data.overcooked.layouts import (
-    BUTTON,
-    COOKED,
-    FACING_OF,
-    GOAL,
-    INDICATOR,
-    PLATE,
-    PLATES,
-    POT,
-    STEP,
-    WALL,
-    Layout,
-)
+from icrl4aht_data.overcooked.cells import BUTTON, COOKED, FACING_OF, GOAL, INDICATOR, PLATE, PLATES, POT, STEP, WALL
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import ingredient_count, unpack
 
 UNREACHABLE = 10_000

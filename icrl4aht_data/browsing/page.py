@@ -18,8 +18,9 @@ from icrl4aht_data.browsing.embedding import NO_ACTION, EmbeddedHistory, embed_h
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError, OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
+from icrl4aht_data.overcooked.cells import WINDOW
 from icrl4aht_data.overcooked.drawing import AGENT_COLOURS
-from icrl4aht_data.overcooked.layouts import WINDOW, get_layout
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.text import counted_histories
 

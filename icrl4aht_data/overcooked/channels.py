@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.overcooked.layouts import FACINGS, LAYOUTS, WINDOW, Layout
-from icrl4aht_data.overcooked.state import Array
+from icrl4aht_data.overcooked.cells import CANONICAL_TYPES, FACINGS, WINDOW
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.tables import Array
 
 Channels = Literal["own", "canonical"]
 CHANNELS: tuple[Channels, ...] = ("own", "canonical")
@@ -35,7 +36,7 @@ def _names(ingredient_types: int, delivery: bool) -> tuple[str, ...]:
     return (*agent("self"), *agent("other"), *static, *piles, *item("item"), *item("recipe"), *last)
 
 
-CANONICAL_CHANNELS: tuple[str, ...] = _names(max(layout.ingredient_types for layout in LAYOUTS.values()), True)
+CANONICAL_CHANNELS: tuple[str, ...] = _names(CANONICAL_TYPES, True)
 """Names of the 46 canonical channels, in order: four ingredient types and the delivery indicator."""
 
 

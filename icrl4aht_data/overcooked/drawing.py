@@ -16,7 +16,8 @@ import numpy as np
 
 from icrl4aht_data.overcooked import layouts
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
-from icrl4aht_data.overcooked.layouts import COOKED, FACINGS, PLATE, STEP, WINDOW, Layout
+from icrl4aht_data.overcooked.cells import COOKED, FACINGS, PLATE, STEP, WINDOW
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, columns, record_size
 
 Colour = tuple[int, int, int]

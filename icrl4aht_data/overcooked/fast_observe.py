@@ -15,8 +15,9 @@ from functools import lru_cache
 import numpy as np
 
 from icrl4aht_data.overcooked.actions import EGO
+from icrl4aht_data.overcooked.cells import CENTRE, NOWHERE, VISIBLE
 from icrl4aht_data.overcooked.channels import observation_shape
-from icrl4aht_data.overcooked.layouts import CENTRE, NOWHERE, VISIBLE, Layout
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, record_size
 from icrl4aht_data.utils.system import in_slices

@@ -15,34 +15,24 @@ import numpy as np
 
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.overcooked.cells import (
+    BUTTON,
+    EMPTY,
+    FACINGS,
+    GOAL,
+    INDICATOR,
+    NOWHERE,
+    PILE,
+    PLATE,
+    PLATES,
+    POT,
+    STEP,
+    VISIBLE,
+    WALL,
+    WINDOW,
+)
+from icrl4aht_data.overcooked.tables import Tables, make_tables
 from icrl4aht_data.utils.plugins import Plugins
-
-EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
-"""Kinds of cells. A wall is a counter for one item; PLATES and PILE never run out."""
-
-FACINGS = ("up", "down", "right", "left")
-"""Facing names by number, the order of the observation's facing channels."""
-
-STEP = {"up": (0, -1), "down": (0, 1), "right": (1, 0), "left": (-1, 0)}
-"""Facing name -> (dx, dy) to the cell ahead."""
-
-FACING_OF = np.array([FACINGS.index(name) for name in ACTIONS if name in FACINGS])
-"""int64 (4,): the facing after a directional action (up, down, left, right)."""
-
-PLATE, COOKED = 1, 2
-"""Flag bits of an item byte. The higher bits count the ingredients, two bits each."""
-
-WINDOW = 5
-"""Side of the square observation window."""
-
-VISIBLE = WINDOW * WINDOW
-"""Number of cells in the window."""
-
-CENTRE = VISIBLE // 2
-"""Position in the window, in reading order, of the observing agent's own cell."""
-
-NOWHERE = 255
-"""Entry of lookup tables for a cell that is outside the window; also the largest byte."""
 
 _LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
 _TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
@@ -226,8 +216,18 @@ class Layout:
         table[cell, self.window[cell, position]] = position
         return table
 
+    @cached_property
+    def tables(self) -> Tables:
+        """The lookup tables that rules, observations and scripted agents take as an argument."""
+        return make_tables(self)
+
     def __repr__(self) -> str:
         return f"Layout({self.name!r}, {self.width}x{self.height}, C={self.channels})"
+
+
+def tables_of(layout: Layout | Tables) -> Tables:
+    """Return the tables of a layout; tables are returned as they are."""
+    return layout.tables if isinstance(layout, Layout) else layout
 
 
 _ALL = (

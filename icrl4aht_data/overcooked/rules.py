@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrl4aht_data.overcooked.actions import INTERACT
-from icrl4aht_data.overcooked.layouts import BUTTON, COOKED, FACINGS, GOAL, PLATE, POT, WALL, Layout
+from icrl4aht_data.overcooked.cells import BUTTON, COOKED, FACINGS, GOAL, PLATE, POT, WALL
+from icrl4aht_data.overcooked.layouts import Layout, tables_of
 from icrl4aht_data.overcooked.state import (
     BUTTON_STEPS,
     POT_STEPS,
@@ -22,6 +23,7 @@ from icrl4aht_data.overcooked.state import (
     pack,
     unpack,
 )
+from icrl4aht_data.overcooked.tables import Tables
 
 DELIVERY_REWARD = 20.0
 WRONG_DELIVERY_REWARD = -20.0
@@ -57,11 +59,11 @@ class StepResult(NamedTuple):
     events: Array
 
 
-def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> StepResult:
+def step(layout: Layout | Tables, record: Array, actions: Array, next_recipe: Array) -> StepResult:
     """Return the result of one step of the game.
 
     Args:
-        layout: the layout.
+        layout: the layout, or its tables.
         record: uint8 (B, S), the state record.
         actions: integers (B, 2), action ids 0..5 of ego and teammate.
         next_recipe: uint8 (B,), item byte of the recipe that follows a correct delivery in this step.
@@ -70,15 +72,16 @@ def step(layout: Layout, record: Array, actions: Array, next_recipe: Array) -> S
         The next states, rewards and events; NumPy and JAX give equal bytes.
     """
     xp = record.__array_namespace__()
-    state = unpack(layout, record)
-    state = _move(layout, xp, state, actions)
+    tables = tables_of(layout)
+    state = unpack(tables, record)
+    state = _move(tables, xp, state, actions)
     # Both agents' events count the plates in hand before either interacts.
     plates_in_hand = xp.sum(state.hands == PLATE, axis=-1, dtype=xp.uint8)
     recipe = state.recipe
     events = []
     for agent in (0, 1):
         acting = actions[..., agent] == INTERACT
-        state, event = _interact(layout, xp, state, agent, acting, plates_in_hand)
+        state, event = _interact(tables, xp, state, agent, acting, plates_in_hand)
         events.append(event)
     happened = xp.stack(events, axis=-1)
     correct = xp.any((happened & CORRECT) > 0, axis=-1)
@@ -120,15 +123,15 @@ def _score(events: Array, values: dict[int, float]) -> Array:
     return sum(xp.astype((events & bit) > 0, xp.float32) * np.float32(value) for bit, value in values.items())
 
 
-def look_up(table: np.ndarray, index: Array) -> Array:
-    """Return `table[index]` for a NumPy table and a NumPy or JAX index."""
+def look_up(table: Array, index: Array) -> Array:
+    """Return `table[index]` for a NumPy table and a NumPy or JAX index, or a JAX table and a JAX index."""
     xp = index.__array_namespace__()
     return xp.take(xp.asarray(table), xp.astype(index, xp.int32), axis=0)
 
 
-def _move(layout: Layout, xp, state: State, actions: Array) -> State:
+def _move(tables: Tables, xp, state: State, actions: Array) -> State:
     """Apply steps 1 to 3: a directional action always turns; no agent enters an occupied or contested cell."""
-    moved = look_up(layout.moves.reshape(-1), xp.astype(state.positions, xp.int32) * 6 + actions)
+    moved = look_up(tables.moves.reshape(-1), xp.astype(state.positions, xp.int32) * 6 + actions)
     old0, old1 = state.positions[..., 0], state.positions[..., 1]
     new0, new1 = moved[..., 0], moved[..., 1]
     # With two agents, undoing until no conflict remains has a closed form: if the wanted cells coincide both go
@@ -142,18 +145,18 @@ def _move(layout: Layout, xp, state: State, actions: Array) -> State:
 
 
 def _interact(
-    layout: Layout, xp, state: State, agent: int, acting: Array, plates_in_hand: Array
+    tables: Tables, xp, state: State, agent: int, acting: Array, plates_in_hand: Array
 ) -> tuple[State, Array]:
     """Apply step 4 (interaction) of one agent where `acting`, bool (B,); return state and event bits uint8 (B,)."""
     hand = state.hands[..., agent]
     pose = xp.astype(state.positions[..., agent], xp.int32) * 4 + state.facings[..., agent]
-    faced = look_up(_faced(layout), pose)
+    faced = look_up(tables.faced.reshape(-1), pose)
     kind, pile, number = faced & 255, xp.astype(faced >> 8 & 255, xp.uint8), faced >> 16
     facing_pot, facing_counter = acting & (kind == POT), acting & (kind == WALL)
     # One-hot over the few cells that hold items: reads and writes without a scatter, in either library.
-    at_pot = (number[..., None] == _range(xp, len(layout.pots))) & facing_pot[..., None]
-    at_counter = (number[..., None] == _range(xp, len(layout.counters))) & facing_counter[..., None]
-    at_button = (number[..., None] == _range(xp, len(layout.buttons))) & (acting & (kind == BUTTON))[..., None]
+    at_pot = (number[..., None] == _range(xp, len(tables.pots))) & facing_pot[..., None]
+    at_counter = (number[..., None] == _range(xp, len(tables.counters))) & facing_counter[..., None]
+    at_button = (number[..., None] == _range(xp, len(tables.buttons))) & (acting & (kind == BUTTON))[..., None]
     content = _read(xp, at_pot, state.pot_items) | _read(xp, at_counter, state.counters)
     timer = _read(xp, at_pot, state.pot_timers)
 
@@ -205,18 +208,6 @@ def _interact(
         USEFUL_PLATE: useful_plate,
     }
     return state, sum(xp.astype(happened, xp.uint8) * np.uint8(bit) for bit, happened in bits.items())
-
-
-def _faced(layout: Layout) -> np.ndarray:
-    """Return int32 (cells * 4,): kind | pile << 8 | number << 16 of the faced cell, by position and facing.
-
-    The number counts the cells of the same kind: pots, counters or buttons.
-    """
-    number = np.zeros(layout.cells, np.int32)
-    for cells in (layout.pots, layout.counters, layout.buttons):
-        number[list(cells)] = range(len(cells))
-    ahead = layout.ahead.reshape(-1)
-    return layout.kinds[ahead] | layout.piles[ahead].astype(np.int32) << 8 | number[ahead] << 16
 
 
 def _range(xp, n: int) -> Array:

@@ -20,14 +20,13 @@ The clock is not part of the record: the rules do not depend on it.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.overcooked.layouts import COOKED, FACINGS, PLATE, Layout
-
-Array = Any
-"""A NumPy or JAX array; functions find the library through `__array_namespace__`."""
+from icrl4aht_data.overcooked.cells import COOKED, FACINGS, PLATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.tables import Array, Tables
 
 POT_STEPS = 20
 """Steps until a full pot is cooked (paper, App. A.1)."""
@@ -62,20 +61,20 @@ class State(NamedTuple):
     counters: Array
 
 
-def columns(layout: Layout) -> State:
-    """Return the position of each field in the record: slices, and an int for the two single columns."""
+def columns(layout: Layout | Tables) -> State:
+    """Return the position of each field in the record of a layout: slices, and an int for the two single columns."""
     pots, buttons, counters = len(layout.pots), len(layout.buttons), len(layout.counters)
     ends = np.cumsum([8, pots, pots, buttons, counters]).tolist()
     rest = [slice(a, b) for a, b in pairwise(ends)]
     return State(slice(0, 2), slice(2, 4), slice(4, 6), 6, 7, *rest)
 
 
-def record_size(layout: Layout) -> int:
+def record_size(layout: Layout | Tables) -> int:
     """Return S, the number of bytes of a layout's state record."""
     return 8 + 2 * len(layout.pots) + len(layout.buttons) + len(layout.counters)
 
 
-def unpack(layout: Layout, record: Array) -> State:
+def unpack(layout: Layout | Tables, record: Array) -> State:
     """Split state records uint8 (B, S) into their columns."""
     return State(*(record[..., column] for column in columns(layout)))
 
@@ -94,11 +93,11 @@ def swapped(record: Array) -> Array:
     return record[..., order]
 
 
-def start(layout: Layout, positions: Array, facings: Array, recipe: Array) -> Array:
+def start(layout: Layout | Tables, positions: Array, facings: Array, recipe: Array) -> Array:
     """Return the record of an episode's first step: hands, pots and counters empty (paper, App. A.1).
 
     Args:
-        layout: the layout.
+        layout: the layout or its tables.
         positions: uint8 (B, 2), flat cell numbers of the two agents.
         facings: uint8 (B, 2), positions in `FACINGS`.
         recipe: uint8 (B,), item byte of the first recipe.

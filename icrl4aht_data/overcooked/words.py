@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.overcooked.layouts import CENTRE, COOKED, FACINGS, GOAL, INDICATOR, NOWHERE, PLATE, VISIBLE, Layout
+from icrl4aht_data.overcooked.cells import CENTRE, COOKED, FACINGS, GOAL, INDICATOR, NOWHERE, PLATE, VISIBLE
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.rules import look_up
 from icrl4aht_data.overcooked.state import (

@@ -11,7 +11,8 @@ import numpy as np
 
 from icrl4aht_data.errors import PublishedFormatError
 from icrl4aht_data.overcooked.actions import EGO
-from icrl4aht_data.overcooked.layouts import WINDOW, Layout
+from icrl4aht_data.overcooked.cells import WINDOW
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, record_size
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from icrl4aht_data.overcooked.layouts import COOKED, FACINGS, PLATE, Layout
+from icrl4aht_data.overcooked.cells import COOKED, FACINGS, PLATE
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import (
     BUTTON_STEPS,
     POT_STEPS,

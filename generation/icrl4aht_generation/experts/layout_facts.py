@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrl4aht_data.overcooked.actions import EGO, INTERACT, TEAMMATE
-from icrl4aht_data.overcooked.layouts import FACING_OF, GOAL, PILE, PLATES, POT, Layout
+from icrl4aht_data.overcooked.cells import FACING_OF, GOAL, PILE, PLATES, POT
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_generation.paths import Paths
 
 FAR = 1000

@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
 
 from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
-from icrl4aht_data.overcooked.layouts import COOKED, GOAL, PLATE, POT, WALL, Layout
+from icrl4aht_data.overcooked.cells import COOKED, GOAL, PLATE, POT, WALL
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack
 from icrl4aht_generation.experts.layout_facts import FAR, NEVER, LayoutFacts, hindrance_table, study_layout
 from icrl4aht_generation.paths import Scene

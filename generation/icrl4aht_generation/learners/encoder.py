@@ -20,7 +20,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num, UInt8
 
 from icrl4aht_data.overcooked.actions import EGO
-from icrl4aht_data.overcooked.layouts import VISIBLE, WINDOW, Layout
+from icrl4aht_data.overcooked.cells import VISIBLE, WINDOW
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.words import CellWords, cell_words
 from icrl4aht_generation.learners.config import EncoderKind

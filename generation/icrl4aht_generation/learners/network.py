@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Integer
 
 from icrl4aht_data.overcooked.actions import ACTIONS
-from icrl4aht_data.overcooked.layouts import WINDOW
+from icrl4aht_data.overcooked.cells import WINDOW
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.encoder import CompactView, Seen, WindowEncoder, orthogonal_dense
 

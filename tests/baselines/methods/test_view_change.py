@@ -13,8 +13,9 @@ from icrl4aht_baselines.methods.view_change import ViewChange, changed_view, mir
 
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import EGO, INTERACT
+from icrl4aht_data.overcooked.cells import FACINGS
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
-from icrl4aht_data.overcooked.layouts import FACINGS, Layout, get_layout
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import start
 

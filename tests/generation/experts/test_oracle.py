@@ -19,7 +19,8 @@ from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.overcooked.actions import EGO, STAY
-from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, Layout
+from icrl4aht_data.overcooked.cells import COOKED
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.rules import CORRECT, PRESSED, WRONG, step
 from icrl4aht_data.overcooked.state import ingredient_count, unpack
 

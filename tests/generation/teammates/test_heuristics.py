@@ -26,7 +26,8 @@ from icrl4aht_generation.teammates.registry import (
 
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS, STAY
-from icrl4aht_data.overcooked.layouts import COOKED, LAYOUTS, PLATE, Layout
+from icrl4aht_data.overcooked.cells import COOKED, PLATE
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.state import faults
 from tests.helpers.states import random_records, state_record
 

@@ -11,7 +11,8 @@ from PIL import Image
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
-from icrl4aht_data.overcooked.layouts import COOKED, INDICATOR, LAYOUTS, PLATE
+from icrl4aht_data.overcooked.cells import COOKED, INDICATOR, PLATE
+from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.render import draw_frame, save_episode, save_frame
 from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.utils.install_hints import install_command

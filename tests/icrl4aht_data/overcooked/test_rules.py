@@ -19,7 +19,8 @@ import pytest
 
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, INTERACT, LEFT, RIGHT, STAY, UP
-from icrl4aht_data.overcooked.layouts import FACINGS, LAYOUTS, Layout
+from icrl4aht_data.overcooked.cells import FACINGS
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns, unpack
 from tests.helpers.states import state_record

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from icrl4aht_data.overcooked.layouts import CENTRE, LAYOUTS, VISIBLE, Layout, get_layout
+from icrl4aht_data.overcooked.cells import CENTRE, VISIBLE
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns, record_size
 from icrl4aht_data.overcooked.words import cell_words

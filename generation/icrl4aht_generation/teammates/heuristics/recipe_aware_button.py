@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
 
 from icrl4aht_data.overcooked.actions import STAY
-from icrl4aht_data.overcooked.layouts import GOAL, INDICATOR, PLATE, PLATES, POT, Layout
+from icrl4aht_data.overcooked.cells import GOAL, INDICATOR, PLATE, PLATES, POT
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import POT_STEPS
 from icrl4aht_generation.paths import UNREACHABLE, Paths, Rule, Scene, is_dish, is_ingredient
 from icrl4aht_generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split

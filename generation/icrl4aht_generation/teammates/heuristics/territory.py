@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
-from icrl4aht_data.overcooked.layouts import GOAL, PILE, PLATES, POT
+from icrl4aht_data.overcooked.cells import GOAL, PILE, PLATES, POT
 from icrl4aht_generation.paths import Paths, Rule, Scene
 from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw
 
