@@ -143,12 +143,12 @@ def stack_tables(layouts: Sequence[Layout]) -> Tables:
     def stacked(name: str, values: Sequence[Any]) -> Any:
         if isinstance(values[0], ChannelBits):
             return ChannelBits(*(stacked("", parts) for parts in zip(*values, strict=True)))
-        shape = np.max([value.shape for value in values], axis=0)
+        shape = np.max([value.shape for value in values], axis=0).astype(int)
         if name == "recipes":  # a repeated recipe changes no decision of a scripted agent
             return np.stack([np.pad(value, (0, shape[0] - len(value)), "edge") for value in values])
         found = np.full((len(values), *shape), _PADDING.get(name, 0), values[0].dtype)
-        for row, value in zip(found, values, strict=True):
-            row[tuple(map(slice, value.shape))] = value
+        for number, value in enumerate(values):
+            found[number, *map(slice, value.shape)] = value
         return found
 
     return Tables(*(stacked(name, parts) for name, parts in zip(Tables._fields, zip(*each, strict=True), strict=True)))
