@@ -1,4 +1,4 @@
-"""Features of a state for scripted agents: shortest paths of the layout, masks over cells, and moves made of them.
+"""Features of a state for scripted agents: masks over cells, shortest paths, and moves made of them.
 
 `cells` denotes the cells of the layout, row by row. Scripted agents see the complete state. The partner never blocks a
 path; ties resolve in the order right, down, left, up (first steps) and above, below, left, right (access cells),
@@ -7,7 +7,6 @@ scanning targets row by row. Source: paper, App. B.2.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,107 +16,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from icrl4aht_data.overcooked.actions import DOWN, INTERACT, LEFT, RIGHT, STAY, UP
-from icrl4aht_data.overcooked.cells import BUTTON, COOKED, FACING_OF, GOAL, INDICATOR, PLATE, PLATES, POT, STEP, WALL
-from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.state import ingredient_count, unpack
+from icrl4aht_data.overcooked.actions import INTERACT, STAY
+from icrl4aht_data.overcooked.cells import (
+    BUTTON,
+    COOKED,
+    FACING_OF,
+    GOAL,
+    INDICATOR,
+    NOWHERE,
+    PILE,
+    PLATE,
+    PLATES,
+    POT,
+    WALL,
+)
+from icrl4aht_data.overcooked.state import State, ingredient_count, unpack
+from icrl4aht_data.overcooked.tables import SEARCH_ORDER, Tables
 
 UNREACHABLE = 10_000
 """Distance of a cell that cannot be reached."""
 
-_SEARCH_ORDER = (RIGHT, DOWN, LEFT, UP)
-_ACCESS_ORDER = ("up", "down", "left", "right")
 _ACTION_OF_FACING = np.argsort(FACING_OF)
-
-
-@dataclass(frozen=True, eq=False)
-class Paths:
-    """Distances and first steps of one layout, as NumPy lookup tables that are compiled into the policies."""
-
-    layout: Layout
-
-    @cached_property
-    def neighbours(self) -> np.ndarray:
-        """int32 (cells, 4): the cell above, below, left and right of each cell, -1 outside the map."""
-        layout = self.layout
-        # Walls, too, have neighbours: a counter's are the cells that it can be used from.
-        found = np.full((layout.cells, 4), -1, np.int32)
-        for cell in range(layout.cells):
-            for k, name in enumerate(_ACCESS_ORDER):
-                x, y = cell % layout.width + STEP[name][0], cell // layout.width + STEP[name][1]
-                if 0 <= x < layout.width and 0 <= y < layout.height:
-                    found[cell, k] = y * layout.width + x
-        return found
-
-    @cached_property
-    def _search(self) -> tuple[np.ndarray, np.ndarray]:
-        """Breadth-first search from every floor cell: distances, and the first action on the way."""
-        cells = self.layout.cells
-        distance = np.full((cells, cells), UNREACHABLE, np.int32)
-        first = np.full((cells, cells), STAY, np.int32)
-        # Python loops are fast enough: layouts have fewer than 100 cells, and each is searched once.
-        for origin in self.layout.walkable.nonzero()[0]:
-            distance[origin, origin] = 0
-            queue = deque([int(origin)])
-            while queue:
-                cell = queue.popleft()
-                for action in _SEARCH_ORDER:
-                    target = int(self.layout.moves[cell, action])
-                    # Only the first visit counts, so the order of the actions decides between equal paths. The
-                    # published teammates search in this order, and their actions depend on it.
-                    if distance[origin, target] == UNREACHABLE:
-                        distance[origin, target] = distance[origin, cell] + 1
-                        first[origin, target] = action if cell == origin else first[origin, cell]
-                        queue.append(target)
-        return distance, first
-
-    @property
-    def distance(self) -> np.ndarray:
-        """int32 (cells, cells): shortest distance between floor cells; UNREACHABLE if there is no path."""
-        return self._search[0]
-
-    @property
-    def first_step(self) -> np.ndarray:
-        """int32 (cells, cells): the action of the first step from one floor cell towards another."""
-        return self._search[1]
-
-    @cached_property
-    def access(self) -> np.ndarray:
-        """int32 (cells, 4): the floor cells above, below, left and right of a cell; -1 for other cells."""
-        floor = (self.neighbours >= 0) & self.layout.walkable[self.neighbours]
-        return np.where(floor, self.neighbours, -1)
-
-    @cached_property
-    def access_distance(self) -> np.ndarray:
-        """int32 (cells, cells, 4): distance from a floor cell to each access cell of a target."""
-        # An index of -1 reads the last cell, which `where` then replaces.
-        return np.where(self.access >= 0, self.distance[:, self.access], UNREACHABLE)
-
-    @cached_property
-    def target_distance(self) -> np.ndarray:
-        """int32 (cells, cells): distance from a floor cell to the nearest access cell of a target."""
-        return self.access_distance.min(axis=-1)
-
-    @cached_property
-    def only_access(self) -> np.ndarray:
-        """int32 (cells,): the access cell of a target that has exactly one, else -1."""
-        return np.where((self.access >= 0).sum(axis=1) == 1, self.access.max(axis=1), -1)
-
-    @cached_property
-    def manhattan(self) -> np.ndarray:
-        """int32 (cells, cells): Manhattan distance."""
-        cell = np.arange(self.layout.cells)
-        x, y = cell % self.layout.width, cell // self.layout.width
-        return np.abs(x[:, None] - x) + np.abs(y[:, None] - y)
-
-    @cached_property
-    def near_pot(self) -> np.ndarray:
-        """bool (cells,): cells adjacent to a pot."""
-        return (self.manhattan[:, list(self.layout.pots)] == 1).any(axis=1)
-
-    def static(self, kind: int) -> np.ndarray:
-        """Return the mask of cells of a kind, bool (cells,)."""
-        return self.layout.kinds == kind
 
 
 def is_dish(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
@@ -128,6 +47,10 @@ def is_dish(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
 def is_ingredient(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
     """Return whether an item has ingredients and no plate."""
     return (item >> 2 > 0) & ((item & PLATE) == 0)
+
+
+def _far(distance: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
+    return jnp.where(distance < NOWHERE, distance.astype(jnp.int32), UNREACHABLE)
 
 
 class Rule(NamedTuple):
@@ -165,19 +88,24 @@ class Scene:
     """One state as a heuristic reads it. All masks are bool (cells,); everything is traced and computed on first use.
 
     Attributes:
-        paths: lookup tables of the layout.
+        tables: tables of the layout.
         record: uint8 (S,), the state record.
         slot: 0 or 1, the agent that reads it, "own" below; the other one is the partner.
     """
 
-    paths: Paths
+    tables: Tables
     record: UInt8[Array, " S"]
     slot: int
 
     @cached_property
-    def state(self):
+    def state(self) -> State:
         """The record's fields."""
-        return unpack(self.paths.layout, self.record)
+        return unpack(self.tables, self.record)
+
+    @cached_property
+    def cell(self) -> Int[Array, " cells"]:
+        """The numbers of all cells."""
+        return jnp.arange(self.tables.kinds.shape[0])
 
     @cached_property
     def me(self) -> Int[Array, ""]:
@@ -224,77 +152,85 @@ class Scene:
 
     # Masks over cells
 
-    def _at(self, cells: tuple[int, ...], values: Array) -> Bool[Array, " cells"]:
-        """Return a mask with one value for each of some cells, False elsewhere."""
-        # A gather by a constant table, since a scatter by traced values is slow under vmap.
-        number = np.zeros(self.paths.layout.cells, np.int32)
-        number[list(cells)] = range(len(cells))
-        listed = np.isin(np.arange(self.paths.layout.cells), cells)
-        return values[number] & listed if cells else jnp.asarray(listed)
+    def static(self, kind: int) -> Bool[Array, " cells"]:
+        """Return the mask of cells of a kind."""
+        return jnp.asarray(self.tables.kinds) == kind
+
+    def near(self, kind: int) -> Bool[Array, " cells"]:
+        """Return the mask of cells with one of a kind above, below, left or right of them."""
+        return (jnp.asarray(self.tables.near) >> kind & 1) > 0
+
+    def at(self, kind: int, values: Array) -> Array:
+        """Return a value for each cell: that of the pot, button or counter there, or 0."""
+        # A gather by number, since a scatter by traced values is slow under vmap.
+        number = jnp.asarray(self.tables.number)
+        if not values.shape[0]:
+            return jnp.zeros(number.shape, values.dtype)
+        found = values[jnp.minimum(number, values.shape[0] - 1)]
+        return jnp.where(self.static(kind) & (number < NOWHERE), found, jnp.zeros((), values.dtype))
 
     @cached_property
-    def _raw_and_idle(self) -> Bool[Array, " P"]:
+    def takes_more(self) -> Bool[Array, " P"]:
+        """Pots that take another ingredient, in the order of the layout's pots."""
         # A pot with three ingredients cooks by itself, so a full one is cooking or cooked.
         items = self.state.pot_items
-        return (self.state.pot_timers == 0) & ((items & COOKED) == 0) & (ingredient_count(items) < 3)
+        exists = jnp.asarray(self.tables.pots) < NOWHERE
+        return exists & (self.state.pot_timers == 0) & ((items & COOKED) == 0) & (ingredient_count(items) < 3)
 
     @cached_property
     def nonfull(self) -> Bool[Array, " cells"]:
         """Mask of pots that take another ingredient."""
-        return self._at(self.paths.layout.pots, self._raw_and_idle)
+        return self.at(POT, self.takes_more)
 
     @cached_property
     def cooking(self) -> Bool[Array, " cells"]:
-        return self._at(self.paths.layout.pots, self.state.pot_timers > 0)
+        return self.at(POT, self.state.pot_timers > 0)
 
     @cached_property
     def cooked(self) -> Bool[Array, " cells"]:
-        return self._at(self.paths.layout.pots, (self.state.pot_items & COOKED) > 0)
+        return self.at(POT, (self.state.pot_items & COOKED) > 0)
 
     @cached_property
     def pots(self) -> Bool[Array, " cells"]:
-        return jnp.asarray(self.paths.static(POT))
+        return self.static(POT)
 
     @cached_property
     def pots_in_use(self) -> Bool[Array, " cells"]:
         """Pots with something in them, raw, cooking or cooked."""
-        return self._at(self.paths.layout.pots, self.state.pot_items > 0)
+        return self.at(POT, self.state.pot_items > 0)
 
     @cached_property
     def staged(self) -> Bool[Array, " cells"]:
         """Mask of counters with an ingredient."""
-        return self._at(self.paths.layout.counters, is_ingredient(self.state.counters))
+        return self.at(WALL, is_ingredient(self.state.counters))
 
     @cached_property
     def empty_counters(self) -> Bool[Array, " cells"]:
         """Walls without an item, also unreachable ones."""
         # The published teammates also aim at walls that nobody reaches; `first` then skips the rule.
-        taken = self._at(self.paths.layout.counters, self.state.counters > 0)
-        return jnp.asarray(self.paths.static(WALL)) & ~taken
+        taken = self.at(WALL, self.state.counters > 0)
+        return self.static(WALL) & ~taken
 
     @cached_property
     def button_lit(self) -> Bool[Array, ""]:
         return jnp.any(self.state.buttons > 0)
 
     @cached_property
-    def needed(self) -> Int[Array, " types"]:
+    def needed(self) -> Int[Array, " 3"]:
         """Missing pieces of each piled ingredient, over all pots together."""
         # Over all pots together, as published: two half-filled pots count as one.
         return jnp.maximum(self.counts(self.state.recipe) - self.counts(self.state.pot_items).sum(axis=0), 0)
 
-    def counts(self, item: UInt8[Array, "*B"]) -> Int[Array, "*B types"]:
-        """Return the number of pieces of each piled ingredient in an item, by ascending id."""
+    def counts(self, item: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
+        """Return the number of pieces of each piled ingredient in an item, by ascending id; 0 for further types."""
         # Two bits for each ingredient, above the bits of plate and cooked.
-        shift = 2 + 2 * jnp.arange(len(self.paths.layout.ingredients), dtype=jnp.uint8)
+        shift = 2 + 2 * jnp.arange(3, dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)
 
-    def piles_of(self, wanted: Bool[Array, " types"]) -> Bool[Array, " cells"]:
+    def piles_of(self, wanted: Bool[Array, " 3"]) -> Bool[Array, " cells"]:
         """Return the piles of the wanted ingredient types."""
-        layout = self.paths.layout
-        mask = jnp.zeros(layout.cells, bool)
-        for k, ingredient in enumerate(layout.ingredients):
-            mask |= jnp.asarray(layout.piles == layout.ingredient_item(ingredient)) & wanted[k]
-        return mask
+        piles = jnp.asarray(self.tables.piles)
+        return jnp.any((self.counts(piles) > 0) & wanted, axis=-1) & self.static(PILE)
 
     @cached_property
     def needed_piles(self) -> Bool[Array, " cells"]:
@@ -306,25 +242,56 @@ class Scene:
 
     @cached_property
     def goals(self) -> Bool[Array, " cells"]:
-        return jnp.asarray(self.paths.static(GOAL))
+        return self.static(GOAL)
 
     @cached_property
     def plate_piles(self) -> Bool[Array, " cells"]:
-        return jnp.asarray(self.paths.static(PLATES))
+        return self.static(PLATES)
 
     @cached_property
     def buttons(self) -> Bool[Array, " cells"]:
-        return jnp.asarray(self.paths.static(BUTTON))
+        return self.static(BUTTON)
 
     @cached_property
     def indicators(self) -> Bool[Array, " cells"]:
-        return jnp.asarray(self.paths.static(INDICATOR))
+        return self.static(INDICATOR)
 
     # Distances and moves
 
+    def distances(self, cell: Int[Array, ""]) -> Int[Array, " cells"]:
+        """Return the distances from a floor cell to all others; UNREACHABLE if there is no path."""
+        return _far(jnp.asarray(self.tables.distance)[cell])
+
     @cached_property
     def _target_distance(self) -> Int[Array, " cells"]:
-        return jnp.asarray(self.paths.target_distance)[self.me]
+        return _far(jnp.asarray(self.tables.target_distance)[self.me])
+
+    def manhattan(self, cell: Int[Array, "*B"], other: Int[Array, "*B"]) -> Int[Array, "*B"]:
+        """Return the Manhattan distance of two cells, or of broadcast arrays of cells."""
+        x, y = jnp.asarray(self.tables.column), jnp.asarray(self.tables.row)
+        return jnp.abs(x[cell] - x[other]) + jnp.abs(y[cell] - y[other])
+
+    def neighbours(self, cell: Int[Array, ""]) -> Int[Array, " 4"]:
+        """Return the cells above, below, left and right of a cell; -1 outside the map."""
+        width, height = jnp.asarray(self.tables.size)
+        x = jnp.asarray(self.tables.column)[cell] + jnp.array([0, 0, -1, 1])
+        y = jnp.asarray(self.tables.row)[cell] + jnp.array([-1, 1, 0, 0])
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return jnp.where(inside, y * width + x, -1)
+
+    def access(self, target: Int[Array, ""]) -> Int[Array, " 4"]:
+        """Return the floor cells above, below, left and right of a cell; -1 for other cells."""
+        beside = self.neighbours(target)
+        return jnp.where((beside >= 0) & jnp.asarray(self.tables.walkable)[beside], beside, -1)
+
+    def only_access(self, target: Int[Array, ""]) -> Int[Array, ""]:
+        """Return the access cell of a target that has exactly one, else -1."""
+        access = self.access(target)
+        return jnp.where(jnp.sum(access >= 0) == 1, jnp.max(access), -1)
+
+    def first_step(self, cell: Int[Array, ""]) -> Int[Array, ""]:
+        """Return the action of the first step towards a floor cell."""
+        return jnp.asarray(self.tables.first_step)[self.me, cell].astype(jnp.int32)
 
     def reach(self, mask: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
         """Return the cells of the mask that are adjacent to a cell that can be walked to."""
@@ -341,8 +308,8 @@ class Scene:
     def _turn_or(self, target: Int[Array, ""], when_facing: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
         """Return whether the target is adjacent, and the action in that case: turn to it, or `when_facing`."""
         # A move into a wall only turns the agent, which is how it comes to face an adjacent target.
-        adjacent = jnp.asarray(self.paths.manhattan)[self.me, target] == 1
-        direction = jnp.argmax(jnp.asarray(self.paths.neighbours)[self.me] == target)  # up, down, left, right
+        adjacent = self.manhattan(self.me, target) == 1
+        direction = jnp.argmax(self.neighbours(self.me) == target)  # up, down, left, right
         return adjacent, jnp.where(self.facing_action == direction, when_facing, direction)
 
     def first(self, rules: Sequence[Rule]) -> Chosen:
@@ -355,18 +322,18 @@ class Scene:
         return Chosen(jnp.any(possible), number, self.closest(targets[number]), waits)
 
     def approach(
-        self, target: Int[Array, ""], extra: np.ndarray | None = None
+        self, target: Int[Array, ""], extra: Float[Array, " cells"] | None = None
     ) -> tuple[Int[Array, ""], Int[Array, ""] | Float[Array, ""]]:
         """Return the step towards the target's nearest access cell, and that cell's cost: its distance, plus 100 if the
         partner is on it, plus `extra` (cells,)."""
-        access = jnp.asarray(self.paths.access)[target]
+        access = self.access(target)
         # 100 is more than any path: an occupied access cell is chosen only if there is no other.
-        cost = jnp.asarray(self.paths.access_distance)[self.me, target] + 100 * (access == self.partner)
+        distance = jnp.where(access >= 0, self.distances(self.me)[access], UNREACHABLE)
+        cost = distance + 100 * (access == self.partner)
         if extra is not None:
-            cost = cost + jnp.asarray(extra)[access]
+            cost = cost + extra[access]
         best = jnp.argmin(cost)
-        step = jnp.asarray(self.paths.first_step)[self.me, access[best]]
-        return jnp.where(cost[best] < UNREACHABLE, step, STAY), cost[best]
+        return jnp.where(cost[best] < UNREACHABLE, self.first_step(access[best]), STAY), cost[best]
 
     def go_to(
         self,
@@ -385,7 +352,7 @@ class Scene:
     @cached_property
     def ways(self) -> Int[Array, " 4"]:
         """The cells to the right, below, left and above; the own cell where the way is blocked."""
-        return jnp.asarray(self.paths.layout.moves[:, list(_SEARCH_ORDER)].astype(np.int32))[self.me]
+        return jnp.asarray(self.tables.moves)[self.me, jnp.array(SEARCH_ORDER)].astype(jnp.int32)
 
     @cached_property
     def free(self) -> Bool[Array, " 4"]:
@@ -404,17 +371,17 @@ class Scene:
     ) -> Int[Array, ""]:
         """Return the allowed way with the highest score, ties in search order."""
         best = jnp.argmax(jnp.where(allowed, score, -jnp.inf))
-        return jnp.where(jnp.any(allowed), jnp.asarray(_SEARCH_ORDER)[best], otherwise)
+        return jnp.where(jnp.any(allowed), jnp.asarray(SEARCH_ORDER)[best], otherwise)
 
     def wander(self, stay_score: int = 50) -> Int[Array, ""]:
         """Return a step onto a free neighbour, in search order; else stay, or (150) walk into the partner."""
-        target = jnp.asarray(self.paths.layout.moves).astype(jnp.int32)[self.me]
+        target = jnp.asarray(self.tables.moves)[self.me].astype(jnp.int32)
         # Costs as published; `stay_score` between them decides whether it is better to stay than to push.
-        scores = [jnp.where(target[a] == self.me, 1000, 100 * (target[a] == self.partner)) for a in _SEARCH_ORDER]
+        scores = [jnp.where(target[a] == self.me, 1000, 100 * (target[a] == self.partner)) for a in SEARCH_ORDER]
         best = jnp.argmin(jnp.stack([*scores, jnp.asarray(stay_score)]))
-        return jnp.asarray((*_SEARCH_ORDER, STAY))[best]
+        return jnp.asarray((*SEARCH_ORDER, STAY))[best]
 
     def destination(self, action: Int[Array, ""]) -> Int[Array, ""]:
         """Return the cell that a move action points at, walls ignored; the own cell for other actions."""
-        ahead = jnp.asarray(self.paths.neighbours)[self.me, jnp.minimum(action, 3)]
+        ahead = self.neighbours(self.me)[jnp.minimum(action, 3)]
         return jnp.where(action < 4, ahead, self.me)

@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Int, Key, UInt8
 
 from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.tables import Tables
 
 Noise = Literal["fixed", "seeded"]
 """Source of a heuristic teammate's randomness: "fixed", the published PRNGKey(slot) in every episode, for results that
 compare with the paper's; or "seeded", a new key in every episode."""
+
+
+class Situation(NamedTuple):
+    """What a scripted agent sees of one environment.
+
+    Attributes:
+        tables: tables of its layout.
+        record: uint8 (S,), its state record.
+    """
+
+    tables: Tables
+    record: UInt8[Array, " S"]
 
 
 class Policy(NamedTuple):
@@ -24,7 +39,8 @@ class Policy(NamedTuple):
             parameters share one compilation.
         init: (params, key) -> memory, any pytree, at the start of an episode; for egos in evaluation, of a task.
         act: (params, memory, view, key) -> action, int32 () in 0..5, and the memory after the step.
-        sees: content of `view`: "state" for the state record, uint8 (S,); "observation" for uint8 (5, 5, C);
+        sees: content of `view`: "state" for the state record, uint8 (S,); "situation" for a `Situation`, by which one
+            policy plays every layout; "observation" for uint8 (5, 5, C);
             "ego_input", for egos in evaluation only, for the observation with the outcome of the previous step
             (`icrl4aht_baselines.agents.EgoInput`).
     """
@@ -32,7 +48,23 @@ class Policy(NamedTuple):
     params: Any
     init: Callable[[Any, Key[Array, ""]], Any]
     act: Callable[[Any, Any, Array, Key[Array, ""]], tuple[Int[Array, ""], Any]]
-    sees: Literal["state", "observation", "ego_input"]
+    sees: Literal["state", "situation", "observation", "ego_input"]
+
+
+@lru_cache(maxsize=256)
+def _act_on(act: Callable[..., Any], layout: Layout) -> Callable[..., Any]:
+    def on_layout(params: Any, memory: Any, record: UInt8[Array, " S"], key: Key[Array, ""]) -> Any:
+        return act(params, memory, Situation(layout.tables, record), key)
+
+    return on_layout
+
+
+def on_layout(policy: Policy, layout: Layout) -> Policy:
+    """Return a policy that sees a `Situation` as one that sees the state records of one layout.
+
+    Policies with the same functions have the same functions afterwards.
+    """
+    return policy._replace(act=_act_on(policy.act, layout), sees="state")
 
 
 def sometimes_random(key: Key[Array, ""], chance: Any, action: Int[Array, ""]) -> Int[Array, ""]:

@@ -87,7 +87,14 @@ class Tables(NamedTuple):
         recipe_count: uint32 (), number of recipes.
         ingredients: int32 (3,), ids of the ingredients that have a pile, ascending; -1 for a type without one.
         size: int32 (2,), width and height of the map.
+        number: uint8 (cells,), position of a cell in `pots`, `buttons` or `counters`; NOWHERE for other cells.
+        near: uint8 (cells,), bit k says whether a cell above, below, left or right is of kind k.
+        goal_access: uint8 (A,), floor cells next to a goal; NOWHERE for a padded one.
+        stations: float32 (cells,), distance to the mean cell of pots and piles, minus that to the mean cell of goals
+            and plates: what the teammates H2 may divide a layout by.
         distance: uint8 (cells, cells), shortest distance between floor cells; NOWHERE if there is no path.
+        target_distance: uint8 (cells, cells), distance from a floor cell to the nearest floor cell next to a target;
+            NOWHERE if there is no path.
         first_step: uint8 (cells, cells), the action of the first step from one floor cell towards another.
     """
 
@@ -111,11 +118,20 @@ class Tables(NamedTuple):
     recipe_count: Array
     ingredients: Array
     size: Array
+    number: Array
+    near: Array
+    goal_access: Array
+    stations: Array
     distance: Array
+    target_distance: Array
     first_step: Array
 
 
-_PADDING = {"kinds": WALL, "pots": NOWHERE, "buttons": NOWHERE, "counters": NOWHERE, "distance": NOWHERE} | {
+_PADDING = {"kinds": WALL, "pots": NOWHERE, "buttons": NOWHERE, "counters": NOWHERE} | {
+    "number": NOWHERE,
+    "goal_access": NOWHERE,
+    "distance": NOWHERE,
+    "target_distance": NOWHERE,
     "first_step": STAY,
     "ingredients": -1,
 }
@@ -162,27 +178,31 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
         pots: number of pots of the state records that the tables are for, at least the layout's own.
         buttons: number of buttons of these records.
     """
-    count, ahead = layout.cells, layout.ahead
-    number = np.zeros(count, np.int32)
+    ahead, kinds, walkable = layout.ahead, layout.kinds, layout.walkable
+    pots, buttons = max(pots or 0, len(layout.pots)), max(buttons or 0, len(layout.buttons))
+    number = np.full(layout.cells, NOWHERE, np.uint8)
     for cells in (layout.pots, layout.counters, layout.buttons):
         number[list(cells)] = range(len(cells))
-    pots, buttons = max(pots or 0, len(layout.pots)), max(buttons or 0, len(layout.buttons))
-    row, column = np.divmod(np.arange(count, dtype=np.int32), layout.width)
+    row, column = np.divmod(np.arange(layout.cells, dtype=np.int32), layout.width)
+    beside = _neighbours(layout)
+    near = np.bitwise_or.reduce(np.where(beside >= 0, 1 << kinds.astype(int)[beside], 0), axis=1).astype(np.uint8)
     distance, first_step = _search(layout)
+    # An index of -1 reads the last cell, which `where` then replaces.
+    to_access = np.where((beside >= 0) & walkable[beside], distance[:, beside], NOWHERE).min(axis=-1)
     canonical = CANONICAL_TYPES if layout.ingredient_types <= CANONICAL_TYPES else 0
     rooms = np.zeros((2, max(map(len, layout.rooms))), np.uint8)
     for cells, room in zip(rooms, layout.rooms, strict=True):
         cells[: len(room)] = room
     return Tables(
-        kinds=layout.kinds,
+        kinds=kinds,
         piles=layout.piles,
         column=column,
         row=row,
-        walkable=layout.walkable,
+        walkable=walkable,
         ahead=ahead,
-        faced=layout.kinds[ahead] | layout.piles[ahead].astype(np.int32) << 8 | number[ahead] << 16,
+        faced=kinds[ahead] | layout.piles[ahead].astype(np.int32) << 8 | number[ahead].astype(np.int32) << 16,
         moves=layout.moves,
-        view=_view(layout, number, pots, buttons),
+        view=_view(layout, number.astype(int), pots, buttons),
         own=_channel_bits(layout, layout.ingredient_types, layout.indicates_delivery),
         canonical=_channel_bits(layout, canonical, True),
         pots=np.array(layout.pots, np.uint8),
@@ -194,9 +214,32 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
         recipe_count=np.array(len(layout.recipes), np.uint32),
         ingredients=np.array((*layout.ingredients, -1, -1, -1)[:3], np.int32),
         size=np.array([layout.width, layout.height], np.int32),
+        number=number,
+        near=near,
+        goal_access=np.flatnonzero(walkable & (near >> GOAL & 1 > 0)).astype(np.uint8),
+        stations=_stations(layout, column, row),
         distance=distance,
+        target_distance=to_access,
         first_step=first_step,
     )
+
+
+def _neighbours(layout: Layout) -> np.ndarray:
+    """Return int (cells, 4): the cell above, below, left and right of each cell, -1 outside the map."""
+    row, column = np.divmod(np.arange(layout.cells)[:, None], layout.width)
+    x, y = column + np.array([0, 0, -1, 1]), row + np.array([-1, 1, 0, 0])
+    inside = (x >= 0) & (x < layout.width) & (y >= 0) & (y < layout.height)
+    return np.where(inside, y * layout.width + x, -1)
+
+
+def _stations(layout: Layout, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    def distance_to(*kinds: int) -> np.ndarray:
+        of = np.isin(layout.kinds, kinds)
+        if not of.any():
+            return np.zeros(layout.cells)
+        return np.abs(column - column[of].mean()) + np.abs(row - row[of].mean())
+
+    return (distance_to(POT, PILE) - distance_to(GOAL, PLATES)).astype(np.float32)
 
 
 def _search(layout: Layout) -> tuple[np.ndarray, np.ndarray]:

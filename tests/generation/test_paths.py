@@ -6,9 +6,9 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from icrl4aht_generation.paths import UNREACHABLE, Paths
 
 from icrl4aht_data.overcooked.actions import ACTIONS, DOWN, LEFT, RIGHT, STAY, UP
+from icrl4aht_data.overcooked.cells import NOWHERE
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 
 SEARCH = (RIGHT, DOWN, LEFT, UP)
@@ -37,7 +37,7 @@ def brute_move(layout: Layout, cell: int, action: int) -> int:
 @lru_cache
 def brute_distances(layout: Layout) -> np.ndarray:
     """int (cells, cells): steps between floor cells, by relaxing all triples (Floyd and Warshall)."""
-    distance = np.full((layout.cells, layout.cells), UNREACHABLE)
+    distance = np.full((layout.cells, layout.cells), NOWHERE)
     for cell, letter in enumerate("".join(layout.rows)):
         if letter in " A":
             for action in DELTA:
@@ -45,13 +45,13 @@ def brute_distances(layout: Layout) -> np.ndarray:
             distance[cell, cell] = 0
     for via in range(layout.cells):
         distance = np.minimum(distance, distance[:, via, None] + distance[via])
-    return np.minimum(distance, UNREACHABLE)
+    return np.minimum(distance, NOWHERE)
 
 
 def brute_first_step(layout: Layout, origin: int, target: int) -> int:
     """Return the first action, right, down, left, up, that starts a shortest path."""
     left = brute_distances(layout)[origin, target]
-    if left in (0, UNREACHABLE):
+    if left in (0, NOWHERE):
         return STAY
     return next(a for a in SEARCH if brute_distances(layout)[brute_move(layout, origin, a), target] == left - 1)
 
@@ -59,23 +59,23 @@ def brute_first_step(layout: Layout, origin: int, target: int) -> int:
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_paths_equal_brute_force_and_lead_one_step_nearer(name):
     layout = LAYOUTS[name]
-    paths = Paths(layout)
-    np.testing.assert_array_equal(paths.distance, brute_distances(layout))
+    tables = layout.tables
+    np.testing.assert_array_equal(tables.distance, brute_distances(layout))
     first = [[brute_first_step(layout, a, b) for b in range(layout.cells)] for a in range(layout.cells)]
-    np.testing.assert_array_equal(paths.first_step, first)
-    origin, target = ((paths.distance > 0) & (paths.distance < UNREACHABLE)).nonzero()
+    np.testing.assert_array_equal(tables.first_step, first)
+    origin, target = ((tables.distance > 0) & (tables.distance < NOWHERE)).nonzero()
     assert len(origin)
-    after = layout.moves[origin, paths.first_step[origin, target]]
-    np.testing.assert_array_equal(paths.distance[after, target], paths.distance[origin, target] - 1)
-    np.testing.assert_array_equal(paths.first_step[(paths.distance == 0) | (paths.distance == UNREACHABLE)], STAY)
+    after = layout.moves[origin, tables.first_step[origin, target]]
+    np.testing.assert_array_equal(tables.distance[after, target], tables.distance[origin, target] - 1)
+    np.testing.assert_array_equal(tables.first_step[(tables.distance == 0) | (tables.distance == NOWHERE)], STAY)
 
 
 def test_ties_resolve_right_down_left_up_in_an_open_room():
-    paths = Paths(OPEN)
+    tables = OPEN.tables
     centre_x, centre_y = 3, 3
     for x in range(1, 6):
         for y in range(1, 6):
             dx, dy = x - centre_x, y - centre_y
             expected = RIGHT if dx > 0 else DOWN if dy > 0 else LEFT if dx < 0 else UP if dy < 0 else STAY
-            found = paths.first_step[centre_y * OPEN.width + centre_x, y * OPEN.width + x]
+            found = tables.first_step[centre_y * OPEN.width + centre_x, y * OPEN.width + x]
             assert ACTIONS[found] == ACTIONS[expected], (x, y)

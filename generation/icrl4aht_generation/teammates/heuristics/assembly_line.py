@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key
 
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
+from icrl4aht_data.overcooked.cells import POT
 from icrl4aht_generation.paths import Rule, Scene, is_ingredient
 from icrl4aht_generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
 
@@ -17,6 +18,7 @@ RUNNER, PLATER, FLEX = range(3)
 AT_POTS, CENTRAL, NEAR_PARTNER = range(3)
 
 _MOVES_BY_DRAW = (RIGHT, DOWN, LEFT, UP)
+_OFF_BEATS = (np.arange(10) / 10).astype(np.float32)
 
 
 class AssemblyMemory(NamedTuple):
@@ -49,8 +51,8 @@ def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int
 
 def _off_beat(scene: Scene) -> Array:
     """Return the factor of the chance to hesitate, float32 in 0..0.9: a fixed pattern over the cells."""
-    y, x = np.divmod(np.arange(scene.paths.layout.cells), scene.paths.layout.width)
-    return jnp.asarray(((7 * x + 13 * y) % 10 / 10).astype(np.float32))[scene.me]
+    x, y = jnp.asarray(scene.tables.column)[scene.me], jnp.asarray(scene.tables.row)[scene.me]
+    return jnp.asarray(_OFF_BEATS)[(7 * x + 13 * y) % 10]
 
 
 def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
@@ -91,7 +93,7 @@ def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
     step, _ = scene.approach(target)
     if scene.slot == 0:
         return step
-    distance = jnp.asarray(scene.paths.distance)[scene.partner, scene.destination(step)]
+    distance = scene.distances(scene.partner)[scene.destination(step)]
     return jnp.where((step < STAY) & (distance <= 1), STAY, step)
 
 
@@ -104,13 +106,12 @@ def _needed_piles(scene: Scene) -> Bool[Array, " cells"]:
 
 def _handoff_counters(scene: Scene, params) -> Bool[Array, " cells"]:
     """Return empty counters for an ingredient that no pot takes, by style; every empty one if the style has none."""
-    layout = scene.paths.layout
-    y, x = np.divmod(np.arange(layout.cells), layout.width)
-    middle_x, middle_y = int(x[layout.walkable].mean()), int(y[layout.walkable].mean())
-    central = np.abs(x - middle_x) + np.abs(y - middle_y) <= 3
-    near_partner = jnp.asarray(scene.paths.manhattan)[scene.partner] <= 2
+    x, y, floor = (jnp.asarray(table) for table in (scene.tables.column, scene.tables.row, scene.tables.walkable))
+    middle_x, middle_y = (jnp.sum(axis * floor) // jnp.sum(floor) for axis in (x, y))
+    central = jnp.abs(x - middle_x) + jnp.abs(y - middle_y) <= 3
+    near_partner = scene.manhattan(scene.cell, scene.partner) <= 2
     free = scene.empty_counters
-    at_pots = free & scene.paths.near_pot
+    at_pots = free & scene.near(POT)
     near_partner = _or_else(free & near_partner, at_pots)
     style = params["handoff_style"]
     preferred = jnp.where(style == AT_POTS, at_pots, jnp.where(style == CENTRAL, free & central, near_partner))
@@ -125,13 +126,13 @@ def _makes_room(scene: Scene) -> Bool[Array, ""]:
     """Return whether agent 1 is empty-handed and adjacent to a partner who carries something."""
     if scene.slot == 0:
         return jnp.asarray(False)
-    adjacent = jnp.asarray(scene.paths.manhattan)[scene.me, scene.partner] == 1
+    adjacent = scene.manhattan(scene.me, scene.partner) == 1
     return scene.holds_nothing & (scene.partner_hand > 0) & adjacent
 
 
 def _step_aside(scene: Scene) -> Int[Array, ""]:
     """Step straight away from the adjacent partner; else sideways, right before left, down before up; else stay."""
-    from_partner = jnp.asarray(scene.paths.neighbours)[scene.me] == scene.partner  # above, below, left, right
+    from_partner = scene.neighbours(scene.me) == scene.partner  # above, below, left, right
     across = from_partner[2] | from_partner[3]
     # Scores of right, down, left, up.
     sideways_in_row = jnp.array([2, 0, 1, 0])
@@ -150,12 +151,12 @@ def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], 
 
     may_return = slips & scene.holds_nothing & (params["stubbornness"] > 0)
     key, own = extra_split(key, may_return)
-    layout = scene.paths.layout
+    width, height = jnp.asarray(scene.tables.size)
     # The published formula of a teammate's home cell; on some layouts it is a wall, and nobody walks home.
-    home = (3 * scene.slot % layout.height) * layout.width + 5 * scene.slot % layout.width
-    far = jnp.asarray(scene.paths.manhattan)[scene.me, home] > 2
-    goes = may_return & far & (jax.random.uniform(own) < params["stubbornness"]) & bool(layout.walkable[home])
-    return jnp.where(goes, jnp.asarray(scene.paths.first_step)[scene.me, home], action), key
+    home = (3 * scene.slot % height) * width + 5 * scene.slot % width
+    far, is_floor = scene.manhattan(scene.me, home) > 2, jnp.asarray(scene.tables.walkable)[home]
+    goes = may_return & far & (jax.random.uniform(own) < params["stubbornness"]) & is_floor
+    return jnp.where(goes, scene.first_step(home), action), key
 
 
 ASSEMBLY_LINE = Heuristic(

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_generation.paths import Paths, Scene
-from icrl4aht_generation.policy import Noise, Policy
+from icrl4aht_generation.paths import Scene
+from icrl4aht_generation.policy import Noise, Policy, Situation, on_layout
 
 SHARES = [0.0, 0.0, 0.25, 0.5, 0.75]
 """Values of a chance of not doing one's part, for `Heuristic.diverse`: none for two teammates in five."""
@@ -67,24 +67,25 @@ class Heuristic:
     diverse: Sampling | None = None
 
     def build(
-        self, layout: Layout, theta: Mapping[str, float], slot: int = TEAMMATE, noise: Noise = "seeded"
+        self, layout: Layout | None, theta: Mapping[str, float], slot: int = TEAMMATE, noise: Noise = "seeded"
     ) -> Policy:
         """Return a teammate of this family.
 
         Policies of one layout, slot and noise share their functions, and so their compilations.
 
         Args:
-            layout: the layout.
+            layout: the layout whose state records it sees; None for a teammate that sees a `Situation` of any layout.
             theta: a value for every parameter.
             slot: 0 or 1, the agent it plays.
             noise: source of its randomness.
         """
-        init, act = _functions(self, layout, slot, noise)
+        init, act = _functions(self, slot, noise)
         params = {
             name: (jnp.int32 if isinstance(default, int) else jnp.float32)(theta[name])
             for name, default in self.defaults.items()
         }
-        return Policy(params, init, act, "state")
+        policy = Policy(params, init, act, "situation")
+        return policy if layout is None else on_layout(policy, layout)
 
     def is_valid(self, name: str, value: Any) -> bool:
         """Return whether a parameter may have this value."""
@@ -107,17 +108,16 @@ class Heuristic:
 
 
 @lru_cache(maxsize=64)
-def _functions(heuristic: Heuristic, layout: Layout, slot: int, noise: Noise):
+def _functions(heuristic: Heuristic, slot: int, noise: Noise):
     """Return `init` and `act` of a policy."""
-    paths = Paths(layout)
 
     # Cached, so that policies of one family are the same functions, and JAX compiles them once.
     def init(params, key: Key[Array, ""]) -> Any:
         return heuristic.begin(jax.random.key(slot) if noise == "fixed" else key)
 
-    def act(params, memory: Any, record: UInt8[Array, " S"], key: Key[Array, ""]):
+    def act(params, memory: Any, view: Situation, key: Key[Array, ""]):
         # The roll-out's key is not used: the published teammates carry a chain of keys in their memory.
-        action, memory = heuristic.act(params, memory, Scene(paths, record, slot))
+        action, memory = heuristic.act(params, memory, Scene(view.tables, view.record, slot))
         return action.astype(jnp.int32), memory
 
     return init, act

@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
 
 from icrl4aht_data.overcooked.actions import STAY
-from icrl4aht_data.overcooked.cells import GOAL, INDICATOR, PLATE, PLATES, POT
-from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.cells import GOAL, NOWHERE, PLATE, POT
 from icrl4aht_data.overcooked.state import POT_STEPS
-from icrl4aht_generation.paths import UNREACHABLE, Paths, Rule, Scene, is_dish, is_ingredient
+from icrl4aht_generation.paths import UNREACHABLE, Rule, Scene, is_dish, is_ingredient
 from icrl4aht_generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
 
 _CRAMPED_CELLS = 8
@@ -93,7 +92,7 @@ def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple
 
 def _look(scene: Scene, memory: ButtonMemory) -> ButtonMemory:
     """Return the memory with the recipe, if the layout has an indicator (seen or not) or the button is lit."""
-    shown = jnp.any(jnp.asarray(scene.paths.static(INDICATOR))) | scene.button_lit
+    shown = jnp.any(scene.indicators) | scene.button_lit
     return memory._replace(
         recipe=jnp.where(shown, scene.state.recipe, memory.recipe),
         seen=jnp.where(shown, memory.clock, memory.seen),
@@ -107,16 +106,17 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
     specialist = params["task_specialization"] > 0.5
     role = Role(specialist & (scene.slot == 0), specialist & (scene.slot == 1))
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
-    cramped = is_cramped(scene.paths.layout)
+    cramped = is_cramped(scene)
+    # In a cramped layout agent 1 is the one that gives way.
+    second = cramped & (scene.slot == 1)
+    ids = jnp.asarray(scene.tables.ingredients)
 
     considered = empty & unsure & ~scene.button_lit & jnp.any(scene.buttons)
     fetches_plate = empty & _wants_plate(scene, params, role)
-    if cramped and scene.slot == 1:
-        fetches_plate &= ~_leaves_plates(scene)
+    fetches_plate &= ~(second & _leaves_plates(scene))
     cooks = empty & ~role.delivers_only
-    errs = cooks & noises.errs & (scene.paths.layout.ingredient_types > 1)
-    right = _right_ingredient(scene, params, recipe, cramped)
-    types = scene.paths.layout.ingredient_types
+    errs = cooks & noises.errs & (jnp.max(ids) > 0)
+    right = _right_ingredient(scene, params, recipe, second)
     first_rules = [
         Rule(dish & role.cooks_only, scene.empty_counters),
         Rule(dish & ~role.cooks_only, scene.goals),
@@ -131,24 +131,22 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
     chosen = scene.first(
         [
             *first_rules,
-            Rule(errs, _piles(scene, (right + 1) % types)),
-            Rule(cooks, _piles(scene, right)),
+            Rule(errs, scene.piles_of(ids == (right + 1) % (jnp.max(ids) + 1))),
+            Rule(cooks, scene.piles_of(ids == right)),
             Rule(empty, scene.pots, waits=True),
         ]
     )
     # The rules from `errs` on fetch ingredients; only they can be replaced by blocking or by a wrong ingredient.
     settled = chosen.found & (chosen.number < len(first_rules))
     action = scene.go_to(chosen.target, chosen.waits, _step(scene, chosen.target, cramped))
-    if cramped and scene.slot == 1:
-        gives_way, aside = _yield_pot(scene, chosen.target)
-        action = jnp.where(chosen.found & (chosen.number == pot_rule) & gives_way, aside, action)
+    gives_way, aside = _yield_pot(scene, chosen.target)
+    action = jnp.where(second & chosen.found & (chosen.number == pot_rule) & gives_way, aside, action)
     action = jnp.where(chosen.found, action, scene.wander())
     blocks, step = _block(scene)
     blocks &= cooks & noises.blocks & ~settled
     action = jnp.where(blocks, step, action)
-    if cramped:
-        clears = plate & is_dish(scene.partner_hand) & ~jnp.any(scene.reach(scene.cooked))
-        action = jnp.where(clears, _clear_the_way(scene), action)
+    clears = cramped & plate & is_dish(scene.partner_hand) & ~jnp.any(scene.reach(scene.cooked))
+    action = jnp.where(clears, _clear_the_way(scene), action)
     pressed = chosen.found & (chosen.number == press_rule)
     return action, considered, pressed, errs & ~settled & ~blocks
 
@@ -161,122 +159,107 @@ def _wants_plate(scene: Scene, params, role: Role) -> Bool[Array, ""]:
     return ((urgency >= 1 - params["plate_timing"]) & ~role.cooks_only) | role.delivers_only
 
 
-def _decoded(scene: Scene) -> np.ndarray:
-    """Return the piled types that H1 recognizes in an item, bool (types,); not id 3 (published quirk)."""
-    return np.array(scene.paths.layout.ingredients) < 3
+def _decoded(scene: Scene) -> Bool[Array, " 3"]:
+    """Return the piled types that H1 recognizes in an item; not id 3 (published quirk)."""
+    return jnp.asarray(scene.tables.ingredients) < 3
 
 
-def _missing(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P types"]:
+def _missing(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P 3"]:
     """Return ingredients of the recipe that are missing in each pot; 0 for pots that take no more."""
     missing = jnp.maximum(scene.counts(recipe) - scene.counts(scene.state.pot_items), 0)
-    takes = scene.nonfull[np.array(scene.paths.layout.pots)]
-    return missing * takes[:, None] * _decoded(scene)
+    return missing * scene.takes_more[:, None] * _decoded(scene)
 
 
 def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
     """Pots in which the ingredient in the hand is missing; if there is none, every pot that takes an ingredient."""
     # A pot with a wrong soup also takes ingredients: with no better pot, H1 fills it up.
     held = scene.counts(scene.hand)
-    wanting = (
-        jnp.zeros_like(scene.nonfull).at[np.array(scene.paths.layout.pots)].set(_missing(scene, recipe) @ held > 0)
-    )
+    wanting = scene.at(POT, _missing(scene, recipe) @ held > 0)
     wanted_everywhere = jnp.any((held > 0) & ~_decoded(scene))
     return jnp.where(jnp.any(wanting) & ~wanted_everywhere, wanting, scene.nonfull)
 
 
-def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], cramped: bool) -> Int[Array, ""]:
+def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], second: Array) -> Int[Array, ""]:
     """Return the id of the ingredient to fetch, -1 for none. In a cramped layout, the agents fetch different ones."""
-    ids = jnp.asarray(scene.paths.layout.ingredients)
+    ids = jnp.asarray(scene.tables.ingredients)
     missing = _missing(scene, recipe).sum(axis=0) > 0
-    second = cramped and scene.slot == 1
     # Teammates cannot talk, so fetching different ingredients is how two of them share the work.
     nth = jnp.cumsum(missing)
-    wanted = jnp.where(jnp.sum(missing) > 1, nth == 2, nth == 1) if second else nth == 1
+    wanted = jnp.where(second & (jnp.sum(missing) > 1), nth == 2, nth == 1)
     known = jnp.where(jnp.any(missing), ids[jnp.argmax(wanted)], _NONE)
-    guessed = jnp.where(params["strict_recipe"] < 0.5, int(second), _NONE)
+    guessed = jnp.where(params["strict_recipe"] < 0.5, second.astype(jnp.int32), _NONE)
     return jnp.where(recipe > 0, known, guessed)
-
-
-def _piles(scene: Scene, ingredient: Int[Array, ""]) -> Bool[Array, " cells"]:
-    return scene.piles_of(jnp.asarray(scene.paths.layout.ingredients) == ingredient)
 
 
 def _block(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether a cell adjacent to a pot or a goal can be reached, and the step to the nearest, or stay on it."""
-    critical = _access_cells(scene.paths, POT) | _access_cells(scene.paths, GOAL)
-    distance = jnp.where(critical, jnp.asarray(scene.paths.distance)[scene.me], UNREACHABLE)
+    critical = (scene.near(POT) | scene.near(GOAL)) & jnp.asarray(scene.tables.walkable)
+    distance = jnp.where(critical, scene.distances(scene.me), UNREACHABLE)
     nearest = jnp.argmin(distance)
-    return distance[nearest] < UNREACHABLE, jnp.asarray(scene.paths.first_step)[scene.me, nearest]
-
-
-def _access_cells(paths: Paths, kind: int) -> np.ndarray:
-    """Return the mask of floor cells adjacent to cells of a kind, bool (cells,)."""
-    return (paths.manhattan[:, paths.static(kind)] == 1).any(axis=1) & paths.layout.walkable
+    return distance[nearest] < UNREACHABLE, scene.first_step(nearest)
 
 
 # Cramped layouts only.
 
 
-def is_cramped(layout: Layout) -> bool:
+def is_cramped(scene: Scene) -> Bool[Array, ""]:
     """Return whether a layout is so small that H1 teammates give way to their partner."""
-    return int(layout.walkable.sum()) <= _CRAMPED_CELLS
+    return jnp.sum(jnp.asarray(scene.tables.walkable)) <= _CRAMPED_CELLS
 
 
-def _step(scene: Scene, target: Int[Array, ""], cramped: bool) -> Int[Array, ""]:
+def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int[Array, ""]:
     """The step towards a target. In a cramped layout, agents prefer opposite corners and walk around each other."""
-    if not cramped:
-        return scene.approach(target)[0]
-    layout = scene.paths.layout
-    y, x = np.divmod(np.arange(layout.cells), layout.width)
+    x, y = jnp.asarray(scene.tables.column), jnp.asarray(scene.tables.row)
+    width, height = jnp.asarray(scene.tables.size)
     # A tenth of a step for each cell: it decides between access cells at equal distance, and nothing else.
-    corner = y + x if scene.slot == 0 else (layout.height - y) + (layout.width - x)
-    step, _ = scene.approach(target, (np.float32(0.1) * corner).astype(np.float32))
+    corner = y + x if scene.slot == 0 else (height - y) + (width - x)
+    step, _ = scene.approach(target, jnp.where(cramped, np.float32(0.1) * corner, np.float32(0)))
     if scene.slot == 1:
         around = scene.sidestep(STAY)
     else:
         pushes = ~scene.holds_dish
         around = scene.sidestep(jnp.where(pushes, step, STAY))
         around = jnp.where(scene.holds_ingredient & (jnp.sum(scene.free) < 2), step, around)
-    return jnp.where(scene.destination(step) == scene.partner, around, step)
+    return jnp.where(cramped & (scene.destination(step) == scene.partner), around, step)
 
 
 def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether the partner has an ingredient and is about as near to the pot, and the step away from it."""
-    manhattan = jnp.asarray(scene.paths.manhattan)
-    access = jnp.asarray(scene.paths.only_access)[pot]
-    as_near = manhattan[scene.partner, access] <= manhattan[scene.me, access] + 1
+    access = scene.only_access(pot)
+    as_near = scene.manhattan(scene.partner, access) <= scene.manhattan(scene.me, access) + 1
     gives_way = is_ingredient(scene.partner_hand) & (access >= 0) & as_near
-    return gives_way, scene.best_way(scene.free, manhattan[scene.ways, access])
+    return gives_way, scene.best_way(scene.free, scene.manhattan(scene.ways, access))
 
 
 def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
     """Return whether to leave the plates to a partner without one: they are accessible from a single cell."""
-    piles = scene.paths.static(PLATES).nonzero()[0]
-    single = bool(len(piles)) and bool(scene.paths.only_access[piles[0]] >= 0)
+    first = jnp.argmax(scene.plate_piles)
+    single = jnp.any(scene.plate_piles) & (scene.only_access(first) >= 0)
     carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)
     return ~carries & single
 
 
 def _clear_the_way(scene: Scene) -> Int[Array, ""]:
     """Return the step off the shortest paths between the partner, who carries a dish, and the goals."""
-    paths = scene.paths
-    manhattan = jnp.asarray(paths.manhattan)
-    exits = np.flatnonzero(_access_cells(paths, GOAL))
-    walkable = jnp.asarray(paths.layout.walkable)
+    exits, walkable = jnp.asarray(scene.tables.goal_access), jnp.asarray(scene.tables.walkable)
     if not len(exits):
         return jnp.int32(STAY)
+    exists = exits < NOWHERE
+    exits = jnp.where(exists, exits, 0)
+    from_exit = scene.manhattan(scene.cell[:, None], exits)
+    from_partner = scene.manhattan(scene.cell, scene.partner)
     # A cell is between two others if the way over it is no detour.
-    detour = manhattan[scene.partner, :, None] + manhattan[:, exits]
-    between = jnp.any(detour == manhattan[scene.partner, exits], axis=1)
-    in_the_way = walkable & (between | (manhattan[scene.partner] == 1))
-    from_exits = jnp.asarray(paths.manhattan[:, exits].min(axis=1))
+    detour = from_partner[:, None] + from_exit
+    between = jnp.any((detour == scene.manhattan(scene.partner, exits)) & exists, axis=1)
+    in_the_way = walkable & (between | (from_partner == 1))
+    from_exits = jnp.min(jnp.where(exists, from_exit, UNREACHABLE), axis=1)
     leaves = scene.free & ~in_the_way[scene.ways]
     # Where no neighbour is out of the way, head for the cell that is farthest from the goals.
     refuge = jnp.argmax(jnp.where(walkable & ~in_the_way, from_exits, -1))
-    to_refuge = manhattan[scene.ways, refuge]
-    nearer = scene.free & (to_refuge < manhattan[scene.me, refuge]) & jnp.any(walkable & ~in_the_way)
+    to_refuge = scene.manhattan(scene.ways, refuge)
+    nearer = scene.free & (to_refuge < scene.manhattan(scene.me, refuge)) & jnp.any(walkable & ~in_the_way)
     step = scene.best_way(leaves, from_exits[scene.ways], scene.best_way(nearer, -to_refuge))
-    return jnp.where(in_the_way[scene.me], step, STAY)
+    return jnp.where(jnp.any(exists) & in_the_way[scene.me], step, STAY)
 
 
 RECIPE_AWARE_BUTTON = Heuristic(

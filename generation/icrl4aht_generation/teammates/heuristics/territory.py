@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
-from icrl4aht_data.overcooked.cells import GOAL, PILE, PLATES, POT
-from icrl4aht_generation.paths import Paths, Rule, Scene
+from icrl4aht_generation.paths import Rule, Scene
 from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw
 
 VERTICAL, HORIZONTAL, STATIONS = range(3)
@@ -68,14 +67,14 @@ def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Ar
 
 def _to_the_middle(scene: Scene) -> Int[Array, ""]:
     """Return the step towards the middle: across first, then along the middle column; stay in front of a wall."""
-    layout = scene.paths.layout
-    y, x = np.divmod(np.arange(layout.cells), layout.width)
+    x, y = jnp.asarray(scene.tables.column)[scene.me], jnp.asarray(scene.tables.row)[scene.me]
+    middle_x, middle_y = jnp.asarray(scene.tables.size) // 2
     # On most layouts nobody gets past a blocker in the middle column.
-    across = np.where(x < layout.width // 2, RIGHT, LEFT)
-    along = np.where(y < layout.height // 2, DOWN, np.where(y > layout.height // 2, UP, STAY))
-    action = np.where(x == layout.width // 2, along, across)
-    blocked = layout.moves[np.arange(layout.cells), action] == np.arange(layout.cells)
-    return jnp.asarray(np.where(blocked, STAY, action))[scene.me]
+    across = jnp.where(x < middle_x, RIGHT, LEFT)
+    along = jnp.where(y < middle_y, DOWN, jnp.where(y > middle_y, UP, STAY))
+    action = jnp.where(x == middle_x, along, across)
+    blocked = jnp.asarray(scene.tables.moves)[scene.me, action] == scene.me
+    return jnp.where(blocked, STAY, action)
 
 
 def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> Int[Array, ""]:
@@ -136,8 +135,8 @@ def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
     step = jnp.where(goes_around, scene.sidestep(STAY), step)
     if scene.slot == 0:
         return step
-    access = jnp.asarray(scene.paths.only_access)[target]
-    near = jnp.asarray(scene.paths.distance)[scene.partner, access] <= 1
+    access = scene.only_access(target)
+    near = scene.distances(scene.partner)[access] <= 1
     waits = (access >= 0) & near & (cost <= 2) & (params["yield_bias"] >= np.float32(0.1))
     return jnp.where(waits, STAY, step)
 
@@ -163,9 +162,14 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
 def areas(scene: Scene, params) -> Areas:
     """Return the areas of the scene's agent, or of its partner for the mode INVADER."""
     # The split by stations can leave one agent without floor, in small rooms; such layouts are split vertically.
-    beyond, stations = _borders(scene.paths)
-    kind = jnp.where((params["split_mode"] == STATIONS) & (not stations), VERTICAL, params["split_mode"])
-    beyond = jnp.asarray(beyond)[kind]
+    tables = scene.tables
+    stations, floor = jnp.asarray(tables.stations), jnp.asarray(tables.walkable)
+    divides = jnp.any(floor & (stations < 0)) & jnp.any(floor & (stations >= 0))
+    kind = jnp.where((params["split_mode"] == STATIONS) & ~divides, VERTICAL, params["split_mode"])
+    middle_x, middle_y = jnp.asarray(tables.size) // 2
+    from_middle = (jnp.asarray(tables.column) - middle_x, jnp.asarray(tables.row) - middle_y)
+    # Signed distance of each cell from the border, positive on agent 1's side, by split mode.
+    beyond = jnp.stack([*(one.astype(jnp.float32) for one in from_middle), stations])[kind]
     margin = params["shared_margin"] * jnp.where(kind == STATIONS, jnp.float32(1.5), jnp.float32(1))
     # An invader works in its partner's territory, so it takes the other side of the border.
     second = (scene.slot == 1) ^ (params["behavior_mode"] == INVADER)
@@ -174,22 +178,6 @@ def areas(scene: Scene, params) -> Areas:
     # As published: cells exactly at the margin are shared, but not in the split by stations.
     shared = jnp.where(kind == STATIONS, near > 0, near >= 0)
     return Areas(strict, jnp.where(second, shared, beyond < margin))
-
-
-def _borders(paths: Paths) -> tuple[np.ndarray, bool]:
-    """float32 (3, cells): signed distance of each cell from the border, by split mode, positive on agent 1's side; and
-    whether the split into stations gives both agents floor cells."""
-    layout = paths.layout
-    y, x = np.divmod(np.arange(layout.cells), layout.width)
-
-    def distance_to(*kinds: int) -> np.ndarray:
-        of = np.isin(layout.kinds, kinds)
-        return np.abs(x - x[of].mean()) + np.abs(y - y[of].mean())
-
-    stations = distance_to(POT, PILE) - distance_to(GOAL, PLATES)
-    floor = stations[layout.walkable]
-    beyond = np.stack([x - layout.width // 2, y - layout.height // 2, stations]).astype(np.float32)
-    return beyond, bool((floor < 0).any() and (floor >= 0).any())
 
 
 TERRITORY = Heuristic(

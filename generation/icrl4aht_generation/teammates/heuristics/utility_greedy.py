@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from icrl4aht_data.overcooked.actions import STAY
+from icrl4aht_data.overcooked.cells import POT
 from icrl4aht_data.overcooked.state import ingredient_count
 from icrl4aht_generation.paths import UNREACHABLE, Scene
 from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, next_key
@@ -55,7 +56,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
     # With a plate, a soup that still cooks is worth as much as a finished one, if no other is finished.
     waits = scene.holds_plate & ~jnp.any(cooked) & jnp.any(cooking)
     needed = scene.reach(scene.needed_piles)
-    stageable = scene.empty_counters & jnp.asarray(scene.paths.near_pot)
+    stageable = scene.empty_counters & scene.near(POT)
     prefers_pots = jnp.any(stageable) & (params["counter_preference"] > 0.5)
     targets = jnp.stack(
         [
@@ -119,7 +120,7 @@ def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array,
 
 def _yield(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
     """Return the action, sometimes `stay` next to the partner, and the number of steps to wait."""
-    distance = jnp.asarray(scene.paths.manhattan)[scene.destination(action), scene.partner]
+    distance = scene.manhattan(scene.destination(action), scene.partner)
     # As published, the roll is the key's first word itself, not a draw from the key.
     roll = jax.random.key_data(memory.key)[0] % 100
     yields = (action < STAY) & (distance <= 1) & (roll < 20 + 20 * scene.slot)
