@@ -6,19 +6,23 @@ number of its episode and the step in it, so an episode does not depend on the o
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8, UInt32
 
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
 from icrl4aht_data.overcooked.state import start
+from icrl4aht_data.overcooked.tables import Tables, stack_tables
+from icrl4aht_generation.policy import Policy, Situation
 
 
 class EnvState(NamedTuple):
@@ -29,12 +33,14 @@ class EnvState(NamedTuple):
         episode: int32 (N,), number of the running episode, from 0.
         clock: int32 (N,), steps taken in the running episode.
         record: uint8 (N, S), state records; see `icrl4aht_data.overcooked.state`.
+        layout: int32 (N,), number of the layout of each environment; None if all have one layout.
     """
 
     key: Key[Array, " N"]
     episode: Int[Array, " N"]
     clock: Int[Array, " N"]
     record: UInt8[Array, "N S"]
+    layout: Int[Array, " N"] | None = None
 
 
 class EnvStep(NamedTuple):
@@ -64,59 +70,145 @@ class Environment:
     Rewards: float32 (N,), the team's; shaped rewards per agent are separate. Episodes end after `max_steps` steps; the
     next one starts automatically.
 
+    With several layouts, every environment has a number of its own, which says which of them it plays. Their state
+    records are padded to common columns, see `stack_tables`. Canonical channels of observations mean the same on all of
+    them; own channels do only if the layouts have equal channel names.
+
     Args:
-        layout: the map and its recipes.
+        layout: the map and its recipes, or several.
         max_steps: steps of an episode: 400 in training, 100 in evaluation.
-        recipes: uint8 (R,), items of the recipes to draw from; by default those of the layout.
+        recipes: uint8 (R,), items of the recipes to draw from; by default those of the layout. For one layout only.
+        redraws: whether every episode is played on a layout that is drawn from all of them at its start.
     """
 
-    layout: Layout
+    layout: Layout | Sequence[Layout]
     max_steps: int = EPISODE_STEPS
     recipes: np.ndarray | None = None
+    redraws: bool = False
+
+    @cached_property
+    def tables(self) -> Tables:
+        """Tables of the one layout, or stacked ones of several."""
+        if not isinstance(self.layout, Layout):
+            return stack_tables(self.layout)
+        if self.recipes is None:
+            return self.layout.tables
+        return self.layout.tables._replace(recipes=self.recipes, recipe_count=np.uint32(len(self.recipes)))
 
     @property
     def recipe_items(self) -> np.ndarray:
         """uint8 (R,): items of the recipes that the environment draws from."""
-        return self.layout.recipe_items if self.recipes is None else self.recipes
+        return self.tables.recipes
 
-    def init(self, keys: Key[Array, " N"]) -> EnvState:
+    def init(self, keys: Key[Array, " N"], layout: Int[Array, " N"] | None = None) -> EnvState:
         """Return the start of the first episode of each environment.
 
         Args:
             keys: typed JAX keys (N,), or raw ones, uint32 (N, 2).
+            layout: numbers of the layouts that the environments play; by default all in turn. Not for one layout, nor
+                for an environment that redraws them.
         """
         if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
             keys = jax.random.wrap_key_data(keys)
         zero = jnp.zeros(keys.shape, jnp.int32)
-        return EnvState(keys, zero, zero, self.first_record(keys, zero))
+        if isinstance(self.layout, Layout):
+            layout = None
+        elif self.redraws:
+            layout = self._drawn_layout(keys, zero)
+        elif layout is None:
+            layout = jnp.arange(len(keys)) % len(self.layout)
+        return EnvState(keys, zero, zero, self.first_record(keys, zero, layout), layout)
 
     def step(self, state: EnvState, actions: Int[Array, "N 2"]) -> EnvStep:
         """Return the result of one step of every environment; finished ones start their next episode."""
         clock = state.clock + 1
-        outcome = rules.step(self.layout, state.record, actions, self.next_recipe(state))
+        outcome: rules.StepResult = self.on_tables(
+            rules.step, state.layout, state.record, actions, self.next_recipe(state)
+        )
         done = clock >= self.max_steps
         episode = state.episode + done
+
+        def restarted() -> tuple[Array, Array | None]:
+            layout = state.layout
+            if self.redraws:
+                layout = jnp.where(done, self._drawn_layout(state.key, episode), layout)
+            first = self.first_record(state.key, episode, layout)
+            return jnp.where(done[:, None], first, outcome.state), layout
+
         # Environments that were initialized together finish together, so one condition for the batch avoids the cost of
         # the reset in all other steps.
-        record = jax.lax.cond(
-            jnp.any(done),
-            lambda: jnp.where(done[:, None], self.first_record(state.key, episode), outcome.state),
-            lambda: outcome.state,
-        )
-        after = EnvState(state.key, episode, jnp.where(done, 0, clock), record)
+        record, layout = jax.lax.cond(jnp.any(done), restarted, lambda: (outcome.state, state.layout))
+        after = EnvState(state.key, episode, jnp.where(done, 0, clock), record, layout)
         return EnvStep(after, outcome.reward, outcome.shaped, done, outcome.state)
 
-    def observe(self, state: EnvState) -> UInt8[Array, "N 2 5 5 C"]:
-        """Return the observations of both agents, ego first."""
-        return observe_both(self.layout, state.record)
+    def on_tables(self, function: Callable[..., Any], layout: Int[Array, " N"] | None, *arguments: Array) -> Any:
+        """Call a function of tables and arrays with the environments' tables.
 
-    def observe_one(self, state: EnvState, agent: int) -> UInt8[Array, "N 5 5 C"]:
+        Args:
+            function: takes tables of one layout, then arrays with or without a leading axis (N,).
+            layout: numbers of the layouts, `EnvState.layout`.
+            arguments: arrays (N, ...).
+        """
+        if layout is None:
+            return function(self.tables, *arguments)
+        return jax.vmap(lambda number, *own: function(self.tables_of(number), *own))(layout, *arguments)
+
+    def tables_of(self, layout: Int[Array, ""] | None) -> Tables:
+        """Return the tables of the layout with a number; None for the only one."""
+        # The compiler fuses this gather with those that follow, so that no environment holds a copy of its tables.
+        return self.tables if layout is None else jax.tree.map(lambda leaf: jnp.asarray(leaf)[layout], self.tables)
+
+    def act(
+        self,
+        policy: Policy,
+        params: Any,
+        memories: Any,
+        state: EnvState,
+        agent: int,
+        keys: Key[Array, " N"],
+        *,
+        own: bool,
+    ) -> tuple[Int[Array, " N"], Any]:
+        """Return the actions of a policy as one agent of every environment, and its memories after the step.
+
+        Args:
+            policy: the policy.
+            params: its parameters; with `own`, stacked on a leading axis, one for each environment.
+            memories: its memories, leaves (N, ...).
+            state: the environments' states.
+            agent: 0 or 1.
+            keys: one for each environment.
+            own: whether every environment has parameters of its own.
+        """
+        axis = 0 if own else None
+        if policy.sees == "situation":
+            numbers = jnp.zeros(len(keys), jnp.int32) if state.layout is None else state.layout
+
+            def act(params: Any, memory: Any, number: Array, record: Array, key: Array) -> Any:
+                tables = self.tables_of(None if state.layout is None else number)
+                return policy.act(params, memory, Situation(tables, record, number), key)
+
+            return jax.vmap(act, in_axes=(axis, 0, 0, 0, 0))(params, memories, numbers, state.record, keys)
+        view = state.record if policy.sees == "state" else self.observe_one(state, agent)
+        return jax.vmap(policy.act, in_axes=(axis, 0, 0, 0))(params, memories, view, keys)
+
+    def observe(self, state: EnvState, canonical: bool = False) -> UInt8[Array, "N 2 5 5 C"]:
+        """Return the observations of both agents, ego first.
+
+        Args:
+            state: the environments' states.
+            canonical: whether to return the canonical channels, which mean the same on all layouts.
+        """
+        return self.on_tables(partial(observe_both, canonical=canonical), state.layout, state.record)
+
+    def observe_one(self, state: EnvState, agent: int, canonical: bool = False) -> UInt8[Array, "N 5 5 C"]:
         """Return the observations of one agent: 0 for the ego, 1 for the teammate."""
-        return observe(self.layout, state.record, agent)
+        return self.on_tables(partial(observe, agent=agent, canonical=canonical), state.layout, state.record)
 
     def next_recipe(self, state: EnvState) -> UInt8[Array, " N"]:
         """Return the item of the recipe that becomes current if this step makes a correct delivery."""
-        return self._recipe(_fold(self.episode_key(state), state.clock + 1))
+        keys = _fold(self.episode_key(state), state.clock + 1)
+        return self.on_tables(_drawn_recipe, state.layout, keys)
 
     def episode_key(self, state: EnvState) -> Key[Array, " N"]:
         """Return the key of each running episode: a function of the environment's key and the episode's number.
@@ -126,35 +218,48 @@ class Environment:
         """
         return _fold(state.key, state.episode)
 
-    def first_record(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> UInt8[Array, "N S"]:
+    def first_record(
+        self, keys: Key[Array, " N"], episode: Int[Array, " N"], layout: Int[Array, " N"] | None = None
+    ) -> UInt8[Array, "N S"]:
         """Return state records at the start of episodes.
 
         Recipe and facings are uniform; first the ego, then the teammate is put on a uniformly drawn free cell of its
         own room.
         """
         draw = jax.vmap(lambda key: jax.random.split(key, 5))(_fold(_fold(keys, episode), jnp.zeros_like(episode)))
-        ego_room, mate_room = self.layout.rooms
-        ego_number = _below(draw[:, 0], len(ego_room))
-        ego = jnp.asarray(ego_room)[ego_number]
-        if np.array_equal(ego_room, mate_room):
-            mate_number = _below(draw[:, 1], len(mate_room) - 1)
-            mate_number += mate_number >= ego_number
-        else:
-            mate_number = _below(draw[:, 1], len(mate_room))
-        positions = jnp.stack([ego, jnp.asarray(mate_room)[mate_number]], axis=-1)
-        facings = jnp.stack([_below(draw[:, 2], 4), _below(draw[:, 3], 4)], axis=-1).astype(jnp.uint8)
-        return start(self.layout, positions, facings, self._recipe(draw[:, 4]))
+        return self.on_tables(_first_record, layout, draw)
 
-    def _recipe(self, keys: Key[Array, " N"]) -> UInt8[Array, " N"]:
-        return jnp.asarray(self.recipe_items)[_below(keys, len(self.recipe_items))]
+    def _drawn_layout(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> Int[Array, " N"]:
+        """Return the number of a layout for each environment, drawn for an episode."""
+        return _below(_fold(_fold(keys, episode), jnp.full_like(episode, _LAYOUT_DRAW)), np.uint32(len(self.layout)))
+
+
+_LAYOUT_DRAW = 2**31 - 1
+"""Number that an episode's key is folded with to draw a layout: more than any step's."""
+
+
+def _first_record(tables: Tables, draw: Key[Array, "*N 5"]) -> UInt8[Array, "*N S"]:
+    (ego_room, mate_room), (ego_cells, mate_cells) = jnp.asarray(tables.rooms), jnp.asarray(tables.room_sizes)
+    one_room = jnp.all(ego_room == mate_room) & (ego_cells == mate_cells)
+    ego_number = _below(draw[..., 0], ego_cells)
+    mate_number = _below(draw[..., 1], mate_cells - one_room)
+    mate_number += one_room & (mate_number >= ego_number)
+    positions = jnp.stack([ego_room[ego_number], mate_room[mate_number]], axis=-1)
+    facings = jnp.stack([_below(draw[..., k], np.uint32(4)) for k in (2, 3)], axis=-1).astype(jnp.uint8)
+    return start(tables, positions, facings, _drawn_recipe(tables, draw[..., 4]))
+
+
+def _drawn_recipe(tables: Tables, keys: Key[Array, "*N"]) -> UInt8[Array, "*N"]:
+    return jnp.asarray(tables.recipes)[_below(keys, jnp.asarray(tables.recipe_count))]
 
 
 def _fold(keys: Key[Array, " N"], data: Int[Array, " N"]) -> Key[Array, " N"]:
     return jax.vmap(jax.random.fold_in)(keys, data)
 
 
-def _below(keys: Key[Array, " N"], n: int) -> Int[Array, " N"]:
+def _below(keys: Key[Array, "*N"], n: UInt32[Array, ""] | np.uint32) -> Int[Array, "*N"]:
     """Return an integer in 0..n-1 per key: the high half of 32 random bits times n (bias below n / 2**32)."""
-    bits = jax.vmap(lambda key: jax.random.bits(key, (), jnp.uint32))(keys)
+    draw = partial(jax.random.bits, shape=(), dtype=jnp.uint32)
+    bits = (jax.vmap(draw) if keys.ndim else draw)(keys)
     high = (bits >> 16) * n + ((bits & 0xFFFF) * n >> 16)
     return (high >> 16).astype(jnp.int32)

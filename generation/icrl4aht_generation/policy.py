@@ -25,10 +25,12 @@ class Situation(NamedTuple):
     Attributes:
         tables: tables of its layout.
         record: uint8 (S,), its state record.
+        layout: int32 (), number of the layout among those of the environments.
     """
 
     tables: Tables
     record: UInt8[Array, " S"]
+    layout: Int[Array, ""] | int = 0
 
 
 class Policy(NamedTuple):
@@ -42,13 +44,13 @@ class Policy(NamedTuple):
         sees: content of `view`: "state" for the state record, uint8 (S,); "situation" for a `Situation`, by which one
             policy plays every layout; "observation" for uint8 (5, 5, C);
             "ego_input", for egos in evaluation only, for the observation with the outcome of the previous step
-            (`icrl4aht_baselines.agents.EgoInput`).
+            (`icrl4aht_baselines.agents.EgoInput`), and "canonical_input" for the same with canonical channels.
     """
 
     params: Any
     init: Callable[[Any, Key[Array, ""]], Any]
     act: Callable[[Any, Any, Array, Key[Array, ""]], tuple[Int[Array, ""], Any]]
-    sees: Literal["state", "situation", "observation", "ego_input"]
+    sees: Literal["state", "situation", "observation", "ego_input", "canonical_input"]
 
 
 @lru_cache(maxsize=256)

@@ -63,15 +63,21 @@ class State(NamedTuple):
 
 def columns(layout: Layout | Tables) -> State:
     """Return the position of each field in the record of a layout: slices, and an int for the two single columns."""
-    pots, buttons, counters = len(layout.pots), len(layout.buttons), len(layout.counters)
+    pots, buttons, counters = _counts(layout)
     ends = np.cumsum([8, pots, pots, buttons, counters]).tolist()
     rest = [slice(a, b) for a, b in pairwise(ends)]
     return State(slice(0, 2), slice(2, 4), slice(4, 6), 6, 7, *rest)
 
 
 def record_size(layout: Layout | Tables) -> int:
-    """Return S, the number of bytes of a layout's state record."""
-    return 8 + 2 * len(layout.pots) + len(layout.buttons) + len(layout.counters)
+    """Return S, the number of bytes of a state record of a layout, or of the layouts of stacked tables."""
+    pots, buttons, counters = _counts(layout)
+    return 8 + 2 * pots + buttons + counters
+
+
+def _counts(layout: Layout | Tables) -> tuple[int, int, int]:
+    pots, buttons, counters = (np.shape(cells)[-1] for cells in (layout.pots, layout.buttons, layout.counters))
+    return pots, buttons, counters
 
 
 def unpack(layout: Layout | Tables, record: Array) -> State:

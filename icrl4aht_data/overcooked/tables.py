@@ -9,7 +9,7 @@ Shapes: `cells` cells of the map, row by row; `P` pots, `L` buttons, `K` counter
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -127,7 +127,11 @@ class Tables(NamedTuple):
     first_step: Array
 
 
-_PADDING = {"kinds": WALL, "pots": NOWHERE, "buttons": NOWHERE, "counters": NOWHERE} | {
+_PADDING = {
+    "kinds": WALL,
+    "pots": NOWHERE,
+    "buttons": NOWHERE,
+    "counters": NOWHERE,
     "number": NOWHERE,
     "goal_access": NOWHERE,
     "distance": NOWHERE,
@@ -156,18 +160,31 @@ def stack_tables(layouts: Sequence[Layout]) -> Tables:
     if 0 < len(without) < len(layouts):
         raise OptionError(f"layouts {without} have ingredients without a canonical channel, the others do not")
 
+    return stack_padded(each, _PADDING)
+
+
+def stack_padded(parts: Sequence[Any], padding: Mapping[str, int]) -> Any:
+    """Return one named tuple of arrays: those of all parts, padded at the end of each axis, on a new first axis.
+
+    Args:
+        parts: named tuples of arrays that differ in the lengths of their axes, or of such named tuples.
+        padding: field -> value of padded entries, where it is not 0. An axis "recipes" repeats its last entry, since a
+            repeated recipe changes no decision of a scripted agent.
+    """
+
     def stacked(name: str, values: Sequence[Any]) -> Any:
-        if isinstance(values[0], ChannelBits):
-            return ChannelBits(*(stacked("", parts) for parts in zip(*values, strict=True)))
+        if isinstance(values[0], tuple):
+            return stack_padded(values, padding)
         shape = np.max([value.shape for value in values], axis=0).astype(int)
-        if name == "recipes":  # a repeated recipe changes no decision of a scripted agent
+        if name == "recipes":
             return np.stack([np.pad(value, (0, shape[0] - len(value)), "edge") for value in values])
-        found = np.full((len(values), *shape), _PADDING.get(name, 0), values[0].dtype)
+        found = np.full((len(values), *shape), padding.get(name, 0), values[0].dtype)
         for number, value in enumerate(values):
             found[number, *map(slice, value.shape)] = value
         return found
 
-    return Tables(*(stacked(name, parts) for name, parts in zip(Tables._fields, zip(*each, strict=True), strict=True)))
+    fields = zip(type(parts[0])._fields, zip(*parts, strict=True), strict=True)
+    return type(parts[0])(*(stacked(name, values) for name, values in fields))
 
 
 def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = None) -> Tables:

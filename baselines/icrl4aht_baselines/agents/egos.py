@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -20,7 +21,7 @@ from icrl4aht_baselines.training.run_folder import CONFIG
 from icrl4aht_data.benchmark.facts import track_of
 from icrl4aht_data.errors import OptionError, UnknownNameError, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS, STAY
-from icrl4aht_data.overcooked.channels import Channels, to_canonical
+from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import Layout
 
 Acting = Literal["cached", "exact"]
@@ -81,18 +82,26 @@ class NamedEgo(NamedTuple):
     run: Path | None = None
 
 
+def _stay(params: Any, carry: Any, view: Any, key: Any) -> tuple[Any, Any]:
+    return jnp.int32(STAY), carry
+
+
+def _act_randomly(params: Any, carry: Any, view: Any, key: Any) -> tuple[Any, Any]:
+    return jax.random.randint(key, (), 0, len(ACTIONS)), carry
+
+
+def _no_memory(params: Any, key: Any) -> tuple[()]:
+    return ()
+
+
 def stay(layout: Layout) -> Policy:
     """Return an ego that always takes the action "stay", and so measures the teammate's return without help."""
-    return Policy((), lambda params, key: (), lambda params, carry, view, key: (jnp.int32(STAY), carry), "observation")
+    return Policy((), _no_memory, _stay, "situation")
 
 
 def random(layout: Layout) -> Policy:
     """Return an ego that draws uniformly from the six actions: the column `Rnd` of the paper."""
-
-    def act(params: Any, carry: Any, view: Any, key: Any) -> tuple[Any, Any]:
-        return jax.random.randint(key, (), 0, len(ACTIONS)), carry
-
-    return Policy((), lambda params, key: (), act, "observation")
+    return Policy((), _no_memory, _act_randomly, "situation")
 
 
 AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle}
@@ -167,7 +176,7 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
                 f"{layout.name} has {layout.obs_shape}: choose tasks of fitting layouts, or train with --channels "
                 f"canonical, which all layouts share"
             )
-        return with_view(policy, layout, run.channels, layout.name in run.hide_recipe)
+        return with_view(policy, run.channels, layout.name in run.hide_recipe)
 
     return make
 
@@ -204,22 +213,26 @@ def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLI
     return Policy(params, lambda params, key: start(), act, "ego_input")
 
 
-def with_view(policy: Policy, layout: Layout, channels: Channels, hide_recipe: bool = False) -> Policy:
-    """Return a policy that takes the inputs of an ego on a layout.
+def with_view(policy: Policy, channels: Channels, hide_recipe: bool = False) -> Policy:
+    """Return a policy that takes inputs of an ego with some channels.
+
+    Policies with the same functions have the same functions afterwards.
 
     Args:
         policy: takes inputs with observations of these channels.
-        layout: the layout, whose own channels the inputs have.
         channels: "own" for those of the layout, or "canonical".
         hide_recipe: whether recipe indicators look like counters; with canonical channels only.
     """
     if channels == "own":
         return policy
+    return policy._replace(act=_without_recipe(policy.act) if hide_recipe else policy.act, sees="canonical_input")
+
+
+@lru_cache(maxsize=16)
+def _without_recipe(act: Callable[..., Any]) -> Callable[..., Any]:
     change = no_change()._replace(hidden=jnp.bool_(True))
 
-    def act(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
-        obs = to_canonical(layout, ego_input.obs)
-        obs = change.observations(obs) if hide_recipe else obs
-        return policy.act(params, memory, ego_input._replace(obs=obs), key)
+    def act_unseeing(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
+        return act(params, memory, ego_input._replace(obs=change.observations(ego_input.obs)), key)
 
-    return policy._replace(act=act)
+    return act_unseeing

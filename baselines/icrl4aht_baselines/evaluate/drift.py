@@ -78,7 +78,7 @@ def measure_drift(
         return one.argmax().astype(jnp.int32), _BothMemories(cached, exact, both.steps + 1, *compared)
 
     ego = Policy(params, init, act, "ego_input")
-    rollout, state, episode = prepare_rollout(lambda layout: with_view(ego, layout, channels), tasks, protocol)
+    rollout, state, episode = prepare_rollout(lambda layout: with_view(ego, channels), tasks, protocol)
     for _ in range(protocol.episodes):
         state, _ = episode(params, rollout.teammate_params, state)
         yield Drift(np.asarray(state.ego.distance), np.asarray(state.ego.same))

@@ -30,6 +30,7 @@ from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout,
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
+from icrl4aht_data.overcooked.channels import channel_names
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.progress import counted, progress_bars
@@ -124,15 +125,15 @@ def _evaluate_groups(
     settings: dict[str, Any],
     played: Callable[[int], None],
 ) -> Iterator[list[Result]]:
-    """Yield the results of tasks of one layout and teammate family after another, in the order in which they finish."""
-    groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
+    """Yield the results of groups of tasks that share a compiled program, in the order in which they finish."""
+    layouts = list(dict.fromkeys(task.layout for task in tasks))
+    egos = {layout: make_ego(layout) for layout in layouts}
+    groups: dict[Any, list[Task]] = defaultdict(list)
     for task in tasks:
-        groups[task.layout_name, task.teammate_kind].append(task)
-    layouts = {group[0].layout.name: group[0].layout for group in groups.values()}
-    egos = {name: make_ego(layout) for name, layout in layouts.items()}
+        groups[_program(task, egos[task.layout])].append(task)
 
     def run(group: list[Task]) -> list[Result]:
-        prepared = prepare_rollout(lambda layout: egos[layout.name], group, protocol, seeds, suite)
+        prepared = prepare_rollout(egos.__getitem__, group, protocol, seeds, suite)
         return _evaluate_group(group, prepared, len(seeds), settings, stopped, played)
 
     # Groups run at the same time: one compiles while another plays, and one alone does not use all cores. An ego
@@ -146,6 +147,16 @@ def _evaluate_groups(
         finally:
             stopped.set()
             pool.shutdown(cancel_futures=True)
+
+
+def _program(task: Task, ego: Policy | HostPolicy) -> tuple[Any, ...]:
+    """Return what tasks share that one compiled program plays: all that it is made of but tables and parameters."""
+    kind = task.teammate_kind
+    if isinstance(ego, HostPolicy) or ego.sees in ("state", "observation") or task.teammate["kind"] != "heuristic":
+        return kind, task.layout
+    # A model of own channels takes the observations of layouts whose channels have equal names.
+    names = channel_names(task.layout) if ego.sees == "ego_input" else None
+    return kind, names, ego.init, ego.act, id(ego.params)
 
 
 def _check_teammate(task: Task, suite: Path | None) -> None:
@@ -169,7 +180,7 @@ def _evaluate_group(
     stopped: Event,
     done: Callable[[int], None],
 ) -> list[Result]:
-    """Return the results of tasks of one layout and teammate family; none if it was stopped."""
+    """Return the results of tasks that share a compiled program; none if it was stopped."""
     returns = []
     for episode in play_episodes(prepared):
         if stopped.is_set():
@@ -185,7 +196,7 @@ def _evaluate_group(
 
 
 class PreparedRollout(NamedTuple):
-    """Tasks of one layout and teammate family, ready to play.
+    """Tasks that share a compiled program, ready to play.
 
     Attributes:
         rollout: the rollout of all tasks.
@@ -205,14 +216,23 @@ def prepare_rollout(
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
 ) -> PreparedRollout:
-    """Compile the episodes of tasks that share a layout and a teammate family.
+    """Compile the episodes of tasks that share a teammate family.
+
+    Tasks on several layouts need an ego whose functions and parameters are the same on all of them, see
+    `EvaluationRollout`.
 
     Raises:
         OptionError: if the ego's action is not one integer for each observation.
     """
-    layout = tasks[0].layout
-    mates = [build_teammate(layout, task.teammate, TEAMMATE, protocol.noise, suite) for task in tasks]
-    rollout = EvaluationRollout(layout, make_ego(layout), [mate for mate in mates for _ in seeds], protocol)
+    layouts = list(dict.fromkeys(task.layout for task in tasks))
+    several = len(layouts) > 1
+    mates = [
+        build_teammate(None if several else task.layout, task.teammate, TEAMMATE, protocol.noise, suite)
+        for task in tasks
+        for _ in seeds
+    ]
+    numbers = np.array([layouts.index(task.layout) for task in tasks for _ in seeds]) if several else None
+    rollout = EvaluationRollout(layouts if several else layouts[0], make_ego(layouts[0]), mates, protocol, numbers)
     keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
     outside = isinstance(rollout.ego, HostPolicy)
     state = rollout.start(keys) if outside else jax.jit(rollout.start)(keys)
@@ -227,8 +247,7 @@ def prepare_rollout(
 def _check_actions(rollout: EvaluationRollout, state: RolloutState) -> None:
     """Trace one step of the egos, which yields shape and dtype of their actions without computing any."""
     keys = state.env.key
-    ego = rollout.batched_ego
-    actions, _ = jax.eval_shape(ego.act, ego.params, state.ego, rollout.ego_view(state), keys)
+    actions, _ = jax.eval_shape(rollout.ego_actions, rollout.ego.params, state, keys)
     if actions.shape != keys.shape or not jnp.issubdtype(actions.dtype, jnp.integer):
         raise OptionError(
             f"the ego's actions are {actions.dtype} of shape {actions.shape} for {keys.shape[0]} observations, "
@@ -243,7 +262,7 @@ def play_tasks(
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
 ) -> Iterator[EpisodeBatch]:
-    """Play tasks that share a layout and a teammate family.
+    """Play tasks that share a teammate family, see `prepare_rollout`.
 
     Yields:
         One `EpisodeBatch` after another with B = tasks x seeds; seeds vary fastest.
@@ -266,5 +285,5 @@ def play_episodes(prepared: PreparedRollout) -> Iterator[EpisodeBatch]:
         try:
             state, played = jax.block_until_ready(episode(rollout.ego.params, params, state))
         except jax.errors.JaxRuntimeError as error:  # an exception of an agent outside JAX arrives wrapped
-            raise OptionError(f"the ego failed on {rollout.layout.name}: {error}") from error
+            raise OptionError(f"the ego failed on {rollout.layout}: {error}") from error
         yield played

@@ -1,14 +1,14 @@
 """Evaluation episodes of an ego and teammates, as pure JAX functions.
 
-Shapes: `B` tasks (times seeds) of one layout and teammate family, `T` steps of an episode, `S` bytes of a state record.
+Shapes: `B` tasks (times seeds) of one teammate family, `T` steps of an episode, `S` bytes of a state record.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -59,45 +59,58 @@ class EpisodeBatch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EvaluationRollout:
-    """Episodes of B tasks that share a layout and a teammate family.
+    """Episodes of B tasks that share a teammate family, on one layout or on several.
+
+    On several layouts the ego and the teammates are policies that see a `Situation`, or egos of the canonical channels
+    or of the layouts' own channels, if these are the same.
 
     Attributes:
-        layout: the layout of all tasks.
+        layout: the layout of all tasks, or several.
         ego: the ego, which plays all tasks.
         teammates: the B teammates, policies of one family.
         protocol: rules of the evaluation.
+        numbers: int (B,), number of each task's layout; None for one layout.
     """
 
-    layout: Layout
+    layout: Layout | Sequence[Layout]
     ego: Policy | HostPolicy
     teammates: Sequence[Policy]
     protocol: Protocol
+    numbers: np.ndarray | None = None
 
     @cached_property
     def env(self) -> Environment:
-        """The environment of the layout under the protocol."""
-        four = self.protocol.four_recipes and any(self.layout.name in names for names in TRACKS["layout"].values())
-        recipes = np.array([self.layout.recipe_item(r) for r in FOUR_RECIPES], np.uint8) if four else None
-        return Environment(self.layout, self.protocol.steps, recipes)
+        """The environment of the layouts under the protocol."""
+        if isinstance(self.layout, Layout):
+            return Environment(_played(self.layout, self.protocol), self.protocol.steps)
+        return Environment([_played(one, self.protocol) for one in self.layout], self.protocol.steps)
 
     @property
     def teammate_params(self) -> Any:
         """Parameters of all teammates, with a leading axis (B,)."""
         return stacked(mate.params for mate in self.teammates)
 
-    @cached_property
-    def batched_ego(self) -> HostPolicy:
-        """The ego with functions that take a batch of B tasks."""
-        if isinstance(self.ego, HostPolicy):
-            return self.ego
-        init, act = jax.vmap(self.ego.init, in_axes=(None, 0)), jax.vmap(self.ego.act, in_axes=(None, 0, 0, 0))
-        return HostPolicy(self.ego.params, init, act, self.ego.sees)
-
     def start(self, keys: jax.Array) -> RolloutState:
         """Return the state before the first episode from task keys (B,)."""
-        batch = keys.shape[0]
-        egos = self.batched_ego.init(self.ego.params, _fold_all(keys, EGO))
-        return RolloutState(self.env.init(keys), egos, no_outcome(batch))
+        ego_keys = _fold_all(keys, EGO)
+        if isinstance(self.ego, HostPolicy):
+            egos = self.ego.init(self.ego.params, ego_keys)
+        else:
+            egos = jax.vmap(self.ego.init, in_axes=(None, 0))(self.ego.params, ego_keys)
+        numbers = None if self.numbers is None else jnp.asarray(self.numbers, jnp.int32)
+        return RolloutState(self.env.init(keys, numbers), egos, no_outcome(keys.shape[0]))
+
+    def ego_actions(self, params: Any, state: RolloutState, keys: jax.Array) -> tuple[Int[Array, " B"], Any]:
+        """Return the egos' actions in the next step, and their memories after it."""
+        if self.ego.sees not in ("ego_input", "canonical_input"):
+            if isinstance(self.ego, HostPolicy):
+                view = state.env.record if self.ego.sees == "state" else self.env.observe_one(state.env, EGO)
+                return self.ego.act(params, state.ego, view, keys)
+            return self.env.act(self.ego, params, state.ego, state.env, EGO, keys, own=False)
+        view = state.before._replace(obs=self.env.observe_one(state.env, EGO, self.ego.sees == "canonical_input"))
+        if isinstance(self.ego, HostPolicy):
+            return self.ego.act(params, state.ego, view, keys)
+        return jax.vmap(self.ego.act, in_axes=(None, 0, 0, 0))(params, state.ego, view, keys)
 
     def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, EpisodeBatch]:
         """Return the state after one episode of every task, and the episode. To be jitted by the caller."""
@@ -110,9 +123,9 @@ class EvaluationRollout:
         def step(carry: Any, t: Array) -> tuple[Any, Any]:
             state, memories, _ = carry
             now = state.env
-            mine, egos = self.batched_ego.act(ego_params, state.ego, self.ego_view(state), _fold_all(ego_keys, t))
-            theirs, memories = jax.vmap(mate.act)(
-                mate_params, memories, self._view(mate.sees, now, TEAMMATE), _fold_all(mate_keys, t)
+            mine, egos = self.ego_actions(ego_params, state, _fold_all(ego_keys, t))
+            theirs, memories = self.env.act(
+                mate, mate_params, memories, now, TEAMMATE, _fold_all(mate_keys, t), own=True
             )
             after = self.env.step(now, jnp.stack([mine, theirs], axis=-1))
             before = state.before._replace(
@@ -126,14 +139,12 @@ class EvaluationRollout:
         record, actions, reward = (jnp.swapaxes(leaf, 0, 1) for leaf in played)
         return state, EpisodeBatch(record, actions, reward, end)
 
-    def ego_view(self, state: RolloutState) -> Any:
-        """Return the input of the egos, with a leading axis (B,): state records, observations, or an `EgoInput`."""
-        if self.ego.sees == "ego_input":
-            return state.before._replace(obs=self._view("observation", state.env, EGO))
-        return self._view(self.ego.sees, state.env, EGO)
 
-    def _view(self, sees: str, state: EnvState, slot: int) -> jax.Array:
-        return state.record if sees == "state" else self.env.observe_one(state, slot)
+@lru_cache(maxsize=64)
+def _played(layout: Layout, protocol: Protocol) -> Layout:
+    """Return a layout with the recipes that the protocol draws from."""
+    four = protocol.four_recipes and any(layout.name in names for names in TRACKS["layout"].values())
+    return replace(layout, recipes=FOUR_RECIPES) if four else layout
 
 
 def no_outcome(batch: int) -> EgoInput:

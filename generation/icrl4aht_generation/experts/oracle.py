@@ -6,25 +6,29 @@ its recipe comes up. With a second pot it cooks ahead. It learns what to expect 
 the work to one that cooks and delivers, and forestalls one that does only half of that. It hands nothing over, which no
 layout rewards, never presses a button, and stays in layouts where it cannot matter. It is deterministic.
 
-Shapes: `P` pots that the ego reaches, `Q` recipes that it may cook (the current one, then the layout's), `O` obstacles,
-`S` bytes of a state record. All times are in steps.
+Shapes: `P` pots, `Q` recipes that it may cook (the current one, then the layout's), `S` bytes of a state record. All
+times are in steps. Arrays of pots have entries for pots that the ego does not reach, which no mask selects.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
 
 from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
-from icrl4aht_data.overcooked.cells import COOKED, GOAL, PLATE, POT, WALL
+from icrl4aht_data.overcooked.cells import COOKED, FACING_OF, NOWHERE, PLATE, POT, WALL
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack
-from icrl4aht_generation.experts.layout_facts import FAR, NEVER, LayoutFacts, hindrance_table, study_layout
+from icrl4aht_data.overcooked.tables import stack_tables
+from icrl4aht_generation.experts.layout_facts import FAR, NEVER, LayoutFacts, stack_facts, study_layout
 from icrl4aht_generation.paths import Scene
-from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.policy import Policy, Situation
 
 WAIT_LIMIT = 10
 """Steps without a change in the pots after which the ego stops waiting for the teammate."""
@@ -56,33 +60,56 @@ class OracleMemory(NamedTuple):
     parks: Bool[Array, ""]
 
 
-def oracle(layout: Layout) -> Policy:
-    """Return the scripted ego for a layout, a policy without parameters that sees the state record, uint8 (S,)."""
-    facts = study_layout(layout)
-    matters = facts.serves or bool(np.isin(layout.kinds[facts.shared], [POT, WALL]).any())
+def oracle(layout: Layout | Sequence[Layout]) -> Policy:
+    """Return the scripted ego.
 
-    def init(params, key: Key[Array, ""]) -> OracleMemory:
-        zero, no = jnp.int32(0), jnp.asarray(False)
-        return OracleMemory(jnp.zeros(record_size(layout), jnp.uint8), zero + STAY, zero, zero, zero, no, no, no)
+    Args:
+        layout: the layout whose state records it sees, a policy without parameters; or several, for a policy that sees
+            a `Situation` of one of them.
+    """
+    if isinstance(layout, Layout):
+        return Policy((), *_on_layout(layout), "state")
+    blank = np.zeros(record_size(stack_tables(layout)), np.uint8)
+    return Policy((stack_facts(layout), blank), _begin_in_situation, _act_in_situation, "situation")
+
+
+@lru_cache(maxsize=64)
+def _on_layout(layout: Layout) -> tuple[Any, Any]:
+    """Return `init` and `act` of the oracle on one layout."""
+    facts, blank = study_layout(layout), np.zeros(record_size(layout), np.uint8)
 
     def act(params, memory: OracleMemory, record: UInt8[Array, " S"], key: Key[Array, ""]):
-        if not matters:  # a constant policy, which compiles in no time
-            return jnp.int32(STAY), memory
-        scene = Scene(facts.paths, record, EGO)
-        memory = _remember(scene, memory)
-        action = _decide(_view_state(facts, scene, memory)).astype(jnp.int32)
-        return action, memory._replace(action=action)
+        return _act(facts, memory, Scene(layout.tables, record, EGO))
 
-    return Policy((), init, act, "state")
+    return lambda params, key: _begin(blank), act
+
+
+def _begin_in_situation(params: Any, key: Key[Array, ""]) -> OracleMemory:
+    return _begin(params[1])
+
+
+def _act_in_situation(params: Any, memory: OracleMemory, view: Situation, key: Key[Array, ""]):
+    facts = jax.tree.map(lambda leaf: jnp.asarray(leaf)[view.layout], params[0])
+    return _act(facts, memory, Scene(view.tables, view.record, EGO))
+
+
+def _begin(blank: UInt8[Array, " S"]) -> OracleMemory:
+    zero, no = jnp.int32(0), jnp.asarray(False)
+    return OracleMemory(jnp.asarray(blank), zero + STAY, zero, zero, zero, no, no, no)
+
+
+def _act(facts: LayoutFacts, memory: OracleMemory, scene: Scene) -> tuple[Int[Array, ""], OracleMemory]:
+    memory = _remember(scene, memory)
+    action = jnp.where(facts.matters, _decide(_view_state(facts, scene, memory)), STAY).astype(jnp.int32)
+    return action, memory._replace(action=action)
 
 
 def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
     """Return the memory updated by a state; `action` remains the previous action."""
-    layout, new = scene.paths.layout, scene.state
-    old = unpack(layout, last.record)
+    new, old = scene.state, unpack(scene.tables, last.record)
     same = jnp.all(new.pot_items == old.pot_items) & (new.recipe == old.recipe)
     ego_rests, mate_rests = new.positions[EGO] == old.positions[EGO], new.positions[TEAMMATE] == old.positions[TEAMMATE]
-    bumped = ego_rests & mate_rests & (jnp.asarray(layout.moves)[scene.me, last.action] != scene.me)
+    bumped = ego_rests & mate_rests & (jnp.asarray(scene.tables.moves)[scene.me, last.action] != scene.me)
     # What left the teammate's hand went onto a counter, into a pot or out: the counters and pots tell which.
     had = old.hands[TEAMMATE]
     put = (had >> 2 > 0) & (new.hands[TEAMMATE] == 0)
@@ -107,17 +134,17 @@ class OracleView(NamedTuple):
         facts: facts of the layout.
         scene: the state from the ego's point of view.
         memory: memory of the ego.
-        origin: index into `LayoutFacts.time` and `action`: the obstacle, the ego's cell and facing.
+        obstacle: int32 (), number of the obstacle in `LayoutFacts.ways`.
         time: int32 (cells,), steps until the ego faces a cell, around the teammate.
         items: uint8 (cells,), items on counters.
-        sources: bool (types, cells), where each ingredient can be taken.
+        sources: bool (3, cells), where each ingredient can be taken.
         contents: uint8 (P,), contents of the pots, without the cooked flag.
         timers: int32 (P,), steps until a pot's soup is done.
         full: bool (P,), whether a pot has three ingredients.
         right: bool (P,), full pots with the current recipe, done or not.
         recipes: uint8 (Q,), the recipes.
         stock: int32 (Q,), soups of each recipe that need no more ingredients.
-        missing: int32 (P, Q, types), ingredients that each pot still needs for each recipe; negative for surplus.
+        missing: int32 (P, Q, 3), ingredients that each pot still needs for each recipe; negative for surplus.
         risky: bool (), the teammate is likely to take any soup out of the ego's pots, also a wrong one.
         careful: bool (), the teammate also fills them, and a wrong soup keeps it from cooking the right one.
         mate_delivers: bool (), the teammate is about to change the recipe.
@@ -126,17 +153,17 @@ class OracleView(NamedTuple):
     facts: LayoutFacts
     scene: Scene
     memory: OracleMemory
-    origin: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
+    obstacle: Int[Array, ""]
     time: Int[Array, " cells"]
     items: UInt8[Array, " cells"]
-    sources: Bool[Array, "types cells"]
+    sources: Bool[Array, "3 cells"]
     contents: UInt8[Array, " P"]
     timers: Int[Array, " P"]
     full: Bool[Array, " P"]
     right: Bool[Array, " P"]
     recipes: UInt8[Array, " Q"]
     stock: Int[Array, " Q"]
-    missing: Int[Array, "P Q types"]
+    missing: Int[Array, "P Q 3"]
     risky: Bool[Array, ""]
     careful: Bool[Array, ""]
     mate_delivers: Bool[Array, ""]
@@ -150,18 +177,27 @@ class OracleView(NamedTuple):
         """Return the time to the cells of a mask plus the time that follows; NEVER for other cells."""
         return jnp.where(mask & self.facts.mine, self.time + then, NEVER)
 
+    @property
+    def pot_times(self) -> Int[Array, " P"]:
+        """Steps until the ego faces each pot."""
+        return self.time[jnp.minimum(jnp.asarray(self.scene.tables.pots), self.time.shape[0] - 1)]
+
+    @property
+    def leg(self) -> Int[Array, "cells P"]:
+        """Steps from facing each cell to facing each pot."""
+        return _steps(jnp.asarray(self.facts.leg))
+
     def at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
         """Return the time to some of the pots plus the time that follows; NEVER for other cells."""
-        cells = self.facts.pot_cells
-        there = jnp.where(which, self.time[cells] + then, NEVER)
-        return jnp.full(self.time.shape, NEVER).at[cells].set(there)
+        there = jnp.where(which & self.facts.pots, self.pot_times + then, NEVER)
+        return jnp.where(self.scene.static(POT), self.scene.at(POT, there), NEVER)
 
     @property
     def parking(self) -> Int[Array, " cells"]:
         """Cost of putting an item down: out of the teammate's reach, or near a pot if the ego only fills pots."""
         facts = self.facts
-        near = 2 * facts.leg[:, facts.pot_cells].min(axis=1, initial=FAR)
-        return self.cost(self.scene.empty_counters, jnp.asarray(3 * facts.shared if facts.serves else near))
+        near = 2 * jnp.min(self.leg, axis=1, initial=FAR)
+        return self.cost(self.scene.empty_counters, jnp.where(facts.serves, 3 * jnp.asarray(facts.shared), near))
 
     @property
     def plates(self) -> Bool[Array, " cells"]:
@@ -171,21 +207,21 @@ class OracleView(NamedTuple):
     @property
     def plans(self) -> Int[Array, "P Q"]:
         """Cost of cooking each recipe in each pot: the recipe least in stock first, then the least work."""
-        trip = self.facts.trip[:, None]
+        trip = jnp.asarray(self.facts.trip)[:, None]
         enough = jnp.all((self.missing >= 0) & ((self.missing == 0) | (trip < FAR)), axis=-1)
         # A surplus ingredient makes a recipe impossible: nothing can be taken out of a pot.
-        possible = enough & ~self.full[:, None]
+        possible = enough & (self.facts.pots & ~self.full)[:, None]
         current, short = self.recipes == self.recipes[0], self.stock[0] == 0
         # With a cooking teammate: cook nothing ahead in a pot that it uses, unless nothing else is left to do.
-        wanted = jnp.where(short, current, self.facts.passed[:, None]) | (short & ~jnp.any(possible[:, 0]))
-        work = jnp.sum(self.missing * np.minimum(trip, FAR // 10), axis=-1)
+        wanted = jnp.where(short, current, jnp.asarray(self.facts.passed)[:, None]) | (short & ~jnp.any(possible[:, 0]))
+        work = jnp.sum(self.missing * jnp.minimum(trip, FAR // 10), axis=-1)
         # A soup in stock outweighs any walk, which is shorter than 200 steps.
         return jnp.where(possible & (wanted | ~self.careful), 200 * (self.stock - current + 1) + work, NEVER)
 
     @property
     def spoiled(self) -> Bool[Array, " P"]:
         """Pots whose contents fit no recipe, to be filled up with anything and cleared if nothing else helps."""
-        nowhere = ~self.full & (self.contents > 0) & (jnp.min(self.plans, axis=1) == NEVER)
+        nowhere = self.facts.pots & ~self.full & (self.contents > 0) & (jnp.min(self.plans, axis=1) == NEVER)
         return nowhere & (self.stock[0] == 0) & self.facts.serves
 
     @property
@@ -213,34 +249,33 @@ class OracleView(NamedTuple):
         ahead = (mixed != self.recipes[0]) | (self.stock[0] > 0)
         spoils = ahead & ~jnp.any(self.right & (self.timers >= WAIT_LIMIT))
         leaves_it = (self.scene.partner_hand == hand) & (self.memory.calm < WAIT_LIMIT)
-        unknown = self.mate_delivers & (self.careful | (len(self.timers) == 1))
+        unknown = self.mate_delivers & (self.careful | (jnp.sum(self.facts.pots) == 1))
         adds = self.full | (completes & (spoils | leaves_it)) | unknown
         return (self.timers > 0) | (self.scene.holds_ingredient & adds)
 
 
 def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> OracleView:
-    state, layout = scene.state, scene.paths.layout
-    # The first obstacle, nowhere, is also the index if the teammate stands where it is in nobody's way.
-    obstacle = jnp.argmax(jnp.asarray(facts.obstacles) == scene.partner)
-    origin = (obstacle, scene.me, state.facings[EGO].astype(jnp.int32))
-    items = jnp.zeros(layout.cells, jnp.uint8).at[np.array(layout.counters, int)].set(state.counters)
-    lying = items == (4 << 2 * np.arange(len(facts.piles)))[:, None]
-    contents = state.pot_items[facts.pots] & np.uint8(0xFF - COOKED)
-    full = ingredient_count(contents) == 3
-    recipes = jnp.concatenate([state.recipe[None], jnp.asarray(layout.recipe_items)])
+    state, mine = scene.state, jnp.asarray(facts.mine)
+    # Obstacle 0 is none, also if the teammate stands where it is in nobody's way.
+    obstacle = jnp.asarray(facts.obstacle)[scene.partner].astype(jnp.int32)
+    items = scene.at(WALL, state.counters)
+    lying = items == jnp.array([[4], [16], [64]], jnp.uint8)
+    contents = state.pot_items & np.uint8(0xFF - COOKED)
+    full = facts.pots & (ingredient_count(contents) == 3)
+    recipes = jnp.concatenate([state.recipe[None], jnp.asarray(facts.recipes)])
     cooked = (full[:, None] & (contents[:, None] == recipes)).sum(axis=0)
-    plated = ((items[:, None] == recipes | _DISH) & facts.mine[:, None]).sum(axis=0) + (scene.hand == recipes | _DISH)
+    plated = ((items[:, None] == recipes | _DISH) & mine[:, None]).sum(axis=0) + (scene.hand == recipes | _DISH)
     risky = memory.plates & facts.mate_serves
     return OracleView(
         facts,
         scene,
         memory,
-        origin,
-        time=jnp.asarray(facts.time)[origin],
+        obstacle,
+        time=_times(facts, scene, obstacle),
         items=items,
-        sources=(jnp.asarray(facts.piles) | lying) & facts.mine,
+        sources=(jnp.asarray(facts.piles) | lying) & mine,
         contents=contents,
-        timers=state.pot_timers[facts.pots].astype(jnp.int32),
+        timers=state.pot_timers.astype(jnp.int32),
         full=full,
         right=full & (contents == state.recipe),
         recipes=recipes,
@@ -250,6 +285,27 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
         careful=risky & memory.cooks,
         mate_delivers=(scene.partner_hand == state.recipe | _DISH) & ~memory.parks,
     )
+
+
+def _steps(stored: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
+    return jnp.where(stored < NOWHERE, stored.astype(jnp.int32), FAR)
+
+
+def _times(facts: LayoutFacts, scene: Scene, obstacle: Int[Array, ""]) -> Int[Array, " cells"]:
+    """Return the steps until the ego faces each cell."""
+    faced = jnp.asarray(scene.tables.ahead)[scene.me, scene.state.facings[EGO].astype(jnp.int32)]
+    return jnp.where(scene.cell == faced, 0, _steps(jnp.asarray(facts.ways)[obstacle, scene.me]))
+
+
+def _way(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Array, ""]) -> Int[Array, ""]:
+    """Return the first action of the shortest way around an obstacle to facing a cell; INTERACT if it is faced."""
+    scene, ahead = view.scene, jnp.asarray(view.scene.tables.ahead)
+    ends = jnp.asarray(scene.tables.moves)[scene.me, :STAY].astype(jnp.int32)
+    # The teammate is the obstacle: a move onto its cell only turns the ego.
+    ends = jnp.where((ends == scene.partner) & (obstacle > 0), scene.me, ends)
+    after = _steps(jnp.asarray(view.facts.ways)[obstacle, ends, target])
+    turn = jnp.argmin(jnp.where(ahead[ends, jnp.asarray(FACING_OF)] == target, 0, after))
+    return jnp.where(ahead[scene.me, scene.state.facings[EGO].astype(jnp.int32)] == target, INTERACT, turn)
 
 
 class Subgoal(NamedTuple):
@@ -268,8 +324,6 @@ class Subgoal(NamedTuple):
 
 def _subgoals(view: OracleView) -> list[Subgoal]:
     """Return the table of decisions; the first row that applies and has a cell that can be reached decides."""
-    if not len(view.facts.pots):
-        return _with_dish(view)
     return _with_dish(view) + _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
 
 
@@ -278,37 +332,33 @@ def _decide(view: OracleView) -> Int[Array, ""]:
     facts, rows = view.facts, _subgoals(view)
     possible = jnp.stack([row.when & (jnp.min(row.cost) < NEVER) for row in rows])
     target = jnp.argmin(jnp.stack([row.cost for row in rows])[jnp.argmax(possible)])
-    action = jnp.asarray(facts.action)[view.origin][target]
-    waits = jnp.any((facts.pot_cells == target) & view.too_early) & (action == INTERACT)
+    action = _way(view, view.obstacle, target)
+    at_pot = (jnp.asarray(view.scene.tables.pots) == target) & facts.pots
+    waits = jnp.any(at_pot & view.too_early) & (action == INTERACT)
     action = jnp.where(waits, STAY, action)
-    if len(facts.obstacles) > 1:
-        return _act_in_shared_room(view, jnp.any(possible), target, action)
-    return jnp.where(jnp.any(possible), action, STAY)
+    alone = jnp.where(jnp.any(possible), action, STAY)
+    return jnp.where(facts.shares_room, _act_in_shared_room(view, jnp.any(possible), target, action), alone)
 
 
 def _with_dish(view: OracleView) -> list[Subgoal]:
     scene, facts = view.scene, view.facts
-    wanted = (view.items == view.dish) & facts.mine & bool((scene.paths.static(GOAL) & facts.mine).any())
-    options = [
+    wanted = (view.items == view.dish) & facts.mine & jnp.any(scene.goals & facts.mine)
+    near = view.cost(scene.empty_counters & facts.shared, scene.manhattan(scene.cell, scene.partner) - view.time)
+    comes = scene.holds_nothing & (scene.partner_hand == view.dish) & ~jnp.any(facts.pots)
+    return [
         Subgoal(scene.hand == view.dish, view.cost(scene.goals), "deliver the current recipe"),
         Subgoal(scene.holds_dish, view.parking, "a wrong delivery costs 20: keep the dish for its recipe"),
         Subgoal(scene.holds_nothing, view.cost(wanted), "a dish that is ready earns most for its steps"),
         Subgoal(jnp.any(wanted), view.parking, "a free hand for that dish"),
+        Subgoal(comes, near, "be there when the teammate puts the dish down that only the ego will deliver"),
     ]
-    if not len(facts.pots):  # wait where the teammate may put down a dish that only the ego will deliver
-        near = view.cost(
-            scene.empty_counters & facts.shared, jnp.asarray(scene.paths.manhattan)[scene.partner] - view.time
-        )
-        comes = scene.holds_nothing & (scene.partner_hand == view.dish)
-        options.append(Subgoal(comes, near, "be there when the teammate puts the dish down"))
-    return options
 
 
 def _with_plate(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plans) < NEVER
     right = view.right & ~view.mate_takes
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
-    rest = jnp.maximum(view.timers - view.time[view.facts.pot_cells], 0)
+    rest = jnp.maximum(view.timers - view.pot_times, 0)
     return [
         Subgoal(holds & (soon | ~building), view.at_pots(right, rest), "plate the soup of the current recipe"),
         Subgoal(
@@ -331,7 +381,7 @@ def _with_ingredient(view: OracleView) -> list[Subgoal]:
         Subgoal(holds, view.at_pots(plans < NEVER, plans), "cook: the pot and recipe that cost least"),
         Subgoal(holds & ~jnp.any(fits), view.at_pots(view.spoiled), "a spoiled pot must be full to be emptied"),
         Subgoal(
-            holds & (not view.facts.serves),
+            holds & ~view.facts.serves,
             view.at_pots(view.full | view.mate_delivers),
             "wait at the pot for the teammate, who serves",
         ),
@@ -342,7 +392,7 @@ def _with_ingredient(view: OracleView) -> list[Subgoal]:
 def _with_nothing(view: OracleView) -> list[Subgoal]:
     facts, scene, plans = view.facts, view.scene, view.plans
     empty = scene.holds_nothing
-    to_pot = jnp.asarray(facts.leg)[:, facts.pot_cells]
+    to_pot, first = view.leg, jnp.argmax(facts.pots)
 
     def fetch(ingredients: Bool[Array, " types"], then: Array) -> Int[Array, " cells"]:
         return view.cost(jnp.any(view.sources & ingredients[:, None], axis=0), then)
@@ -372,10 +422,10 @@ def _with_nothing(view: OracleView) -> list[Subgoal]:
         Subgoal(builds, ingredients, "cook"),
         plate_for(right, "wait with a plate, as there is nothing to cook"),
         plate_for(wrong, "empty a pot that blocks the current recipe"),
-        Subgoal(empty & jnp.any(view.spoiled), fetch(used, to_pot[:, 0]), "fill up a spoiled pot"),
+        Subgoal(empty & jnp.any(view.spoiled), fetch(used, to_pot[:, first]), "fill up a spoiled pot"),
         Subgoal(
-            empty & jnp.any(view.full | view.mate_delivers) & (not facts.serves),
-            fetch(used, to_pot[:, 0]),
+            empty & (jnp.any(view.full) | view.mate_delivers) & ~facts.serves,
+            fetch(used, to_pot[:, first]),
             "an ego that only fills pots holds a piece ready for the next soup",
         ),
     ]
@@ -384,20 +434,21 @@ def _with_nothing(view: OracleView) -> list[Subgoal]:
 def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Array, ""], action: Int[Array, ""]):
     """Return the action in a room that both agents share: wait out of the teammate's way, without blocking forever."""
     scene, facts, still = view.scene, view.facts, view.memory.still
-    layout, origin = scene.paths.layout, view.origin[1:]
-    ahead = jnp.asarray(layout.ahead)[scene.partner, scene.state.facings[TEAMMATE].astype(jnp.int32)]
+    tables = scene.tables
+    ahead = jnp.asarray(tables.ahead)[scene.partner, scene.state.facings[TEAMMATE].astype(jnp.int32)]
     pushed = (ahead == scene.me) & (still > 0)
     reachable = found & (view.time[target] < FAR)
     # A teammate on the ego's way may leave it in this very step; one that does not may be waiting for the ego.
     follows = found & ~reachable & ~pushed & (still < 3)
-    through = jnp.asarray(facts.action)[0, *origin, target]
+    through = _way(view, 0, target)
 
     carries = jnp.where(scene.partner_hand & COOKED > 0, 0, jnp.where(scene.partner_hand > 0, 1, 2))
-    ends = jnp.asarray(layout.moves[:, : STAY + 1].astype(np.int32))[scene.me]
+    ends = jnp.asarray(tables.moves)[scene.me, : STAY + 1].astype(jnp.int32)
     stays = jnp.arange(STAY + 1) == STAY
     taken = (ends == scene.partner) | ((ends == scene.me) & ~stays) | (stays & pushed)
-    away = jnp.where(found, jnp.asarray(facts.time[0].min(axis=1))[ends, target], 0)
-    hindrance = jnp.asarray(hindrance_table(scene.paths))[carries, scene.partner, ends]
+    faces = jnp.any(jnp.asarray(tables.ahead)[ends] == target, axis=1)
+    away = jnp.where(found & ~faces, _steps(jnp.asarray(facts.ways)[0, ends, target]), 0)
+    hindrance = jnp.asarray(facts.hindrance)[carries, scene.partner, ends].astype(jnp.int32)
     aside = jnp.argmin(jnp.where(taken, NEVER, hindrance + away - stays))
 
     # With a plate the ego waits in front of the pot; with anything else it had better step aside than stay.

@@ -227,9 +227,8 @@ def policy_player(
         return jax.vmap(policy.init, in_axes=(axis, 0))(params, keys)
 
     def act(memory, state: EnvState, key):
-        view = state.record if policy.sees == "state" else env.observe_one(state, agent)
-        step = jax.vmap(policy.act, in_axes=(axis, 0, 0, 0))
-        action, memory = step(params, memory, view, jax.random.split(key, envs))
+        keys = jax.random.split(key, envs)
+        action, memory = env.act(policy, params, memory, state, agent, keys, own=own_params)
         return Choice(action, jnp.zeros(envs), jnp.zeros(envs)), memory
 
     return Player(agent * envs + np.arange(envs), init, act)

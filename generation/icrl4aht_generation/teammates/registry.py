@@ -99,7 +99,7 @@ def _uniform(key: jax.Array, low: float, high: float) -> float:
 
 
 def build_teammate(
-    layout: Layout,
+    layout: Layout | None,
     teammate: dict[str, Any],
     slot: int = TEAMMATE,
     noise: Noise = "seeded",
@@ -108,7 +108,8 @@ def build_teammate(
     """Return the policy of a task's teammate entry; learned ones act greedily.
 
     Args:
-        layout: the layout.
+        layout: the layout whose state records or observations it sees; None for a heuristic that sees a `Situation`,
+            and so plays every layout.
         teammate: a heuristic's parameters, or a checkpoint; see `icrl4aht_data.benchmark.tasks.Task`.
         slot: 0 or 1, the agent it plays.
         noise: source of a heuristic's randomness, see `icrl4aht_generation.policy.Noise`.
@@ -122,6 +123,8 @@ def build_teammate(
     if slot not in (EGO, TEAMMATE):
         raise TaskFormatError(f"teammate {teammate['family']}: slot {slot!r}, expected {EGO} or {TEAMMATE}")
     if teammate.get("kind") == "rl":
+        if layout is None:
+            raise OptionError(f"teammate {teammate['theta']['checkpoint']}: a checkpoint plays one layout, give it")
         return learned.build_learned_entry(layout, teammate, suite)
     check_theta(teammate)
     return _family(teammate["family"]).build(layout, teammate["theta"], slot, noise)
