@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -106,6 +106,28 @@ def random(layout: Layout) -> Policy:
 
 AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle}
 """Reference egos: name -> function from a layout to the policy."""
+
+
+def ego_on(make: Callable[[Layout], Policy], layouts: Sequence[Layout]) -> Policy:
+    """Return one policy of an ego for several layouts.
+
+    Args:
+        make: function from a layout to its policy.
+        layouts: the layouts, in the order of their numbers in the environment.
+
+    Raises:
+        OptionError: if the ego has different policies on these layouts, or sees their own channels or state records.
+    """
+    if make is oracle:
+        return oracle(layouts)
+    egos = [make(layout) for layout in layouts]
+    same = len({(one.init, one.act, id(one.params)) for one in egos}) == 1
+    if not same or egos[0].sees not in ("situation", "canonical_input"):
+        raise OptionError(
+            f"an ego that sees {egos[0].sees} cannot play {len(layouts)} layouts at once: expected a model of "
+            f"canonical channels, or a reference ego"
+        )
+    return egos[0]
 
 
 def find_agent(

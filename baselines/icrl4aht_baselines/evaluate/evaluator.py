@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from icrl4aht_generation.experts.oracle import oracle
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.registry import build_teammate, check_theta
 
@@ -130,10 +131,10 @@ def _evaluate_groups(
     egos = {layout: make_ego(layout) for layout in layouts}
     groups: dict[Any, list[Task]] = defaultdict(list)
     for task in tasks:
-        groups[_program(task, egos[task.layout])].append(task)
+        groups[_program(task, egos[task.layout], make_ego)].append(task)
 
     def run(group: list[Task]) -> list[Result]:
-        prepared = prepare_rollout(egos.__getitem__, group, protocol, seeds, suite)
+        prepared = prepare_rollout(oracle if make_ego is oracle else egos.__getitem__, group, protocol, seeds, suite)
         return _evaluate_group(group, prepared, len(seeds), settings, stopped, played)
 
     # Groups run at the same time: one compiles while another plays, and one alone does not use all cores. An ego
@@ -149,10 +150,12 @@ def _evaluate_groups(
             pool.shutdown(cancel_futures=True)
 
 
-def _program(task: Task, ego: Policy | HostPolicy) -> tuple[Any, ...]:
+def _program(task: Task, ego: Policy | HostPolicy, make_ego: MakeEgo) -> tuple[Any, ...]:
     """Return what tasks share that one compiled program plays: all that it is made of but tables and parameters."""
-    kind = task.teammate_kind
-    if isinstance(ego, HostPolicy) or ego.sees in ("state", "observation") or task.teammate["kind"] != "heuristic":
+    kind, heuristic = task.teammate_kind, task.teammate["kind"] == "heuristic"
+    if make_ego is oracle and heuristic:
+        return kind, oracle
+    if isinstance(ego, HostPolicy) or ego.sees in ("state", "observation") or not heuristic:
         return kind, task.layout
     # A model of own channels takes the observations of layouts whose channels have equal names.
     names = channel_names(task.layout) if ego.sees == "ego_input" else None
@@ -232,7 +235,8 @@ def prepare_rollout(
         for _ in seeds
     ]
     numbers = np.array([layouts.index(task.layout) for task in tasks for _ in seeds]) if several else None
-    rollout = EvaluationRollout(layouts if several else layouts[0], make_ego(layouts[0]), mates, protocol, numbers)
+    ego = oracle(layouts) if several and make_ego is oracle else make_ego(layouts[0])
+    rollout = EvaluationRollout(layouts if several else layouts[0], ego, mates, protocol, numbers)
     keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
     outside = isinstance(rollout.ego, HostPolicy)
     state = rollout.start(keys) if outside else jax.jit(rollout.start)(keys)

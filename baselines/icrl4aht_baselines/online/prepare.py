@@ -171,10 +171,13 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
         history_of = dict(zip(dataset.column("task_id").tolist(), dataset.ids.tolist(), strict=True))
         for task_id, history_id in history_of.items():
             entry = dataset.index.entry(history_id)
-            mate = _Teammate(dataset.recover_teammate(history_id), recover_teammate(dataset, history_id))
+            teammate = dataset.recover_teammate(history_id)
+            learned = teammate["kind"] == "rl"
+            policy = recover_teammate(dataset, history_id) if learned else build_teammate(None, teammate)
+            mate = _Teammate(teammate, policy)
             found.setdefault((get_layout(entry.layout), entry.teammate_kind), {})[task_id] = mate
     for task in tasks:
-        mate = _Teammate(task.teammate, build_teammate(task.layout, task.teammate))
+        mate = _Teammate(task.teammate, build_teammate(None, task.teammate))
         found.setdefault((task.layout, task.teammate_kind), {})[task.task_id] = mate
     return found
 
@@ -211,9 +214,7 @@ def _groups(
     if play.four_recipes:
         for layout, kinds in heuristics.items():
             other, (kind, mates) = with_four_recipes(layout), next(iter(kinds.items()))
-            everywhere[other, kind] = {
-                task_id: mate._replace(policy=build_teammate(other, mate.entry)) for task_id, mate in mates.items()
-            }
+            everywhere[other, kind] = mates
             shares[other.name] = FOUR_RECIPES_SHARE
             hidden += [other.name] * (layout.name in hidden)
     # Rearranged versions get their own part of the tasks; the other layouts divide the rest by their shares.
@@ -266,11 +267,7 @@ def _rearranged_groups(
         count = max(len(own), round(tasks * len(own) / versions))
         where = [own[task % len(own)] for task in range(count)]
         chosen = [list(mates)[number] for number in chosen_teammates(len(mates), count)]
-        # Policies on different layouts have different functions, so that each is wrapped by itself.
-        policies = [
-            with_behaviours([build_teammate(one, mates[task_id].entry)], chances[None])[0]
-            for one, task_id, chances in zip(where, chosen, mixed_chances(count), strict=True)
-        ]
+        policies = with_behaviours([mates[task_id].policy for task_id in chosen], mixed_chances(count))
         yield TaskGroup(where, kind, policies, hidden, f"{layout.name} rearranged"), set(chosen)
 
 

@@ -16,7 +16,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -26,7 +27,7 @@ import numpy as np
 from icrl4aht_generation.collection.curate import follow_oracle
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.ppo import PPO, Sequences, ppo_optimizer
-from icrl4aht_generation.policy import Policy, stacked
+from icrl4aht_generation.policy import Policy
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from icrl4aht_baselines.evaluate.protocols import get_protocol
@@ -34,13 +35,11 @@ from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout,
 from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.tokens import StepInput, input_step
 from icrl4aht_baselines.methods.view_change import ViewChange, no_change
-from icrl4aht_baselines.online.programs import SharedProgram, run_all, shared_programs
 from icrl4aht_baselines.online.teammates import mixed_chances, with_behaviours
 from icrl4aht_baselines.training.options import PlayOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
-from icrl4aht_data.overcooked.channels import to_canonical
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
@@ -80,12 +79,12 @@ class PlayState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TaskGroup:
-    """Tasks of one family of teammates, on one layout or on one for each task, which are played at once.
+    """Tasks of one family of teammates, on one layout or on one for each task.
 
     Attributes:
         layouts: the layout of all tasks alone, or one for each task.
         family: kind of the teammates, such as "assembly_line".
-        teammates: policies, one for each task; those on one layout share their functions.
+        teammates: policies that share their functions, one for each task.
         hidden: whether the model does not see recipe indicators.
         label: the layouts' name in the log.
     """
@@ -100,6 +99,11 @@ class TaskGroup:
     def name(self) -> str:
         """Name in the log."""
         return f"{self.label} {self.family}"
+
+    @property
+    def task_layouts(self) -> Sequence[Layout]:
+        """The layout of each task."""
+        return self.layouts if len(self.layouts) > 1 else [self.layouts[0]] * len(self.teammates)
 
 
 def make_groups(
@@ -151,17 +155,28 @@ class _Network(NamedTuple):
 
 
 class _Player:
-    """Plays one episode after another of tasks on one layout."""
+    """Plays one episode after another of groups of tasks with one family of teammates, in one compiled program."""
 
-    def __init__(
-        self, layout: Layout, teammates: Sequence[Policy], hidden: bool, method: Method, play: PlayOptions, mirror: bool
-    ) -> None:
-        self.layout, self.hidden, self._method, self._play, self._mirror = layout, hidden, method, play, mirror
-        # A model whose view never changes needs no code for it, which is a part of every step and of its compilation.
-        self._changes = mirror or hidden
-        ego = _model_policy(method, layout, self._changes)
-        self.rollout = EvaluationRollout(layout, ego, teammates, get_protocol("seeded"))
+    def __init__(self, groups: Sequence[TaskGroup], method: Method, play: PlayOptions, mirror: bool) -> None:
+        self.groups, self._method, self._play, self._mirror = groups, method, play, mirror
+        teammates = [mate for group in groups for mate in group.teammates]
         self.tasks = len(teammates)
+        self._hidden = np.repeat([group.hidden for group in groups], [len(group.teammates) for group in groups])
+        # A model whose view never changes needs no code for it, which is a part of every step and of its compilation.
+        self._changes = mirror or bool(self._hidden.any())
+        played = [layout for group in groups for layout in group.task_layouts]
+        layouts = list(dict.fromkeys(played))
+        number = {layout: position for position, layout in enumerate(layouts)}
+        several = len(layouts) > 1
+        self.rollout = EvaluationRollout(
+            layouts if several else layouts[0],
+            _model_policy(method, self._changes),
+            teammates,
+            get_protocol("seeded"),
+            np.array([number[layout] for layout in played]) if several else None,
+        )
+        self.mates = self.rollout.teammate_params
+        self.compiled: Any = jax.jit(self.episode)
 
     def start(self, key: Key[Array, ""]) -> RolloutState:
         """Return the state before the first episode of all tasks."""
@@ -170,7 +185,7 @@ class _Player:
         return state._replace(ego=state.ego._replace(change=self._draw_change(change_key)))
 
     def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
-        change = no_change(self.tasks)._replace(hidden=jnp.full(self.tasks, self.hidden))
+        change = no_change(self.tasks)._replace(hidden=jnp.asarray(self._hidden))
         if not self._mirror:
             return change
         upside_down, sideways = jax.random.bernoulli(key, 0.5, (2, self.tasks))
@@ -193,12 +208,14 @@ class _Player:
     def _sequences(
         self, params: Any, state: RolloutState, after: RolloutState, played: EpisodeBatch, ended: Bool[Array, " B"]
     ) -> Sequences:
-        layout, change = self.layout, state.ego.change
+        env, change = self.rollout.env, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
         taken, theirs = actions[..., EGO], actions[..., TEAMMATE]
         # One step more than was played: the value there is what the last step leads to.
+        look = partial(observe, agent=EGO, canonical=True)
+        seen_records = jnp.concatenate([played.record, after.env.record[:, None]], axis=1)
         steps = StepInput(
-            obs=observe(layout, jnp.concatenate([record, after.env.record[None]]), EGO, canonical=True),
+            obs=jnp.swapaxes(env.on_tables(look, state.env.layout, seen_records), 0, 1),
             prev_action=jnp.concatenate([state.before.prev_action[None], taken]),
             prev_reward=jnp.concatenate([state.before.prev_reward[None], reward]),
             prev_teammate_action=jnp.concatenate([state.before.prev_teammate_action[None], theirs]),
@@ -229,77 +246,18 @@ class _Player:
             weight=jnp.ones((1, self.tasks)),
             last_value=value[-1][None],
             # The oracle acts in the environment's view; its actions are learned in the model's.
-            expert=own.actions(follow_oracle(layout, record, taken)),
+            expert=own.actions(follow_oracle(self.rollout.layout, record, taken, state.env.layout)),
         )
 
 
-class _GroupPlayer:
-    """Plays one episode after another of a group's tasks, all in one compiled program."""
-
-    def __init__(self, group: TaskGroup, method: Method, play: PlayOptions, mirror: bool) -> None:
-        self.group, self.tasks = group, len(group.teammates)
-        player = _Player(group.layouts[0], group.teammates, group.hidden, method, play, mirror)
-        self.mates = player.rollout.teammate_params
-        self.start: Callable[..., RolloutState] = player.start
-        self.episode: Any = jax.jit(player.episode)
-
-
-class _LayoutsPlayer:
-    """Plays one episode after another of tasks that are each on a layout of its own, all in one compiled program.
-
-    `start` and `episode` are programs of `_Player` for one task, with the tables of every task's layout.
-    """
-
-    def __init__(self, group: TaskGroup, start: SharedProgram, episode: SharedProgram) -> None:
-        self.group, self.tasks = group, len(group.teammates)
-        self.mates = jax.tree.map(lambda leaf: leaf[:, None], stacked(mate.params for mate in group.teammates))
-        self._start, self._episode = start, episode
-        self.episode: Any = jax.jit(self._play)
-
-    def start(self, key: Key[Array, ""]) -> RolloutState:
-        """Return the state before the first episode of all tasks."""
-        state = run_all(self._start, 0, jax.random.split(key, self.tasks))
-        return jax.tree.map(lambda leaf: leaf[:, 0], state)
-
-    def _play(
-        self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
-    ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
-        state = jax.tree.map(lambda leaf: leaf[:, None], state)
-        keys = jax.random.split(key, self.tasks)
-        after, sequences, returns = run_all(self._episode, 1, params, mates, state, keys)
-        after = jax.tree.map(lambda leaf: leaf[:, 0], after)
-        return after, jax.tree.map(lambda leaf: jnp.moveaxis(leaf[:, :, 0], 0, 1), sequences), returns[:, 0]
-
-
-def _group_players(
-    group: TaskGroup, method: Method, play: PlayOptions, mirror: bool
-) -> Sequence[_GroupPlayer | _LayoutsPlayer]:
-    """Return the players of a group; more than one if its layouts differ in more than their tables."""
-    if len(group.layouts) == 1:
-        return [_GroupPlayer(group, method, play, mirror)]
-    layouts = list(dict.fromkeys(group.layouts))
-    players = [
-        _Player(layout, [group.teammates[group.layouts.index(layout)]], group.hidden, method, play, mirror)
-        for layout in layouts
-    ]
-    # Shapes suffice to compare programs: nothing is computed or compiled here.
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    params = jax.eval_shape(lambda: method.init(jax.random.key(0)))
-    state, mates = jax.eval_shape(players[0].start, key), players[0].rollout.teammate_params
-    found = []
-    for episode in shared_programs([player.episode for player in players], params, mates, state, key):
-        # A start is a part of an episode, after which the next one starts: equal episodes have equal starts.
-        (start,) = shared_programs([players[number].start for number in episode.members], key)
-        own = [layouts[number] for number in episode.members]
-        tasks = [task for task, layout in enumerate(group.layouts) if layout in own]
-        rows = [own.index(group.layouts[task]) for task in tasks]
-        part = replace(
-            group,
-            layouts=[group.layouts[task] for task in tasks],
-            teammates=[group.teammates[task] for task in tasks],
-        )
-        found.append(_LayoutsPlayer(part, start.repeated(rows), episode.repeated(rows)))
-    return found
+def make_players(groups: Sequence[TaskGroup], method: Method, play: PlayOptions, mirror: bool) -> list[_Player]:
+    """Return a player of all groups whose teammates share their functions and so one compilation."""
+    programs: dict[Any, list[TaskGroup]] = defaultdict(list)
+    for group in groups:
+        mate = group.teammates[0]
+        shared = (mate.init, mate.act) if mate.sees == "situation" else group.layouts[0]
+        programs[group.family, shared].append(group)
+    return [_Player(own, method, play, mirror) for own in programs.values()]
 
 
 def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
@@ -331,20 +289,20 @@ def _select(which: Bool[Array, " B"], one: Any, other: Any) -> Any:
     return jax.tree.map(choose, one, other)
 
 
-def _model_policy(method: Method, layout: Layout, changes: bool) -> Policy:
+def _model_policy(method: Method, changes: bool) -> Policy:
     """Return the policy that plays while it learns: it draws its actions. `changes`: whether its view may change."""
 
     def init(params: Any, key: Array) -> PlayerMemory:
         return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))
 
     def act(params: Any, memory: PlayerMemory, ego_input: Any, key: Array) -> tuple[Array, PlayerMemory]:
-        step = input_step(ego_input._replace(obs=to_canonical(layout, ego_input.obs)))
+        step = input_step(ego_input)
         step = seen_steps(memory.change, step, memory.started) if changes else step
         logits, state = method.act(params, step, ego_input.prev_done, memory.state)
         action = jax.random.categorical(key, logits).astype(jnp.int32)
         return memory.change.actions(action), memory._replace(state=state, started=jnp.bool_(True))
 
-    return Policy({}, init, act, "ego_input")
+    return Policy({}, init, act, "canonical_input")
 
 
 class StepNumbers:
@@ -390,7 +348,7 @@ class PlayTrainer:
         mirror: bool = False,
     ) -> None:
         self.method, self.options, self.play = method, options, play
-        self.players = [player for group in groups for player in _group_players(group, method, play, mirror)]
+        self.players = make_players(groups, method, play, mirror)
         self._mates = [player.mates for player in self.players]
         self.tasks = sum(player.tasks for player in self.players)
         if self.tasks < play.minibatches:
@@ -457,7 +415,9 @@ class PlayTrainer:
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
         by_name: dict[str, list[Array]] = defaultdict(list)
         for player, own in zip(self.players, returns, strict=True):
-            by_name[player.group.name].append(own)
+            ends = np.cumsum([len(group.teammates) for group in player.groups])[:-1]
+            for group, of_group in zip(player.groups, jnp.split(own, ends), strict=True):
+                by_name[group.name].append(of_group)
         log |= {f"return {name}": jnp.concatenate(own).mean() for name, own in by_name.items()}
         return PlayState(params, optimizer, tasks, state.step + 1), log
 
@@ -465,7 +425,7 @@ class PlayTrainer:
         """Compile the episodes of all groups at the same time, since each takes seconds and one core."""
         with ThreadPoolExecutor() as pool:
             lowered = [
-                player.episode.lower(state.params, mates, tasks, key)
+                player.compiled.lower(state.params, mates, tasks, key)
                 for player, mates, tasks in zip(self.players, self._mates, state.tasks, strict=True)
             ]
             return list(pool.map(lambda one: one.compile(), lowered))

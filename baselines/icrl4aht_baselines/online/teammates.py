@@ -7,7 +7,8 @@ task, one with several switches between episodes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -63,24 +64,31 @@ def with_behaviours(teammates: Sequence[Policy], chances: np.ndarray) -> list[Po
         teammates: policies that share their functions.
         chances: float32 (len(teammates), 4), chances of `BEHAVIOURS`.
     """
-    functions = _with_behaviours(teammates[0])
+    init, act = _functions(teammates[0].init, teammates[0].act)
     return [
-        functions._replace(params={"script": mate.params, "chances": jnp.asarray(of_mate)})
+        Policy(
+            params={"script": mate.params, "chances": jnp.asarray(of_mate)},
+            init=init,
+            act=act,
+            sees=mate.sees,
+        )
         for mate, of_mate in zip(teammates, chances, strict=True)
     ]
 
 
-def _with_behaviours(policy: Policy) -> Policy:
+@lru_cache(maxsize=64)
+def _functions(script_init: Callable[..., Any], script_act: Callable[..., Any]) -> tuple[Any, Any]:
+    """Return `init` and `act` of teammates whose scripts have these functions."""
     noise = jnp.array([0.0, 0.0, 1.0, NOISY_SHARE])  # share of random actions in each behaviour
 
     def init(params: Any, key: jax.Array) -> tuple[jax.Array, Any]:
         behaviour = jax.random.categorical(jax.random.fold_in(key, 1), jnp.log(params["chances"]))
-        return behaviour, policy.init(params["script"], key)
+        return behaviour, script_init(params["script"], key)
 
     def act(params: Any, memory: tuple[jax.Array, Any], view: jax.Array, key: jax.Array) -> tuple[jax.Array, Any]:
         behaviour, script = memory
-        action, script = policy.act(params["script"], script, view, key)
+        action, script = script_act(params["script"], script, view, key)
         action = sometimes_random(jax.random.fold_in(key, 1), noise[behaviour], action)
         return jnp.where(behaviour == BEHAVIOURS.index("stay"), STAY, action).astype(jnp.int32), (behaviour, script)
 
-    return Policy({}, init, act, policy.sees)
+    return init, act

@@ -7,21 +7,19 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from icrl4aht_generation.layouts.rearranged import rearranged_layouts
-from icrl4aht_generation.policy import Policy, stacked
+from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.registry import build_teammate
 from jaxtyping import Float
 
+from icrl4aht_baselines.agents.egos import ego_on
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
-from icrl4aht_baselines.online.programs import SharedProgram, run_all, shared_programs
-from icrl4aht_baselines.training.options import MOST_REARRANGED
+from icrl4aht_generation.layouts.rearranged import unseen_layouts
 from icrl4aht_data.benchmark.reference_returns import Cell
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
@@ -71,45 +69,16 @@ def unseen_returns(
     return found
 
 
-def unseen_layouts(layout: Layout, count: int) -> list[Layout]:
-    """Return rearranged versions of a layout that no model is trained on, with the layout's own recipes.
-
-    They have the layout's name: settings by layout, such as hidden recipe indicators, apply to them as well.
-
-    Raises:
-        OptionError: as `rearranged_layouts`.
-    """
-    found = rearranged_layouts(layout, MOST_REARRANGED + count)[MOST_REARRANGED:]
-    return [replace(layout, rows=one.rows) for one in found]
-
-
 def _returns(
     make: Callable[[Layout], Policy], layouts: Sequence[Layout], tasks: Sequence[Task], episodes: int
 ) -> Float[np.ndarray, "V E"]:
     """Return the returns of an ego on each layout, with the teammate of the task of the same number."""
-    rollouts = [
-        EvaluationRollout(layout, make(layout), [build_teammate(layout, task.teammate)], get_protocol("seeded"))
-        for layout, task in zip(layouts, tasks, strict=True)
-    ]
-    keys = jnp.stack([task_key(number, task.task_id) for number, task in enumerate(tasks)])[:, None]
-    params = rollouts[0].ego.params  # a model's parameters are the same on every layout
-    state = jax.eval_shape(rollouts[0].start, keys[0])
-    totals = np.zeros((len(layouts), episodes))
-    for program in shared_programs([one.episode for one in rollouts], params, rollouts[0].teammate_params, state):
-        totals[program.members] = _played_returns(program, [rollouts[n] for n in program.members], keys, episodes)
-    return totals
-
-
-def _played_returns(
-    program: SharedProgram, rollouts: Sequence[EvaluationRollout], keys: Any, episodes: int
-) -> Float[np.ndarray, "V E"]:
-    """Return the return of each episode on the layouts of one program."""
-    (start,) = shared_programs([one.start for one in rollouts], keys[0])
-    state = run_all(start, 0, keys[jnp.array(program.members)])
-    mates = stacked(one.teammate_params for one in rollouts)
-    episode = jax.jit(lambda params, mates, state: run_all(program, 1, params, mates, state))
-    found = []
+    mates = [build_teammate(None, task.teammate) for task in tasks]
+    ego, numbers = ego_on(make, layouts), np.arange(len(layouts))
+    rollout = EvaluationRollout(layouts, ego, mates, get_protocol("seeded"), numbers)
+    state = jax.jit(rollout.start)(jnp.stack([task_key(number, task.task_id) for number, task in enumerate(tasks)]))
+    episode, found = jax.jit(rollout.episode), []
     for _ in range(episodes):
-        state, batch = episode(rollouts[0].ego.params, mates, state)
-        found.append(np.asarray(batch.reward, np.float64)[:, 0].sum(axis=-1))
+        state, batch = episode(ego.params, rollout.teammate_params, state)
+        found.append(np.asarray(batch.reward, np.float64).sum(axis=-1))
     return np.stack(found, axis=-1)

@@ -18,6 +18,7 @@ from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.plotting import plot_curves
+from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.oracle import oracle
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.network import ActorCritic
@@ -153,24 +154,29 @@ def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Arr
     return jax.jit(lambda records, taken: follow_oracle(layout, records, taken).astype(jnp.int8))
 
 
-def follow_oracle(layout: Layout, records: jax.Array, taken: jax.Array) -> jax.Array:
+def follow_oracle(
+    layout: Layout | Sequence[Layout], records: jax.Array, taken: jax.Array, numbers: jax.Array | None = None
+) -> jax.Array:
     """Return what the scripted oracle would do in each state of episodes in which another ego acted.
 
     Args:
-        layout: the layout.
+        layout: the layout, or several.
         records: uint8 (T, E, S), state records of E episodes.
         taken: int (T, E), the ego's actions.
+        numbers: int (E,), number of each episode's layout; None for one layout.
 
     Returns:
         int32 (T, E).
     """
-    script, key = oracle(layout), jax.random.key(0)  # the key has no effect: the oracle draws nothing
-    act = jax.vmap(script.act, in_axes=(None, 0, 0, None))
+    env, script = Environment(layout), oracle(layout)
+    keys = jax.random.split(jax.random.key(0), records.shape[1])  # without effect: the oracle draws nothing
+    zero = jnp.zeros(len(keys), jnp.int32)
 
     def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
         record, action = now
-        wanted, memory = act((), memory, record, key)
+        state = EnvState(keys, zero, zero, record, numbers)
+        wanted, memory = env.act(script, script.params, memory, state, EGO, keys, own=False)
         return memory._replace(action=action.astype(jnp.int32)), wanted
 
-    memory = jax.vmap(lambda _: script.init((), key))(jnp.arange(records.shape[1]))
+    memory = jax.vmap(script.init, in_axes=(None, 0))(script.params, keys)
     return jax.lax.scan(step, memory, (records, taken))[1]
