@@ -80,6 +80,22 @@ def _counts(layout: Layout | Tables) -> tuple[int, int, int]:
     return pots, buttons, counters
 
 
+def padded_positions(layout: Layout, tables: Tables) -> np.ndarray:
+    """Return where the bytes of a layout's state records are in the padded records of a group of layouts.
+
+    Args:
+        layout: one of the layouts, with records of S bytes.
+        tables: tables of the group, see `stack_tables`.
+
+    Returns:
+        int (S,): `padded[..., positions]` are the layout's own records.
+    """
+    own, padded = columns(layout), columns(tables)
+    lengths = [one.stop - one.start for one in own[5:]]
+    parts = [np.arange(one.start, one.start + length) for one, length in zip(padded[5:], lengths, strict=True)]
+    return np.concatenate([np.arange(8), *parts])
+
+
 def unpack(layout: Layout | Tables, record: Array) -> State:
     """Split state records uint8 (B, S) into their columns."""
     return State(*(record[..., column] for column in columns(layout)))

@@ -25,10 +25,9 @@ from icrl4aht_baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTrainer,
     TaskGroup,
-    _group_players,
-    _Player,
     chosen_teammates,
     make_groups,
+    make_players,
     seen_steps,
 )
 from icrl4aht_baselines.online.teammates import BEHAVIOURS, MIXTURE, mixed_chances, with_behaviours
@@ -174,26 +173,24 @@ def test_a_first_step_is_not_mirrored(layers):
 
 def test_tasks_on_different_layouts_in_one_batch():
     """Each task plays and learns as it does in a batch of its own layout."""
-    layouts, mates = rearranged_layouts(LAYOUT, 3)[::2], []
-    mates = [build_teammate(one, sample_teammate("assembly_line", 0, "train")) for one in layouts]
-    group = TaskGroup([*layouts, layouts[1]], "assembly_line", [*mates, mates[1]], True, "some")
-    (player,) = _group_players(group, METHOD, PLAY, mirror=False)
-    assert list(player.group.layouts) == group.layouts
+    layouts = rearranged_layouts(LAYOUT, 3)[::2]
+    mate = build_teammate(None, sample_teammate("assembly_line", 0, "train"))
+    mixed = [
+        TaskGroup([layouts[0]], "assembly_line", [mate], True, "first"),
+        TaskGroup([layouts[1]] * 2, "assembly_line", [mate] * 2, True, "second"),
+    ]
+    (player,) = make_players(mixed, METHOD, PLAY, mirror=False)
+    (alone,) = make_players(
+        [TaskGroup([layouts[1]], "assembly_line", [mate] * 3, True, "")], METHOD, PLAY, mirror=False
+    )
     params, key = METHOD.init(jax.random.key(0)), jax.random.key(1)
-    found = player.episode(params, player.mates, player.start(key), key)
-    alone = _Player(layouts[1], mates[1:], True, METHOD, PLAY, mirror=False)
-    own = jax.random.split(key, 3)[1]
-    expected = jax.jit(alone.episode)(params, alone.rollout.teammate_params, alone.start(own), own)
-    after, sequences, returns = found
-    one = jax.tree.map(lambda leaf: leaf[1:2], (after, returns)), jax.tree.map(lambda leaf: leaf[:, 1:2], sequences)
-    wanted = (expected[0], expected[2]), expected[1]
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(_plain(a), _plain(b), atol=1e-5), one, wanted)
-    assert (np.asarray(sequences.action[:, 0]) != np.asarray(sequences.action[:, 1])).any()
-
-
-def _plain(leaf: Any) -> np.ndarray:
-    """Return an array as numbers; random keys become their data."""
-    return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+    (after, found, returns), (alone_after, expected, alone_returns) = (
+        one.compiled(params, one.mates, one.start(key), key) for one in (player, alone)
+    )
+    np.testing.assert_array_equal(returns[1:], alone_returns[1:])
+    np.testing.assert_array_equal(after.env.record[1:], alone_after.env.record[1:])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a[:, 1:], b[:, 1:], atol=1e-5), found, expected)
+    assert (np.asarray(found.action[:, 0]) != np.asarray(expected.action[:, 0])).any()
 
 
 class TestGroups:
@@ -283,7 +280,9 @@ class TestPreparing:
     def test_rearranged_layouts_are_played_too(self):
         """All versions of a layout have equally many tasks over all families, up to one."""
         play = PlayOptions(rearranged=6, four_recipes=True)
-        groups = [one.group for one in self.prepare(play).trainer.players]
+        players = self.prepare(play).trainer.players
+        groups = [group for player in players for group in player.groups]
+        assert len(players) == len({group.family for group in groups})
         assert all(group.hidden and len(group.layouts) in (1, len(group.teammates)) for group in groups)
         tasks = collections.Counter[str]()
         for group in groups:

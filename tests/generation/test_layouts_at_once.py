@@ -1,0 +1,123 @@
+"""Environments of several layouts: every one plays as it does alone."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from icrl4aht_generation.env import Environment
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
+from icrl4aht_data.overcooked.observe import observe_both
+from icrl4aht_data.overcooked.state import columns, padded_positions
+from icrl4aht_data.overcooked.tables import Tables, make_tables, stack_tables
+
+NAMES = ("cramped_up", "coord_ring", "test_wide", "demo_wide")
+"""Layouts of different sizes, with one room and with two, with buttons and with delivery indicators."""
+
+GROUP = [LAYOUTS[name] for name in NAMES]
+ENVS, STEPS = 3 * len(NAMES), 30
+
+
+@pytest.fixture(scope="module")
+def played() -> dict[str, np.ndarray]:
+    """Two episodes of random actions: arrays (steps, environments, ...)."""
+    env = Environment(GROUP, max_steps=STEPS)
+
+    def step(state, key):
+        actions = jax.random.randint(key, (ENVS, 2), 0, 6)
+        actions = jnp.where(jax.random.uniform(key, actions.shape) < 0.4, 5, actions)  # more interaction than walking
+        after = env.step(state, actions)
+        shown = {
+            "record": state.record,
+            "actions": actions,
+            "obs": env.observe(state, canonical=True),
+            "next_recipe": env.next_recipe(state),
+            "reward": after.reward,
+            "shaped": after.shaped,
+            "final": after.final,
+            "layout": state.layout,
+        }
+        return after.state, shown
+
+    run = jax.jit(lambda keys, steps: jax.lax.scan(step, env.init(keys), steps)[1])
+    found = run(keys_of(ENVS), jax.random.split(jax.random.key(1), 2 * STEPS))
+    return {name: np.asarray(value) for name, value in found.items()}
+
+
+def keys_of(count: int) -> jax.Array:
+    return jax.random.split(jax.random.key(0), count)
+
+
+@pytest.mark.parametrize("number", range(len(NAMES)), ids=NAMES)
+def test_every_layout_plays_as_alone(played, number):
+    layout, envs = GROUP[number], np.arange(number, ENVS, len(NAMES))
+    own = padded_positions(layout, stack_tables(GROUP))
+    part = {name: value[:, envs] for name, value in played.items()}
+    assert (part["layout"] == number).all()
+    records, final = part["record"][..., own], part["final"][..., own]
+    others = np.setdiff1d(np.arange(part["record"].shape[-1]), own)
+    assert not part["record"][..., others].any()  # nothing is ever in a padded pot or on a padded counter
+    for episode in (0, STEPS):
+        start = Environment(layout, STEPS).first_record(keys_of(ENVS)[envs], jnp.full(len(envs), episode // STEPS))
+        np.testing.assert_array_equal(records[episode], start)
+    alone = rules.step(layout, records, part["actions"], part["next_recipe"])
+    np.testing.assert_array_equal(final, alone.state)
+    np.testing.assert_array_equal(part["reward"], alone.reward)
+    np.testing.assert_array_equal(part["shaped"], alone.shaped)
+    np.testing.assert_array_equal(part["obs"], observe_both(layout, records, canonical=True))
+    assert set(np.unique(part["next_recipe"])) == set(layout.recipe_items)
+    assert (records[..., columns(layout).hands] > 0).any()
+
+
+def test_layouts_are_drawn_at_each_reset():
+    env = Environment(GROUP, max_steps=1, redraws=True)
+    step = jax.jit(lambda state: env.step(state, jnp.full((ENVS, 2), 4)).state)
+    states = [env.init(keys_of(ENVS))]
+    for _ in range(30):
+        states.append(step(states[-1]))
+    numbers = np.array([state.layout for state in states])
+    counts = np.bincount(numbers.ravel(), minlength=len(GROUP))
+    assert (abs(counts / counts.sum() - 1 / len(GROUP)) < 0.08).all()
+    for number, layout in enumerate(GROUP):
+        cells = np.array([state.record for state in states])[numbers == number][:, :2]
+        assert layout.walkable[cells].all()
+
+
+class TestTables:
+    def test_padding_of_a_layout_changes_nothing_that_is_its_own(self):
+        stacked = stack_tables(GROUP)
+        for number, layout in enumerate(GROUP):
+            own = make_tables(layout, stacked.pots.shape[-1], stacked.buttons.shape[-1])
+            for name, table, padded in zip(Tables._fields, own, stacked, strict=True):
+                if not isinstance(table, tuple):
+                    np.testing.assert_array_equal(padded[number][tuple(map(slice, table.shape))], table, name)
+                    assert padded.dtype == table.dtype
+
+    def test_padded_cells_are_walls_that_nobody_faces(self):
+        stacked = stack_tables(GROUP)
+        for number, layout in enumerate(GROUP):
+            beyond = slice(layout.cells, None)
+            assert (stacked.kinds[number, beyond] == 1).all() and not stacked.walkable[number, beyond].any()
+            assert (stacked.faced[number][layout.walkable.nonzero()[0]] >> 16 < 255).all()
+
+    def test_without_layouts(self):
+        with pytest.raises(OptionError, match="no layouts to stack"):
+            stack_tables([])
+
+    def test_channels_that_only_some_layouts_have(self):
+        odd = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
+        with pytest.raises(OptionError, match=r"layouts \['mine'\] have ingredients without a canonical channel"):
+            stack_tables([odd, *GROUP])
+        with pytest.raises(OptionError, match="take its own channels"):
+            observe_both(odd, np.zeros((1, 8 + len(odd.counters)), np.uint8), canonical=True)
+
+
+def test_numbers_of_layouts_can_be_chosen():
+    env = Environment(GROUP, max_steps=STEPS)
+    state = env.init(keys_of(2), jnp.array([3, 1]))
+    assert state.layout is not None and state.layout.tolist() == [3, 1]
+    assert all(GROUP[number].walkable[cells].all() for number, cells in zip([3, 1], state.record[:, :2], strict=True))
