@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from icrl4aht_generation.layouts.rearranged import unseen_layouts
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.registry import build_teammate
 from jaxtyping import Float
@@ -19,7 +20,6 @@ from jaxtyping import Float
 from icrl4aht_baselines.agents.egos import ego_on
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
-from icrl4aht_generation.layouts.rearranged import unseen_layouts
 from icrl4aht_data.benchmark.reference_returns import Cell
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
