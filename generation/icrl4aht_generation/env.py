@@ -75,13 +75,13 @@ class Environment:
     them; own channels do only if the layouts have equal channel names.
 
     Args:
-        layout: the map and its recipes, or several.
+        layout: the map and its recipes, or several; or their tables, where a compiled program takes them as an argument.
         max_steps: steps of an episode: 400 in training, 100 in evaluation.
         recipes: uint8 (R,), items of the recipes to draw from; by default those of the layout. For one layout only.
         redraws: whether every episode is played on a layout that is drawn from all of them at its start.
     """
 
-    layout: Layout | Sequence[Layout]
+    layout: Layout | Sequence[Layout] | Tables
     max_steps: int = EPISODE_STEPS
     recipes: np.ndarray | None = None
     redraws: bool = False
@@ -89,6 +89,8 @@ class Environment:
     @cached_property
     def tables(self) -> Tables:
         """Tables of the one layout, or stacked ones of several."""
+        if isinstance(self.layout, Tables):
+            return self.layout
         if not isinstance(self.layout, Layout):
             return stack_tables(self.layout)
         if self.recipes is None:
@@ -111,12 +113,12 @@ class Environment:
         if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
             keys = jax.random.wrap_key_data(keys)
         zero = jnp.zeros(keys.shape, jnp.int32)
-        if isinstance(self.layout, Layout):
+        if np.ndim(self.tables.kinds) == 1:
             layout = None
         elif self.redraws:
             layout = self._drawn_layout(keys, zero)
         elif layout is None:
-            layout = jnp.arange(len(keys)) % len(self.layout)
+            layout = jnp.arange(len(keys)) % len(self.tables.kinds)
         return EnvState(keys, zero, zero, self.first_record(keys, zero, layout), layout)
 
     def step(self, state: EnvState, actions: Int[Array, "N 2"]) -> EnvStep:
@@ -231,7 +233,9 @@ class Environment:
 
     def _drawn_layout(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> Int[Array, " N"]:
         """Return the number of a layout for each environment, drawn for an episode."""
-        return _below(_fold(_fold(keys, episode), jnp.full_like(episode, _LAYOUT_DRAW)), np.uint32(len(self.layout)))
+        return _below(
+            _fold(_fold(keys, episode), jnp.full_like(episode, _LAYOUT_DRAW)), np.uint32(len(self.tables.kinds))
+        )
 
 
 _LAYOUT_DRAW = 2**31 - 1

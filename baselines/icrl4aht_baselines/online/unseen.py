@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from icrl4aht_generation.layouts.rearranged import unseen_layouts
+from icrl4aht_generation.layouts.rearranged import rearranged_layouts
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.registry import build_teammate
 from jaxtyping import Float
@@ -20,6 +21,7 @@ from jaxtyping import Float
 from icrl4aht_baselines.agents.egos import ego_on
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
+from icrl4aht_baselines.training.options import MOST_REARRANGED
 from icrl4aht_data.benchmark.reference_returns import Cell
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
@@ -67,6 +69,18 @@ def unseen_returns(
             done += versions * episodes
     played("all layouts", total, total)
     return found
+
+
+def unseen_layouts(layout: Layout, count: int) -> list[Layout]:
+    """Return rearranged versions of a layout that no model is trained on, with the layout's own recipes.
+
+    They have the layout's name: settings by layout, such as hidden recipe indicators, apply to them as well.
+
+    Raises:
+        OptionError: as `rearranged_layouts`.
+    """
+    found = rearranged_layouts(layout, MOST_REARRANGED + count)[MOST_REARRANGED:]
+    return [replace(layout, rows=one.rows) for one in found]
 
 
 def _returns(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,65 +12,100 @@ import numpy as np
 from jaxtyping import Bool
 
 from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
-from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.rules import CORRECT
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
+from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import swapped
+from icrl4aht_data.overcooked.tables import Tables, stack_tables
 from icrl4aht_generation.env import Environment
+from icrl4aht_generation.experts.layout_facts import study_layout
 from icrl4aht_generation.experts.oracle import oracle
-from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
-from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.learners.rollout import Player, RolloutCarry, init_rollout, policy_player, roll_out
+from icrl4aht_generation.policy import Situation
 
-_PAIRS = np.array([[True, True, False], [True, False, True]])  # which agents play in each environment
+_AT_ONCE = 512  # layouts of one batch; every batch runs the same program
+_STEPS = 100
+
+_TRIES = ((1, (True, True)), (4, (True, True)), (4, (True, False)), (4, (False, True)))
+"""Hundreds of steps, and which of the two agents play while the other stays: most layouts need only the first."""
 
 
-def layouts_delivered(layouts: Sequence[Layout]) -> Bool[np.ndarray, " layouts"]:
+def layouts_delivered(
+    layouts: Sequence[Layout], checked: Callable[[int], None] = lambda count: None
+) -> Bool[np.ndarray, " layouts"]:
     """Return for each layout whether an oracle, or a pair of them, delivers at least once in an episode of 400 steps.
 
-    There are three episodes on a layout: with a pair, and with each agent alone while the other stays.
+    Args:
+        layouts: the layouts.
+        checked: called with the number of layouts whose answer was found since the last call, for progress.
     """
-    return np.array([_delivers(layout) for layout in layouts], bool)
+    found = np.zeros(len(layouts), bool)
+    for hundreds, playing in _TRIES:
+        missing = np.flatnonzero(~found)
+        for start in range(0, len(missing), _AT_ONCE):
+            numbers = missing[start : start + _AT_ONCE]
+            found[numbers] = _delivered(layouts, numbers, hundreds, playing)
+            checked(int(found[numbers].sum()))
+    checked(int((~found).sum()))
+    return found
 
 
-def _delivers(layout: Layout) -> bool:
-    """Return whether oracles deliver on one layout; compiles a program for it, which takes seconds."""
-    env = Environment(layout)
-    egos = _if_playing(oracle(layout)), _if_playing(_as_teammate(oracle(_ExchangedLayout(*_arguments(layout)))))
-    count = _PAIRS.shape[1]
-    players = [
-        policy_player(env, policy, jnp.array(_PAIRS[agent]), agent, count, own_params=True)
-        for agent, policy in ((EGO, egos[0]), (TEAMMATE, egos[1]))
-    ]
-
-    @jax.jit
-    def play(key):
-        carry = init_rollout(env, players, jax.random.split(key, count))
-        return roll_out(env, players, carry, env.max_steps, key)[1].reward.max()
-
-    return bool(play(jax.random.key(0)) >= CORRECT)
+def _delivered(
+    layouts: Sequence[Layout], numbers: np.ndarray, hundreds: int, playing: tuple[bool, bool]
+) -> Bool[np.ndarray, " numbers"]:
+    # The largest layouts give all batches equal shapes, and the last batch repeats layouts, so that all share a program.
+    own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + _largest(layouts)
+    tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
+    egos = oracle(own).params, oracle([_exchanged(layout) for layout in own]).params
+    carry, earned = _begin(tables, egos, keys), np.zeros(len(own), bool)
+    for _ in range(hundreds):
+        carry, reward = _play(tables, egos, jnp.array(playing), carry)
+        earned |= np.asarray(reward) >= DELIVERY_REWARD
+    return earned[: len(numbers)]
 
 
-def _if_playing(policy: Policy) -> Policy:
-    """Return a policy whose parameter, bool (), decides whether it acts or always stays."""
-
-    def act(playing, memory, record, key):
-        action, memory = policy.act((), memory, record, key)
-        return jnp.where(playing, action, STAY), memory
-
-    return policy._replace(init=lambda playing, key: policy.init((), key), act=act)
+def _largest(layouts: Sequence[Layout]) -> list[Layout]:
+    """Return layouts that together have the largest size of every axis of the tables."""
+    shapes = np.array(
+        [[np.shape(leaf) for leaf in jax.tree.leaves((one.tables, study_layout(one)))] for one in layouts]
+    )
+    return [layouts[number] for number in dict.fromkeys(shapes.argmax(axis=0).ravel().tolist())]
 
 
-def _as_teammate(policy: Policy) -> Policy:
-    """Return a policy of the ego for the teammate."""
-    return policy._replace(act=lambda params, memory, record, key: policy.act(params, memory, swapped(record), key))
+def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) -> list[Player]:
+    """Return an oracle as either agent of every environment, or one that stays."""
+    sample = oracle([next(iter(LAYOUTS.values()))])  # for its functions, which all groups of layouts share
+
+    def act(agent: int) -> Callable[..., Any]:
+        def act_if_playing(params: Any, memory: Any, view: Situation, key: Any) -> Any:
+            record = view.record if agent == EGO else swapped(view.record)
+            action, memory = sample.act(params, memory, view._replace(record=record), key)
+            return jnp.where(playing[agent], action, STAY), memory
+
+        return act_if_playing
+
+    return [policy_player(env, sample._replace(act=act(agent)), egos[agent], agent, count) for agent in (EGO, TEAMMATE)]
+
+
+@jax.jit
+def _begin(tables: Tables, egos: tuple[Any, Any], keys: Any) -> RolloutCarry:
+    env = Environment(tables)
+    return init_rollout(env, _players(env, egos, (True, True), len(keys)), keys)
+
+
+@jax.jit
+def _play(tables: Tables, egos: tuple[Any, Any], playing: Any, carry: RolloutCarry) -> tuple[RolloutCarry, Any]:
+    env = Environment(tables)
+    players = _players(env, egos, playing, len(carry.ended))
+    carry, played = roll_out(env, players, carry, _STEPS, jax.random.key(0))
+    return carry, played.reward.max(axis=0)
+
+
+def _exchanged(layout: Layout) -> Layout:
+    """Return a layout whose agents are exchanged, for a policy that only plays the ego."""
+    return _ExchangedLayout(layout.name, layout.alias, layout.rows, layout.recipes, layout.indicates_delivery)
 
 
 class _ExchangedLayout(Layout):
-    """Layout whose agents are exchanged, for policies that only play the ego."""
-
     @cached_property
     def agent_cells(self) -> tuple[int, ...]:
         return super().agent_cells[::-1]
-
-
-def _arguments(layout: Layout) -> tuple:
-    return layout.name, layout.alias, layout.rows, layout.recipes, layout.indicates_delivery
