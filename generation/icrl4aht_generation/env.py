@@ -75,7 +75,7 @@ class Environment:
     them; own channels do only if the layouts have equal channel names.
 
     Args:
-        layout: the map and its recipes, or several; or their tables, where a compiled program takes them as an argument.
+        layout: the map and its recipes, or several; or their tables, if a compiled program takes them as an argument.
         max_steps: steps of an episode: 400 in training, 100 in evaluation.
         recipes: uint8 (R,), items of the recipes to draw from; by default those of the layout. For one layout only.
         redraws: whether every episode is played on a layout that is drawn from all of them at its start.

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
+from icrl4aht_data.overcooked.cells import GOAL
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import swapped
 from icrl4aht_data.overcooked.tables import Tables, stack_tables
 from icrl4aht_generation.env import Environment
-from icrl4aht_generation.experts.layout_facts import study_layout
 from icrl4aht_generation.experts.oracle import oracle
 from icrl4aht_generation.learners.rollout import Player, RolloutCarry, init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Situation
@@ -38,22 +38,22 @@ def layouts_delivered(
         layouts: the layouts.
         checked: called with the number of layouts whose answer was found since the last call, for progress.
     """
-    found = np.zeros(len(layouts), bool)
+    found, largest = np.zeros(len(layouts), bool), _largest(layouts)
     for hundreds, playing in _TRIES:
         missing = np.flatnonzero(~found)
         for start in range(0, len(missing), _AT_ONCE):
             numbers = missing[start : start + _AT_ONCE]
-            found[numbers] = _delivered(layouts, numbers, hundreds, playing)
+            found[numbers] = _delivered(layouts, largest, numbers, hundreds, playing)
             checked(int(found[numbers].sum()))
     checked(int((~found).sum()))
     return found
 
 
 def _delivered(
-    layouts: Sequence[Layout], numbers: np.ndarray, hundreds: int, playing: tuple[bool, bool]
+    layouts: Sequence[Layout], largest: list[Layout], numbers: np.ndarray, hundreds: int, playing: tuple[bool, bool]
 ) -> Bool[np.ndarray, " numbers"]:
-    # The largest layouts give all batches equal shapes, and the last batch repeats layouts, so that all share a program.
-    own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + _largest(layouts)
+    # The largest layouts give all batches equal shapes, and short batches repeat layouts, so that all share a program.
+    own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
     egos = oracle(own).params, oracle([_exchanged(layout) for layout in own]).params
     carry, earned = _begin(tables, egos, keys), np.zeros(len(own), bool)
@@ -65,10 +65,16 @@ def _delivered(
 
 def _largest(layouts: Sequence[Layout]) -> list[Layout]:
     """Return layouts that together have the largest size of every axis of the tables."""
-    shapes = np.array(
-        [[np.shape(leaf) for leaf in jax.tree.leaves((one.tables, study_layout(one)))] for one in layouts]
-    )
-    return [layouts[number] for number in dict.fromkeys(shapes.argmax(axis=0).ravel().tolist())]
+    sizes = np.array([_sizes(layout) for layout in layouts])
+    return [layouts[number] for number in dict.fromkeys(sizes.argmax(axis=0).tolist())]
+
+
+def _sizes(layout: Layout) -> tuple[int, ...]:
+    """Return the sizes of the axes of a layout's tables and of the oracle's facts."""
+    by_goal = (layout.kinds[layout.ahead] == GOAL).any(axis=1) & layout.walkable
+    lists = (layout.pots, layout.buttons, layout.counters, layout.recipes, *layout.rooms)
+    one_room = np.array_equal(*layout.rooms)
+    return layout.cells, *map(len, lists), int(by_goal.sum()), one_room * len(layout.rooms[0])
 
 
 def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) -> list[Player]:
