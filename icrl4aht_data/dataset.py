@@ -53,6 +53,7 @@ def load_icrl4aht(
     *,
     split: FilterValues = None,
     layout: FilterValues = None,
+    layout_family: FilterValues = None,
     track: FilterValues = None,
     teammate_family: FilterValues = None,
     teammate_kind: FilterValues = None,
@@ -75,6 +76,7 @@ def load_icrl4aht(
         split: "train", "validation", "test" or "heldout". Each filter is one value, a sequence of values, or None
             for any. Train models on "train" only; samplers warn about a mixture.
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple).
+        layout_family: "published", or a family of layouts that the release carries, such as "templates".
         track: "teammate" or "layout", the part that is new in test tasks.
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
@@ -111,6 +113,7 @@ def load_icrl4aht(
     return dataset.filter(
         split=split,
         layout=layout,
+        layout_family=layout_family,
         track=track,
         teammate_family=teammate_family,
         teammate_kind=teammate_kind,

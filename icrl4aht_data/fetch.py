@@ -31,13 +31,13 @@ from icrl4aht_data.clients import (
 from icrl4aht_data.errors import OfflineError, OptionError, RemoteError, RootNotFoundError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import check_against_manifest, check_folder, parse_manifest
-from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS
+from icrl4aht_data.format.schema import HISTORIES, INFO, LAYOUTS_FILE, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.utils import files as disk
 from icrl4aht_data.utils.hashes import file_hash, git_hash
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.system import data_folder
 
-_INDEX_FILES = (INFO, HISTORIES, TASKS, PROVENANCE)  # read when a release is opened
+_INDEX_FILES = (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE)  # read when a release is opened
 _HUB = re.compile(r"hf://datasets/(?P<repo>[\w.-]+/[\w.-]+)(?:@(?P<revision>[^@]+))?/?")
 
 

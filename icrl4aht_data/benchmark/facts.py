@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 
 from icrl4aht_data.errors import check_choice, unknown
-from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS
+from icrl4aht_data.overcooked.layouts import further_layout_names
 from icrl4aht_data.utils.plugins import Plugins
 
 _TEAMMATE_LAYOUTS = ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide")
@@ -119,8 +119,8 @@ def kind_family(kind: str) -> str | None:
 
 
 def track_layouts(track: str, split: str) -> tuple[str, ...]:
-    """Return the short names of a track's layouts in a split; registered layouts are in every split of `layout`."""
-    return (*TRACKS[track][split], *(LAYOUT_PLUGINS.names if track == "layout" else ()))
+    """Return the short names of a track's layouts in a split; further ones are in every split of `layout`."""
+    return (*TRACKS[track][split], *(further_layout_names() if track == "layout" else ()))
 
 
 def track_of(layout: str) -> str:
@@ -132,9 +132,9 @@ def track_of(layout: str) -> str:
     for track, splits in TRACKS.items():
         if any(layout in layouts for layouts in splits.values()):
             return track
-    if layout in LAYOUT_PLUGINS.names:
+    if layout in further_layout_names():
         return "layout"
-    raise unknown("layout", layout, (*LAYOUT_NAMES, *LAYOUT_PLUGINS.names))
+    raise unknown("layout", layout, (*LAYOUT_NAMES, *further_layout_names()))
 
 
 def layout_order(layout: str) -> tuple[int, str]:

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import SOURCES, SPLITS, TRACKS, all_families
-from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, OptionError, UnknownNameError, unknown
+from icrl4aht_data.errors import (
+    EmptySelectionError,
+    IndexFormatError,
+    OptionError,
+    UnknownNameError,
+    check_choice,
+    unknown,
+)
 from icrl4aht_data.format.columns import QUERY_FIELDS, Columns, read_columns
 from icrl4aht_data.format.info import ReleaseInfo, read_info
+from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_layouts_known, read_layouts
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, Entry
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import resolve_inside
@@ -20,6 +28,9 @@ from icrl4aht_data.utils.text import counted_histories
 
 ALIASES = {"algorithm": "teammate_kind"}
 """Other names of filters: the kind of a learned teammate is its training algorithm."""
+
+LAYOUT_FAMILY = "layout_family"
+"""Filter by the family of the layout: "published", or one of those that the release carries."""
 
 _KNOWN_VALUES: dict[str, Callable[[], Sequence[str]]] = {
     "split": lambda: SPLITS,
@@ -37,11 +48,13 @@ class Index:
         root: the release folder.
         info: content of meta/info.json.
         entries: the histories; a history's id is its position in this sequence.
+        layouts: the layouts that the release carries.
     """
 
     root: Path
     info: ReleaseInfo
     entries: Columns
+    layouts: ReleaseLayouts = field(default_factory=lambda: ReleaseLayouts({}))
 
     def __repr__(self) -> str:
         return f"Index({counted_histories(len(self.entries))} at {self.root})"
@@ -77,11 +90,13 @@ class Index:
         matching = np.ones(len(self.entries), bool)
         for given, value in filters.items():
             name = ALIASES.get(given, given)
-            if name not in QUERY_FIELDS:
-                raise unknown("filter", given, (*QUERY_FIELDS, *ALIASES))
+            if name not in (*QUERY_FIELDS, LAYOUT_FAMILY):
+                raise unknown("filter", given, (*QUERY_FIELDS, LAYOUT_FAMILY, *ALIASES))
             if isinstance(value, Mapping):
                 raise OptionError(f"{given} = {value!r}: expected a name or a sequence of names")
             names = [value] if isinstance(value, str) or not isinstance(value, Iterable) else value
+            if name == LAYOUT_FAMILY:
+                name, names = "layout", self._of_families(names)
             matching &= self.entries.matches(name, {self._known_value(name, one, given) for one in names})
         if not matching.any():
             what = ", ".join(f"{name}={value!r}" for name, value in filters.items()) or "any"
@@ -90,6 +105,15 @@ class Index:
                 f"{self.root}: no history has {what}. This release has {self.summary()}; sources: {sources}"
             )
         return np.flatnonzero(matching)
+
+    def _of_families(self, families: Iterable[str]) -> list[str]:
+        """Return the layouts of the release that belong to families."""
+        by_family: dict[str, list[str]] = {PUBLISHED: []}
+        for layout in self.values("layout"):
+            by_family.setdefault(self.layouts.family(layout), []).append(layout)
+        for family in families:
+            check_choice(LAYOUT_FAMILY, family, by_family)
+        return [layout for family in families for layout in by_family[family]]
 
     def _known_value(self, name: str, value: str, given: str) -> str:
         """Return a valid value of a field, for a layout its name; the release may not have the value.
@@ -133,7 +157,7 @@ def read_index(root: Path) -> Index:
         FormatTooNewError, FormatTooOldError: if the release has another format version.
         IndexFormatError: if a file is malformed; with the file and the line number.
     """
-    info = read_info(root)
+    info, layouts = read_info(root), read_layouts(root)
     path = resolve_inside(root, HISTORIES)
     entries = read_columns(path)
     if len(entries) != info.histories:
@@ -143,4 +167,5 @@ def read_index(root: Path) -> Index:
         raise IndexFormatError(
             f"{path}, line {without[0] + 1}: expected has_teammate_actions true in a {info.kind} release"
         )
-    return Index(root, info, entries)
+    check_layouts_known(entries.values("layout"), path)
+    return Index(root, info, entries, layouts)

@@ -21,6 +21,7 @@ from icrl4aht_data.errors import (
     OptionError,
     RootNotFoundError,
 )
+from icrl4aht_data.format.layouts_file import read_layouts
 from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -210,6 +211,7 @@ def read_info(root: Path) -> ReleaseInfo:
     path = resolve_inside(root, INFO)
     if not path.is_file():
         raise RootNotFoundError(f"{root}: no release here, expected {INFO} in it; {_instead(root)}")
+    read_layouts(root)  # left-out tasks may be on layouts that the release carries
     try:
         content = parse_json(read_text(path))
         version = content.get("format_version") if isinstance(content, dict) else None
@@ -223,7 +225,7 @@ def read_info(root: Path) -> ReleaseInfo:
     if version > FORMAT_VERSION:
         raise FormatTooNewError(f"{found}: `pip install -U {PACKAGE}`")
     raise FormatTooOldError(
-        f"{found}: fetch the release again, or convert it to version 4 with `icrl4aht-data convert` of {_CONVERTER}"
+        f"{found}: fetch the release again, or convert it to version {FORMAT_VERSION} with `icrl4aht-data convert` of {_CONVERTER}"
     )
 
 

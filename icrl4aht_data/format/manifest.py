@@ -18,6 +18,7 @@ from icrl4aht_data.format.schema import (
     EXPERTS,
     HISTORIES,
     INFO,
+    LAYOUTS_FILE,
     MANIFEST,
     PARQUET_EPISODES,
     PARQUET_INDEX,
@@ -43,7 +44,7 @@ _KNOWN = re.compile(
     "|".join(
         (
             r"README\.md|card\.json|LICENSE|CITATION\.cff|croissant\.json",
-            r"meta/(info\.json|histories\.jsonl|tasks\.jsonl|provenance\.json|source_card\.md)",
+            r"meta/(info\.json|histories\.jsonl|tasks\.jsonl|layouts\.jsonl|provenance\.json|source_card\.md)",
             rf"data/{_NAME}/{_NAME}/{_NAME}\.h5",
             rf"meta/chunks/{_NAME}/{_NAME}/{_NAME}\.npy",
             rf"({TEAMMATES}|{EXPERTS})/[0-9a-f]{{64}}/(policy\.json|policy\.safetensors|README\.md)",
@@ -154,7 +155,9 @@ def check_meta(root: Path) -> None:
     `SOURCE_CARD` may be missing, since no code reads it.
     """
     listed = [name for name in _listed(root) if re.fullmatch(r"meta/[^/]+", name)]
-    read = {name for name in (INFO, HISTORIES, TASKS, PROVENANCE) if name in listed or (root / name).exists()}
+    read = {
+        name for name in (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE) if name in listed or (root / name).exists()
+    }
     check_against_manifest(root, sorted(read | {name for name in listed if (root / name).exists()}))
 
 

@@ -3,6 +3,7 @@
     meta/info.json          versions, kind, environment, totals
     meta/histories.jsonl    one line per learning history: `Entry`
     meta/tasks.jsonl        one line per task, see `benchmark.tasks`; may be empty in releases of observations
+    meta/layouts.jsonl      layouts that are not published ones, see `format.layouts_file`
     meta/provenance.json    task_id -> how its histories were made
     meta/chunks/**.npy      for each shard: offset, size, rows, crc32, hash of every chunk
     data/<track>/<layout>/<split>-00000-of-00001.h5
@@ -28,16 +29,19 @@ from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """Format version that this package writes."""
 
-READABLE_VERSIONS = (FORMAT_VERSION,)
+READABLE_VERSIONS = (4, FORMAT_VERSION)
 """Format versions that this package reads; others raise `FormatTooOldError` or `FormatTooNewError`."""
 
 MANIFEST = "MANIFEST.sha256"
 INFO, HISTORIES, TASKS, PROVENANCE = (
     f"meta/{name}" for name in ("info.json", "histories.jsonl", "tasks.jsonl", "provenance.json")
 )
+
+LAYOUTS_FILE = "meta/layouts.jsonl"
+"""Path of the layouts that the release carries, see `layouts_file`; absent if all are published ones."""
 
 TEAMMATES = "teammates"
 """Folder of the checkpoints of learned teammates."""

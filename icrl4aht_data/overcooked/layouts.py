@@ -7,13 +7,14 @@ a digit = ingredient pile, a space = floor. Source: paper, App. A.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from string import digits
 
 import numpy as np
 
-from icrl4aht_data.errors import unknown
+from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.cells import (
     BUTTON,
@@ -291,6 +292,8 @@ _BY_ALIAS = {layout.alias: layout for layout in _ALL}
 LAYOUT_PLUGINS = Plugins("icrl4aht.layouts", (*LAYOUTS, *_BY_ALIAS))
 """Layouts registered by other installed packages; no published task uses them."""
 
+_OF_RELEASES: dict[str, Layout] = {}  # those that the releases opened in this process carry, and generated ones
+
 
 def get_layout(name: str) -> Layout:
     """Return the layout with a short name (coord_simple) or environment name (grounded_coord_simple).
@@ -301,7 +304,7 @@ def get_layout(name: str) -> Layout:
         UnknownNameError: lists the valid names and the nearest.
         PluginError: if a registered layout cannot be used.
     """
-    layout = LAYOUTS.get(name) or _BY_ALIAS.get(name)
+    layout = LAYOUTS.get(name) or _BY_ALIAS.get(name) or _OF_RELEASES.get(name)
     if layout is not None:
         return layout
     if name not in LAYOUT_PLUGINS.names:
@@ -314,6 +317,37 @@ def get_layout(name: str) -> Layout:
     return layout
 
 
+def add_layouts(layouts: Iterable[Layout]) -> list[Layout]:
+    """Make layouts known to `get_layout` in this process, as opening a release does with those that it carries.
+
+    Returns:
+        The layouts; one that was known before is the earlier object.
+
+    Raises:
+        OptionError: if another layout has the name of one of them.
+    """
+    found = []
+    for layout in layouts:
+        known = get_layout(layout.name) if layout.name in all_layout_names() else layout
+        if (known.rows, known.recipes, known.indicates_delivery) != (
+            layout.rows,
+            layout.recipes,
+            layout.indicates_delivery,
+        ):
+            raise OptionError(
+                f"layout {layout.name!r}: differs from the layout that this name stands for; expected "
+                f"{'/'.join(known.rows)} with recipes {known.recipes}, found {'/'.join(layout.rows)} with recipes "
+                f"{layout.recipes}: give it another name"
+            )
+        found.append(_OF_RELEASES.setdefault(layout.name, known))
+    return found
+
+
+def further_layout_names() -> tuple[str, ...]:
+    """Return the names of layouts that the benchmark does not have: registered ones, and those of opened releases."""
+    return (*LAYOUT_PLUGINS.names, *(name for name in _OF_RELEASES if name not in LAYOUTS))
+
+
 def all_layout_names() -> list[str]:
     """Return all names that `get_layout` accepts: short names, registered names and environment names."""
-    return [*LAYOUTS, *LAYOUT_PLUGINS.names, *_BY_ALIAS]
+    return [*LAYOUTS, *further_layout_names(), *_BY_ALIAS]

@@ -18,6 +18,7 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.format.info import LeftOutTask, check_version, describe
+from icrl4aht_data.format.layouts_file import write_layouts
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import (
@@ -186,6 +187,7 @@ def _write_meta(
     """Write the files of meta/: index, tasks, provenance and info."""
     with (root / HISTORIES).open("w", encoding="utf-8") as stream:
         stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
+    write_layouts(root, [one.task.layout for one in new])
     tasks = [one.task for one in new if not isinstance(one.task, NamedTask)]
     write_tasks(root / TASKS, tasks)
     provenance = {one.task.task_id: one.provenance for one in new}

@@ -137,7 +137,8 @@ def _record(
     work: Work, profile: Profile, partial: Path, on_update: UpdateCallback, suite: Path | None, save_seconds: float
 ) -> None:
     task, config = work.task, profile.noise
-    teammate = build_teammate(task.layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
+    layout = None if task.teammate["kind"] == "heuristic" else task.layout
+    teammate = build_teammate(layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
     schedules = noise_schedules(config, task.seed)
     saved = StateFile(partial / LEARNER, noise_settings(work, profile) | software_versions())
     first, pieces = saved_progress(saved), -(-schedules.size // EPISODES_AT_ONCE)

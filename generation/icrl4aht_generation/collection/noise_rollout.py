@@ -21,8 +21,10 @@ from jaxtyping import Array, Float, Int, Int8, Key, UInt8
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_generation.env import Environment, EnvState
-from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
+from icrl4aht_generation.experts.padded import own_layout, padded_layout
 from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Policy, sometimes_random
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
@@ -88,18 +90,20 @@ class NoisyChoice(NamedTuple):
 def play_noisy_episodes(
     layout: Layout, teammate: Policy, seed: int, history: np.ndarray, episode: np.ndarray, chance: np.ndarray
 ) -> NoisyEpisodes:
-    """Play some episodes of a task; compiled once for all teammates of one family on one layout.
+    """Play some episodes of a task; compiled once for all heuristics of one family on all layouts of a process.
 
     Args:
         layout: the layout.
-        teammate: the teammate.
+        teammate: the teammate: a heuristic that sees a `Situation`, or a learned one of this layout.
         seed: the task's seed.
         history: int (M,), number of each episode's history.
         episode: int (M,), its number in the history.
         chance: float32 (M,), its chance of a random action.
     """
-    play = _compiled(layout, teammate._replace(params=()))
-    return play(teammate.params, _keys(seed)[1], history.astype(np.int32), episode.astype(np.int32), chance)
+    tables, expert, own = (padded_layout if teammate.sees == "situation" else own_layout)(layout)
+    play, where = _program(teammate._replace(params=())), (history.astype(np.int32), episode.astype(np.int32))
+    played = play(tables, expert, teammate.params, _keys(seed)[1], *where, chance)
+    return played._replace(state=played.state[..., own], episode_end_state=played.episode_end_state[..., own])
 
 
 def noisy_episode_keys(seed: int, history: np.ndarray, episode: np.ndarray) -> Key[Array, " M"]:
@@ -123,15 +127,15 @@ def _episode_keys(key: Key[Array, ""], history: Any, episode: Any) -> Key[Array,
     return fold(fold(jnp.broadcast_to(key, len(history)), history), episode)
 
 
-@lru_cache(maxsize=8)
-def _compiled(layout: Layout, teammate: Policy) -> Callable[..., NoisyEpisodes]:
-    env = Environment(layout)
+@lru_cache(maxsize=64)
+def _program(teammate: Policy) -> Callable[..., NoisyEpisodes]:
+    """Return a compiled function of tables, parameters of the oracle and of the teammate, a key, and the episodes."""
 
     @jax.jit
-    def play(params, key: Key[Array, ""], history, episode, chance) -> NoisyEpisodes:
-        m = len(history)
+    def play(tables: Tables, expert: Any, params: Any, key: Key[Array, ""], history, episode, chance) -> NoisyEpisodes:
+        env, m = Environment(tables), len(history)
         keys = _episode_keys(key, history, episode)
-        players = [_noisy_oracle(env, chance), policy_player(env, teammate, params, TEAMMATE, m)]
+        players = [_noisy_oracle(env, expert, chance), policy_player(env, teammate, params, TEAMMATE, m)]
         # The roll-out's own key is not used: heuristics have keys of their own, and learned teammates act greedily.
         carry, rollout = roll_out(env, players, init_rollout(env, players, keys), KEPT_STEPS, key)
         choice: Any = rollout.choices[EGO]
@@ -151,13 +155,14 @@ def _compiled(layout: Layout, teammate: Policy) -> Callable[..., NoisyEpisodes]:
     return play
 
 
-def _noisy_oracle(env: Environment, chance: Float[Array, " M"]) -> Player:
+def _noisy_oracle(env: Environment, expert: Any, chance: Float[Array, " M"]) -> Player:
     """Return the oracle as agent 0 of M environments, each with its own chance of a random action.
 
     It remembers the action that was taken, as an observer of the episode would; so the recorded states and actions
     determine what it would do at every state.
     """
-    script, fold = policy_player(env, oracle(env.layout), (), EGO, chance.shape[0]), jax.vmap(jax.random.fold_in)
+    script = policy_player(env, SITUATION_ORACLE, expert, EGO, chance.shape[0])
+    fold = jax.vmap(jax.random.fold_in)
 
     def act(memory: Any, state: EnvState, key: Key[Array, ""]) -> Any:
         choice, memory = script.act(memory, state, key)

@@ -69,8 +69,12 @@ def oracle(layout: Layout | Sequence[Layout]) -> Policy:
     """
     if isinstance(layout, Layout):
         return Policy((), *_on_layout(layout), "state")
-    blank = np.zeros(record_size(stack_tables(layout)), np.uint8)
-    return Policy((stack_facts(layout), blank), _begin_in_situation, _act_in_situation, "situation")
+    return SITUATION_ORACLE._replace(params=oracle_params(layout))
+
+
+def oracle_params(layouts: Sequence[Layout]) -> Any:
+    """Return the parameters of `SITUATION_ORACLE` for some layouts: their facts, and an empty state record."""
+    return stack_facts(layouts), np.zeros(record_size(stack_tables(layouts)), np.uint8)
 
 
 @lru_cache(maxsize=64)
@@ -91,6 +95,10 @@ def _begin_in_situation(params: Any, key: Key[Array, ""]) -> OracleMemory:
 def _act_in_situation(params: Any, memory: OracleMemory, view: Situation, key: Key[Array, ""]):
     facts = jax.tree.map(lambda leaf: jnp.asarray(leaf)[view.layout], params[0])
     return _act(facts, memory, Scene(view.tables, view.record, EGO))
+
+
+SITUATION_ORACLE = Policy((), _begin_in_situation, _act_in_situation, "situation")
+"""The ego for any layouts; its parameters are `oracle_params` of these."""
 
 
 def _begin(blank: UInt8[Array, " S"]) -> OracleMemory:

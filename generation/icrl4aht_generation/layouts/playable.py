@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Bool
 
 from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
-from icrl4aht_data.overcooked.cells import GOAL
-from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import swapped
 from icrl4aht_data.overcooked.tables import Tables, stack_tables
 from icrl4aht_generation.env import Environment
-from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.experts.oracle import SITUATION_ORACLE, oracle_params
+from icrl4aht_generation.experts.padded import largest_layouts
 from icrl4aht_generation.learners.rollout import Player, RolloutCarry, init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Situation
 
@@ -38,7 +38,7 @@ def layouts_delivered(
         layouts: the layouts.
         checked: called with the number of layouts whose answer was found since the last call, for progress.
     """
-    found, largest = np.zeros(len(layouts), bool), _largest(layouts)
+    found, largest = np.zeros(len(layouts), bool), largest_layouts(layouts)
     for hundreds, playing in _TRIES:
         missing = np.flatnonzero(~found)
         for start in range(0, len(missing), _AT_ONCE):
@@ -55,7 +55,7 @@ def _delivered(
     # The largest layouts give all batches equal shapes, and short batches repeat layouts, so that all share a program.
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
-    egos = oracle(own).params, oracle([_exchanged(layout) for layout in own]).params
+    egos = oracle_params(own), oracle_params([_exchanged(layout) for layout in own])
     carry, earned = _begin(tables, egos, keys), np.zeros(len(own), bool)
     for _ in range(hundreds):
         carry, reward = _play(tables, egos, jnp.array(playing), carry)
@@ -63,33 +63,21 @@ def _delivered(
     return earned[: len(numbers)]
 
 
-def _largest(layouts: Sequence[Layout]) -> list[Layout]:
-    """Return layouts that together have the largest size of every axis of the tables."""
-    sizes = np.array([_sizes(layout) for layout in layouts])
-    return [layouts[number] for number in dict.fromkeys(sizes.argmax(axis=0).tolist())]
-
-
-def _sizes(layout: Layout) -> tuple[int, ...]:
-    """Return the sizes of the axes of a layout's tables and of the oracle's facts."""
-    by_goal = (layout.kinds[layout.ahead] == GOAL).any(axis=1) & layout.walkable
-    lists = (layout.pots, layout.buttons, layout.counters, layout.recipes, *layout.rooms)
-    one_room = np.array_equal(*layout.rooms)
-    return layout.cells, *map(len, lists), int(by_goal.sum()), one_room * len(layout.rooms[0])
-
-
 def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) -> list[Player]:
     """Return an oracle as either agent of every environment, or one that stays."""
-    sample = oracle([next(iter(LAYOUTS.values()))])  # for its functions, which all groups of layouts share
 
     def act(agent: int) -> Callable[..., Any]:
         def act_if_playing(params: Any, memory: Any, view: Situation, key: Any) -> Any:
             record = view.record if agent == EGO else swapped(view.record)
-            action, memory = sample.act(params, memory, view._replace(record=record), key)
+            action, memory = SITUATION_ORACLE.act(params, memory, view._replace(record=record), key)
             return jnp.where(playing[agent], action, STAY), memory
 
         return act_if_playing
 
-    return [policy_player(env, sample._replace(act=act(agent)), egos[agent], agent, count) for agent in (EGO, TEAMMATE)]
+    return [
+        policy_player(env, SITUATION_ORACLE._replace(act=act(agent)), egos[agent], agent, count)
+        for agent in (EGO, TEAMMATE)
+    ]
 
 
 @jax.jit

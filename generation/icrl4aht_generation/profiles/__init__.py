@@ -13,8 +13,9 @@ from msgspec import Meta, Struct
 from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, REBUILT_SOURCES
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.format.info import check_version
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.layouts import add_layouts, get_layout
 from icrl4aht_data.utils.options import Count, Natural, replace_options
+from icrl4aht_generation.layouts.families import generate_layouts
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.profiles.profile import Profile, SampledConfig, TeammateConfig
@@ -46,10 +47,20 @@ class _Sampled(Struct, forbid_unknown_fields=True):
     validation: Natural | dict[str, Natural] = 0
 
 
+class _Generated(Struct, forbid_unknown_fields=True):
+    """One table of [[tasks.generated]]: generated layouts of a family."""
+
+    family: str
+    count: Count
+    seed: Natural = 0
+    split: str = "train"
+
+
 class _Tasks(Struct, forbid_unknown_fields=True):
     """Section [tasks]."""
 
-    layouts: _Names
+    layouts: _Names = ()
+    generated: tuple[_Generated, ...] = ()
     sources: Annotated[_Names, Meta(min_length=1)] = ("ppo",)
     learners: Count = 1
     presets: _Names = ()
@@ -109,6 +120,11 @@ def _named_errors(path: Path) -> Iterator[None]:
 def _profile(name: str, content: _ProfileFile) -> Profile:
     release, tasks = content.release, content.tasks
     layouts, sources = _layouts("tasks.layouts", tasks.layouts), _distinct("tasks.sources", tasks.sources)
+    for one in tasks.generated:
+        found = generate_layouts(one.family, one.seed, one.count, split=one.split)
+        layouts += tuple(layout.name for layout in add_layouts(found))
+    if not layouts:
+        raise OptionError("tasks.layouts: none, expected layouts there or in tasks.generated")
     _known("source", "tasks.sources", sources, REBUILT_SOURCES)
     ego = dict(content.ego)
     of_layouts = _by_layout("ego.layouts", ego.pop("layouts", {}), layouts)

@@ -25,10 +25,11 @@ from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_generation.env import Environment
+from icrl4aht_generation.experts.oracle import oracle
 from icrl4aht_generation.learners.rollout import init_rollout, roll_out
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_thetas
-from icrl4aht_generation.teammates.references import player_in_some, reference_egos, stacked_families
+from icrl4aht_generation.teammates.references import REFERENCE_EGOS, player_in_some, stacked_families
 from icrl4aht_generation.teammates.registry import build_teammate
 
 _EPISODES = 10
@@ -83,7 +84,7 @@ def common_states(layout: Layout) -> CommonStates:
     """
     if layout.name not in TESTED_ON:
         raise unknown("training layout", layout.name, TESTED_ON)
-    env, egos = Environment(layout, KEPT_STEPS), reference_egos(layout)
+    env = Environment(layout, KEPT_STEPS)
     tested = TESTED_ON[layout.name]
     tests = [
         [build_teammate(layout, {"family": family, "theta": theta}) for theta in published_thetas(tested, family)]
@@ -97,8 +98,8 @@ def common_states(layout: Layout) -> CommonStates:
     @jax.jit
     def play(own, key):
         players = [
-            player_in_some(env, egos["random"], (), EGO, np.flatnonzero(~with_oracle), total),
-            player_in_some(env, egos["oracle"], (), EGO, np.flatnonzero(with_oracle), total),
+            player_in_some(env, REFERENCE_EGOS["random"], (), EGO, np.flatnonzero(~with_oracle), total),
+            player_in_some(env, oracle(layout), (), EGO, np.flatnonzero(with_oracle), total),
         ]
         for k, (family, params) in enumerate(zip(families, own, strict=True)):
             envs = np.arange(k * each, (k + 1) * each)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_generation.env import Environment
-from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
+from icrl4aht_generation.experts.padded import own_layout, padded_layout
 from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Policy, stacked
 
@@ -40,18 +44,33 @@ def reference_returns(
     Returns:
         "stay", "random" and "oracle" -> mean return with each teammate, float64 (teammates,).
     """
-    env, egos = Environment(layout, KEPT_STEPS), reference_egos(layout)
     families = list(stacked_families(teammates))
-    each = len(teammates) * episodes
-    total = len(egos) * each  # environments are ordered by ego, teammate and episode
-    mate_of = np.arange(total) // episodes % len(teammates)
+    learned = any(family.sees == "observation" for _, family in families)
+    tables, expert, _ = (own_layout if learned else padded_layout)(layout)
+    play = _program(
+        tuple((tuple(numbers), family._replace(params=())) for numbers, family in families), len(teammates), episodes
+    )
+    earned = np.asarray(play(tables, expert, [family.params for _, family in families]), np.float64)
+    means = earned.reshape(len(REFERENCE_EGOS), len(teammates), episodes).mean(axis=-1)
+    return dict(zip(REFERENCE_EGOS, means, strict=True))
+
+
+@lru_cache(maxsize=16)
+def _program(families: tuple[tuple[tuple[int, ...], Policy], ...], teammates: int, episodes: int) -> Callable[..., Any]:
+    """Return a compiled function of tables, parameters of the oracle and of each family, to the episodes' returns."""
+    each = teammates * episodes
+    total = len(REFERENCE_EGOS) * each  # environments are ordered by ego, teammate and episode
+    mate_of = np.arange(total) // episodes % teammates
     starts = jax.random.split(jax.random.key(_SEED), episodes)
 
     @jax.jit
-    def play(params):
+    def play(tables: Tables, expert: Any, params: Sequence[Any]) -> Array:
+        env = Environment(tables, KEPT_STEPS)
         players = [
-            player_in_some(env, ego, (), EGO, np.arange(k * each, (k + 1) * each), total)
-            for k, ego in enumerate(egos.values())
+            player_in_some(
+                env, ego, expert if ego is SITUATION_ORACLE else (), EGO, np.arange(k * each, (k + 1) * each), total
+            )
+            for k, ego in enumerate(REFERENCE_EGOS.values())
         ]
         for (numbers, family), all_params in zip(families, params, strict=True):
             envs = np.flatnonzero(np.isin(mate_of, numbers))
@@ -60,28 +79,26 @@ def reference_returns(
         carry = init_rollout(env, players, jnp.tile(starts, total // episodes))
         return roll_out(env, players, carry, env.max_steps, starts[0])[1].reward.sum(axis=0)
 
-    earned = np.asarray(play([family.params for _, family in families]), np.float64)
-    means = earned.reshape(len(egos), len(teammates), episodes).mean(axis=-1)
-    return dict(zip(egos, means, strict=True))
+    return play
 
 
 def _rows(tree: Any, rows: np.ndarray) -> Any:
     return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
-def reference_egos(layout: Layout) -> dict[str, Policy]:
-    """Return the egos "stay", "random" (uniform over the six actions) and "oracle", whose draws are the episode's."""
+def _act_randomly(params: Any, key: Any, view: Any, _: Any) -> tuple[Any, Any]:
+    key, own = jax.random.split(key)
+    return jax.random.randint(own, (), 0, len(ACTIONS)), key
 
-    def act_randomly(params, key, view, _):
-        key, own = jax.random.split(key)
-        return jax.random.randint(own, (), 0, len(ACTIONS)), key
 
-    still = Policy((), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(STAY), memory), "state")
-    return {
-        "stay": still,
-        "random": Policy((), lambda params, key: key, act_randomly, "state"),
-        "oracle": oracle(layout),
-    }
+REFERENCE_EGOS = {
+    "stay": Policy(
+        (), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(STAY), memory), "situation"
+    ),
+    "random": Policy((), lambda params, key: key, _act_randomly, "situation"),
+    "oracle": SITUATION_ORACLE,
+}
+"""The egos "stay", "random" (uniform over the six actions) and "oracle", whose draws are the episode's."""
 
 
 def player_in_some(

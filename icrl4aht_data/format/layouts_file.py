@@ -1,0 +1,130 @@
+"""The layouts that a release carries: meta/layouts.jsonl, one line for each layout that this package does not have.
+
+    {"name": "templates-0-17", "map": ["WWPWW", ...], "recipes": [[0, 0, 1], ...], "indicates_delivery": false,
+     "family": "templates", "seed": 0, "number": 17}
+
+Reading a release makes its layouts known to `get_layout` by their names.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, UnknownNameError
+from icrl4aht_data.format.schema import LAYOUTS_FILE, check_name
+from icrl4aht_data.overcooked.cells import GOAL, PLATES, POT
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, add_layouts, get_layout
+from icrl4aht_data.utils.files import read_lines, resolve_inside
+
+PUBLISHED = "published"
+"""Family of the layouts of the benchmark, which every copy of this package has."""
+
+OTHER = "other"
+"""Family of layouts that were not generated."""
+
+_NEEDED = {GOAL: "a goal", POT: "a pot", PLATES: "a pile of plates"}
+
+
+class LayoutLine(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """One line of the file.
+
+    Args:
+        name: the layout's name, which is also its environment name.
+        map: its rows.
+        recipes: triples of ingredient ids.
+        indicates_delivery: whether observations have the delivery channel.
+        family: family of generated layouts, or `OTHER`.
+        seed: seed of the family's sequence; None for a layout that was not generated.
+        number: number in that sequence.
+    """
+
+    name: str
+    map: tuple[str, ...]
+    recipes: Annotated[tuple[tuple[int, int, int], ...], Meta(min_length=1)]
+    indicates_delivery: bool
+    family: str
+    seed: int | None = None
+    number: int | None = None
+
+
+@dataclass(frozen=True)
+class ReleaseLayouts:
+    """The layouts that a release carries.
+
+    Args:
+        families: name -> family.
+        layouts: the layouts, in the order of the file.
+    """
+
+    families: dict[str, str]
+    layouts: tuple[Layout, ...] = ()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # A process that unpickles a dataset has not read the release.
+        self.__dict__.update(state)
+        add_layouts(self.layouts)
+
+    def family(self, layout: str) -> str:
+        """Return the family of a layout of the release."""
+        return PUBLISHED if layout in LAYOUTS else self.families.get(layout, OTHER)
+
+
+def read_layouts(root: Path) -> ReleaseLayouts:
+    """Read the layouts of a release, and make them known to `get_layout`.
+
+    Raises:
+        IndexFormatError: if a line is malformed, a name occurs twice or stands for another map elsewhere, or no dish
+            can be made on a map; with the file and the line number.
+    """
+    path = resolve_inside(root, LAYOUTS_FILE)
+    families: dict[str, str] = {}
+    layouts = []
+    for number, line in enumerate(read_lines(path) if path.is_file() else (), start=1):
+        try:
+            fields = msgspec.json.decode(line, type=LayoutLine)
+            check_name(fields.name)
+            check_name(fields.family)
+            if fields.name in families:
+                raise IndexFormatError(f"layout {fields.name!r} is listed twice")
+            families[fields.name] = fields.family
+            layout = Layout(fields.name, fields.name, fields.map, fields.recipes, fields.indicates_delivery)
+            missing = [what for kind, what in _NEEDED.items() if kind not in layout.kinds]
+            if missing:
+                raise IndexFormatError(f"layout {fields.name!r}: its map has not {' and '.join(missing)}")
+            layouts += add_layouts([layout])
+        except (msgspec.MsgspecError, Icrl4ahtError, ValueError) as error:
+            raise IndexFormatError(f"{path}, line {number}: {error}") from error
+    return ReleaseLayouts(families, tuple(layouts))
+
+
+def write_layouts(root: Path, layouts: Iterable[Layout]) -> None:
+    """Write the layouts that the benchmark does not have; no file if there are none."""
+    lines = [_line(layout) for layout in dict.fromkeys(layouts) if layout.name not in LAYOUTS]
+    if lines:
+        (root / LAYOUTS_FILE).write_bytes(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
+
+
+def _line(layout: Layout) -> LayoutLine:
+    generated = re.fullmatch(r"(\w+)-(\d+)-(\d+)", layout.name, re.ASCII)
+    origin = (generated[1], int(generated[2]), int(generated[3])) if generated else (OTHER,)
+    return LayoutLine(layout.name, layout.rows, layout.recipes, layout.indicates_delivery, *origin)
+
+
+def check_layouts_known(names: Iterable[str], path: Path) -> None:
+    """Check that the layouts of an index exist.
+
+    Raises:
+        IndexFormatError: if the package and the release's file of layouts both lack one.
+    """
+    for name in names:
+        try:
+            get_layout(name)
+        except UnknownNameError as error:
+            raise IndexFormatError(f"{path}: layout {name!r} is neither published nor in {LAYOUTS_FILE}") from error
