@@ -16,8 +16,10 @@ from icrl4aht_data.benchmark.facts import (
 )
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.options import Count, Natural, Option, check_options, replace_options
+from icrl4aht_generation.layouts.families import split_of
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.profiles.work import Work
@@ -216,8 +218,9 @@ class Profile:
 
     def _heuristic_tasks(self, layout: str, source: str) -> list[Task]:
         track, first = track_of(layout), self.layouts.index(layout) * len(self.presets)
+        split = "train" if layout in LAYOUT_NAMES else split_of(get_layout(layout))
         tasks = [
-            make_task(track, "train", layout, heuristic_teammate("utility_greedy", preset, number), first + number)
+            make_task(track, split, layout, heuristic_teammate("utility_greedy", preset, number), first + number)
             for number, preset in enumerate(self.presets)
         ]
         tasks = [_of_source(task, source) for task in tasks]

@@ -119,7 +119,7 @@ def _measure(
     returns = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
     returns |= learned_headroom(missing, suite) if missing else {}
     if heuristics:
-        egos = reference_returns(layout, [_build(task, suite) for task in heuristics])
+        egos = reference_returns(layout, [build_teammate(None, task.teammate) for task in heuristics])
         for k, task in enumerate(heuristics):
             stay, random, oracle = (float(egos[ego][k]) for ego in ("stay", "random", "oracle"))
             returns[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES)

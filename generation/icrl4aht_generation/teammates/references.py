@@ -45,8 +45,9 @@ def reference_returns(
         "stay", "random" and "oracle" -> mean return with each teammate, float64 (teammates,).
     """
     families = list(stacked_families(teammates))
-    learned = any(family.sees == "observation" for _, family in families)
-    tables, expert, _ = (own_layout if learned else padded_layout)(layout)
+    # Observations and the state records that a policy of one layout sees are not padded.
+    every = all(family.sees == "situation" for _, family in families)
+    tables, expert, _ = (padded_layout if every else own_layout)(layout)
     play = _program(
         tuple((tuple(numbers), family._replace(params=())) for numbers, family in families), len(teammates), episodes
     )
@@ -67,10 +68,8 @@ def _program(families: tuple[tuple[tuple[int, ...], Policy], ...], teammates: in
     def play(tables: Tables, expert: Any, params: Sequence[Any]) -> Array:
         env = Environment(tables, KEPT_STEPS)
         players = [
-            player_in_some(
-                env, ego, expert if ego is SITUATION_ORACLE else (), EGO, np.arange(k * each, (k + 1) * each), total
-            )
-            for k, ego in enumerate(REFERENCE_EGOS.values())
+            player_in_some(env, ego, expert if name == "oracle" else (), EGO, k * each + np.arange(each), total)
+            for k, (name, ego) in enumerate(REFERENCE_EGOS.items())
         ]
         for (numbers, family), all_params in zip(families, params, strict=True):
             envs = np.flatnonzero(np.isin(mate_of, numbers))
@@ -91,10 +90,12 @@ def _act_randomly(params: Any, key: Any, view: Any, _: Any) -> tuple[Any, Any]:
     return jax.random.randint(own, (), 0, len(ACTIONS)), key
 
 
+def _stay(params: Any, memory: Any, view: Any, key: Any) -> tuple[Any, Any]:
+    return jnp.int32(STAY), memory
+
+
 REFERENCE_EGOS = {
-    "stay": Policy(
-        (), lambda params, key: (), lambda params, memory, view, key: (jnp.int32(STAY), memory), "situation"
-    ),
+    "stay": Policy((), lambda params, key: (), _stay, "situation"),
     "random": Policy((), lambda params, key: key, _act_randomly, "situation"),
     "oracle": SITUATION_ORACLE,
 }

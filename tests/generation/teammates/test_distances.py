@@ -19,7 +19,7 @@ from icrl4aht_generation.teammates.distances import (
 from icrl4aht_generation.teammates.draws import read_draws
 from icrl4aht_generation.teammates.instances import published_thetas
 from icrl4aht_generation.teammates.measuring import measure_draws
-from icrl4aht_generation.teammates.references import reference_egos, reference_returns
+from icrl4aht_generation.teammates.references import reference_returns
 from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_data.errors import UnknownNameError
@@ -79,10 +79,9 @@ def test_returns_belong_to_their_teammates(monkeypatch):
         return carry, played._replace(reward=actions[..., 0] + 100 * (actions[..., 1] == 2))
 
     roll_out = references.roll_out
-    egos = reference_egos(LAYOUT)
-    egos["oracle"] = Policy((), count, lambda params, steps, view, key: (jnp.int32(1), steps), "state")
+    other = Policy((), count, lambda params, steps, view, key: (jnp.int32(1), steps), "state")
     monkeypatch.setattr(references, "roll_out", counted)
-    monkeypatch.setattr(references, "reference_egos", lambda layout: egos)
+    monkeypatch.setitem(references.REFERENCE_EGOS, "oracle", other)
     monkeypatch.setattr(references, "KEPT_STEPS", 3)
     actions = {0: walks, 2: walks_too, 5: walks}
     mates = [Policy(jnp.int32(action), count, act, "state") for action, act in actions.items()]
