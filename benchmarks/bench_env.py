@@ -1,6 +1,7 @@
 """Steps/s of environments and of learning in them compared with JaxMARL's OvercookedV2: `make bench-env`.
 
     steps    environments alone
+    layouts  as many generated layouts as environments, compared with one layout and with JaxMARL's environment of it
     ippo     JaxMARL's IPPO on our environment and on JaxMARL's own: `PEER=file`
 
 In `steps` both run the same jitted loop with random actions and auto-reset, which writes both agents' observations of
@@ -17,7 +18,7 @@ environment, see `benchmarks.peers`. Its network takes most of the time, so a fa
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from icrl4aht_generation.adapters.jaxmarl_env import JaxMARLEnv
 from icrl4aht_generation.env import Environment
+from icrl4aht_generation.layouts.families import generate_layouts
 from icrl4aht_generation.learners.config import PPOConfig
 
 from benchmarks.harness import compared, print_line, rates_in_turn
@@ -35,6 +37,7 @@ from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _LAYOUTS = ("coord_simple", "coord_ring", "demo_wide")
+_ONE = "asymm_both"  # the layout that many layouts are compared with
 ENVIRONMENTS = (64, 1024)
 WRITTEN = ("uint8", "state", "float32")
 STEPS = 51_200  # per call, summed over environments
@@ -44,15 +47,17 @@ StepEnvironments = Callable[[Any, Any, Any], tuple[Any, Any, Any]]
 """(key, state, actions int32 (N, 2)) -> state, array to write (N, ...), reward float32 (N,)."""
 
 
-def our_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironments]:
-    """Return the initial state and the step function of n of our environments."""
+def our_game(
+    layout: Layout | Sequence[Layout], n: int, written: str, canonical: bool = False
+) -> tuple[Any, StepEnvironments]:
+    """Return the initial state and the step function of n of our environments, on one layout or on several."""
     env = Environment(layout)
 
     def step(key, state, actions):
         outcome = env.step(state, actions)
         if written == "state":
             return outcome.state, outcome.state.record, outcome.reward
-        obs = env.observe(outcome.state)
+        obs = env.observe(outcome.state, canonical)
         return outcome.state, obs.astype(jnp.float32) if written == "float32" else obs, outcome.reward
 
     return env.init(jax.random.split(jax.random.key(0), n)), step
@@ -101,6 +106,24 @@ def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
     return play
 
 
+def print_layouts(n: int, rounds: int) -> None:
+    """Print the speed of n environments on n generated layouts, on one layout, and of JaxMARL's on that layout.
+
+    Canonical observations are written, which are larger than the one layout's own.
+    """
+    one = get_layout(_ONE)
+    many = generate_layouts("templates", 0, n // 2) + generate_layouts("rooms", 0, n - n // 2)
+    ways = {
+        "ours": rollout(our_game(many, n, "uint8", canonical=True), n),
+        "one": rollout(our_game(one, n, "uint8", canonical=True), n),
+        "jaxmarl": rollout(peer_game(one, n, "uint8"), n),
+    }
+    rates = rates_in_turn(ways, STEPS // n * n, rounds)
+    of_one = compared(rates, "ours", "one")["ratio"]
+    facts = {"one_layout": one.name, "ratio_to_one_layout": of_one, **compared(rates, "ours", "jaxmarl")}
+    print_line("env", part="layouts", layouts=len(many), environments=n, written="uint8", **facts)
+
+
 @click.command()
 @click.option("--layout", "layouts", multiple=True, default=_LAYOUTS, show_default=True)
 @click.option("--environments", multiple=True, type=COUNT, default=ENVIRONMENTS, show_default=True)
@@ -121,6 +144,8 @@ def main(
     steps: int,
 ) -> None:
     """Compare steps/s of environments, or of learning in them, with JaxMARL's; one JSON line per setting."""
+    if peer is None:
+        print_layouts(max(environments), rounds)
     for layout, n in itertools.product(map(get_layout, layouts), environments):
         if peer is None:
             for what in written:
