@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, Unpack
@@ -13,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from icrl4aht_data.benchmark.tasks import Task, read_tasks, teammate_id
+from icrl4aht_data.benchmark.tasks import Task, read_tasks, task_fields, teammate_id
 from icrl4aht_data.environments import make_environment
 from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError, check_choice, unknown
 from icrl4aht_data.fetch import ReleaseLocation, open_root
@@ -295,7 +294,7 @@ class Dataset(Selection):
         teammate = self.recover_teammate(history_id)
         task = self.history_task(history_id)
         known: dict[str, Any] = {
-            "task": asdict(task),
+            "task": task_fields(task),
             "noise": teammate.get("noise", "seeded"),
             "channels": self.channels,
             "max_episode_steps": self.info.environment.max_steps,
@@ -347,7 +346,8 @@ class Dataset(Selection):
             history_id: a history of the release, whether selected or not.
         """
         entry = self.index.entry(history_id)
-        layout = get_layout(entry.layout)
+        task = self._tasks.get(entry.task_id)
+        layout = get_layout(entry.layout) if task is None else task.layout
         return {
             "layout": layout.name,
             "environment_name": layout.alias,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -30,8 +30,11 @@ from icrl4aht_data.benchmark.facts import (
     kind_family,
 )
 from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, check_choice, unknown
-from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.layouts import Layout, get_layout, with_recipes
 from icrl4aht_data.utils.files import is_inside, json_hash, parse_json, read_lines
+
+Recipe = tuple[int, int, int]
+"""Ids of the three ingredients of a dish."""
 
 _S = TypeVar("_S", bound=msgspec.Struct)
 
@@ -50,6 +53,8 @@ class Task:
         seed: seed of the ego's training.
         teammate: kind, family, theta_id, base_seed and theta. For kind "heuristic", theta contains the parameters; for
             kind "rl", the checkpoint's folder within its suite and the sha256 of its weights.
+        recipes: recipes that replace the layout's in this task, triples of ingredient ids; None for the layout's. With
+            a single one, all episodes of the task want the same dish.
     """
 
     task_id: str
@@ -58,16 +63,19 @@ class Task:
     layout_name: str
     seed: int
     teammate: dict[str, Any]
+    recipes: tuple[Recipe, ...] | None = None
 
     @property
     def layout(self) -> Layout:
-        return get_layout(self.layout_name)
+        """The layout that is played, with the recipes of the task."""
+        layout = get_layout(self.layout_name)
+        return layout if self.recipes is None else with_recipes(layout, self.recipes)
 
     @property
     def teammate_key(self) -> tuple[str, str]:
         """Key shared by all tasks with the same teammate on the same layout, such as tasks of another source: the
         layout's name and a hash of the teammate."""
-        return self.layout.name, json_hash(self.teammate)
+        return self.layout.name, json_hash(self.teammate if self.recipes is None else [self.teammate, self.recipes])
 
     @property
     def teammate_kind(self) -> str:
@@ -123,24 +131,47 @@ def teammate_id(teammate: Mapping[str, Any]) -> str:
     return json_hash({name: float(np.float32(value)) for name, value in theta.items()})
 
 
-def make_task(track: str, split: str, layout: str, teammate: dict[str, Any], seed: int) -> Task:
+def make_task(
+    track: str,
+    split: str,
+    layout: str,
+    teammate: dict[str, Any],
+    seed: int,
+    recipes: Sequence[Recipe] | None = None,
+) -> Task:
     """Return a task with its id.
 
     Raises:
         UnknownNameError: if the layout does not belong to that split of that track.
+        TaskFormatError: if the recipes are not different ones that the layout's piles allow.
     """
     known = get_layout(layout)
     check_membership(track, split, known.name)
-    return Task(task_id(track, split, known.alias, teammate, seed), track, split, known.alias, seed, teammate)
+    given = None if recipes is None else tuple(recipes)
+    task = Task(
+        task_id(track, split, known.alias, teammate, seed, given), track, split, known.alias, seed, teammate, given
+    )
+    _check_recipes(task)
+    return task
 
 
-def task_id(track: str, split: str, layout_name: str, teammate: dict[str, Any], seed: int) -> str:
+def task_id(
+    track: str,
+    split: str,
+    layout_name: str,
+    teammate: dict[str, Any],
+    seed: int,
+    recipes: Sequence[Recipe] | None = None,
+) -> str:
     """`{track}_{split}_{layout}_{family}_t{theta_id}_s{seed}_{hash8}`, as in the published manifests.
 
-    hash8 is the first 8 hexadecimal digits of SHA-256 of `track:split:layout:<repr of the teammate>:seed`.
+    hash8 is the first 8 hexadecimal digits of SHA-256 of `track:split:layout:<repr of the teammate>:seed`, followed by
+    `:` and the recipes, such as `000,001`, if the task has its own.
     """
     spec = {name: teammate[name] for name in _HASHED if name in teammate}
     text = f"{track}:{split}:{layout_name}:{spec!r}:{seed}"
+    if recipes is not None:
+        text += ":" + ",".join("".join(map(str, recipe)) for recipe in recipes)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     return f"{track}_{split}_{layout_name}_{teammate['family']}_t{teammate.get('theta_id', 0)}_s{seed}_{digest}"
 
@@ -181,7 +212,13 @@ def read_tasks(path: Path) -> list[Task]:
 
 def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
     """Write one JSON line per task."""
-    path.write_text("".join(json.dumps(asdict(task)) + "\n" for task in tasks), encoding="utf-8")
+    path.write_text("".join(json.dumps(task_fields(task)) + "\n" for task in tasks), encoding="utf-8")
+
+
+def task_fields(task: Task) -> dict[str, Any]:
+    """Return the fields of a manifest line; `recipes` only if the task has its own."""
+    fields = asdict(task)
+    return fields if task.recipes is not None else {name: fields[name] for name in fields if name != "recipes"}
 
 
 class _RlTheta(msgspec.Struct, forbid_unknown_fields=True):
@@ -209,10 +246,11 @@ class _TaskFields(msgspec.Struct, forbid_unknown_fields=True):
     layout_name: str
     seed: Annotated[int, Meta(gt=-(2**63), le=2**63 - 1)]
     teammate: dict[str, Any]
+    recipes: tuple[Recipe, ...] | None = None
 
 
 def parse_task(fields: Any) -> Task:
-    """Parse the fields of a manifest line as a task; the inverse of `dataclasses.asdict`.
+    """Parse the fields of a manifest line as a task; the inverse of `task_fields`.
 
     Raises:
         TaskFormatError: for missing or unknown fields, or impossible values.
@@ -221,10 +259,27 @@ def parse_task(fields: Any) -> Task:
     task = Task(**msgspec.structs.asdict(_convert(fields, _TaskFields, "")))
     check_membership(task.track, task.split, task.layout.name)
     _check_teammate(task.teammate)
-    expected = task_id(task.track, task.split, task.layout_name, task.teammate, task.seed)
+    _check_recipes(task)
+    expected = task_id(task.track, task.split, task.layout_name, task.teammate, task.seed, task.recipes)
     if task.task_id != expected:
         raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")
     return task
+
+
+def _check_recipes(task: Task) -> None:
+    """Check that the recipes of a task can be cooked on its layout.
+
+    Raises:
+        TaskFormatError: if there is none, one twice or in another order of its pieces, or one without a pile.
+    """
+    if task.recipes is None:
+        return
+    if not task.recipes or len({tuple(sorted(recipe)) for recipe in task.recipes}) < len(task.recipes):
+        raise TaskFormatError(f"recipes: expected different ones, at least one, found {list(task.recipes)}")
+    try:
+        _ = task.layout
+    except ValueError as error:
+        raise TaskFormatError(f"recipes: {error}") from error
 
 
 def _check_teammate(teammate: dict[str, Any]) -> None:

@@ -22,7 +22,7 @@ from icrl4aht_data.format.schema import (
     stream_score,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import faults
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.shard import Shard
@@ -44,22 +44,25 @@ def check_chunks(shard: Shard, report: Report) -> set[int]:
     return damaged
 
 
-def check_history(history: History, info: ReleaseInfo, contents: dict[tuple[str, bytes], int], report: Report) -> None:
+def check_history(
+    history: History, layout: Layout, info: ReleaseInfo, contents: dict[tuple[str, bytes], int], report: Report
+) -> None:
     """Check one history whose chunks are valid.
 
     Args:
         history: the history.
+        layout: its layout, with the recipes of its task.
         info: the release's info.
         contents: (task id, hash of the ego's observations and actions) -> history id, of the histories checked so far;
             receives this one.
         report: receives the problems.
     """
-    entry, layout = history.entry, get_layout(history.entry.layout)
+    entry = history.entry
     try:
         step_bytes = sum(field.element(layout, info.kind).itemsize for field in entry.stored_fields(info.kind))
         if (size := _COPIES * entry.T * step_bytes) > free_memory():
             raise OptionError(f"takes {size / 1e9:.3g} GB of memory, more than is free")
-        for fault in _history_faults(history, info.environment.kept_steps, deep=report.level == "deep"):
+        for fault in _history_faults(history, layout, info.environment.kept_steps, deep=report.level == "deep"):
             report.add(entry.shard, f"history {entry.history_id}: {fault}")
         arrays = (history.read(name) for name in (record_field(info.kind).name, "actions"))
         digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).digest()
@@ -71,8 +74,8 @@ def check_history(history: History, info: ReleaseInfo, contents: dict[tuple[str,
         report.add(entry.shard, f"history {entry.history_id}: could not be checked: {error!r}")
 
 
-def _history_faults(history: History, kept_steps: int, deep: bool) -> Iterator[str]:
-    entry, layout = history.entry, get_layout(history.entry.layout)
+def _history_faults(history: History, layout: Layout, kept_steps: int, deep: bool) -> Iterator[str]:
+    entry = history.entry
     dones, rewards, has_states = history.read("dones"), history.read("rewards"), history.kind in KINDS
     # Only a release of observations may end a history within an episode.
     counted = entry.episodes == entry.T // kept_steps and not (has_states and entry.T % kept_steps)

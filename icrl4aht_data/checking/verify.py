@@ -28,6 +28,7 @@ from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS, Entry
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
@@ -133,7 +134,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     if report.level == "quick":
         check_shard_sizes(origin, index, shards, report)
     else:
-        _check_shards(index, shards, report, advance)
+        _check_shards(index, {task.task_id: task.layout for task in tasks}, shards, report, advance)
 
 
 def _unchecked_values(index: Index, provenance: Mapping[str, Provenance]) -> Iterator[str]:
@@ -164,8 +165,10 @@ def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgr
         advance("fetched", number, len(names))
 
 
-def _check_shards(index: Index, shards: list[str], report: Report, advance: NamedProgress) -> None:
-    """Check shards and their histories."""
+def _check_shards(
+    index: Index, layouts: Mapping[str, Layout], shards: list[str], report: Report, advance: NamedProgress
+) -> None:
+    """Check shards and their histories; `layouts` are those of the tasks by id, with the tasks' recipes."""
     local = ReleaseLocation(index.root)  # no remote, since files that could not be fetched are already reported
     members: dict[str, list[Entry]] = {name: [] for name in shards}
     for entry in index.entries:
@@ -184,6 +187,8 @@ def _check_shards(index: Index, shards: list[str], report: Report, advance: Name
         contents: dict[tuple[str, bytes], int] = {}
         for entry in entries:
             if entry.history_id not in damaged:
-                check_history(History(entry, lambda name, shard=shard: shard, "uint8"), index.info, contents, report)
+                layout = layouts.get(entry.task_id) or get_layout(entry.layout)
+                history = History(entry, lambda name, shard=shard: shard, "uint8")
+                check_history(history, layout, index.info, contents, report)
             report.histories += 1
             advance("histories", report.histories, total)

@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.cells import CENTRE, NOWHERE, VISIBLE
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
-from icrl4aht_data.overcooked.state import columns, record_size
+from icrl4aht_data.overcooked.state import columns, possible_recipes, record_size
 from icrl4aht_data.utils.system import in_slices
 
 _SLAB = 8192  # steps rendered at a time: smaller blocks lose more time in calls than they save in cache misses
@@ -74,7 +74,7 @@ class _Renderer:
         self._agent: int = fixed.start // 2  # A: the channels of two agents precede the fixed ones
         self._first: int = fixed.stop  # first channel whose value on a cell can change
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
-        self._recipes = np.unique(np.array([0, *layout.recipe_items], np.uint8))
+        self._recipes = np.append(np.uint8(0), possible_recipes(layout))
         self._in_window = layout.window_position.astype(np.intp)
         self._background = self._make_background()
         self._agents = _as_items(self._make_agents())

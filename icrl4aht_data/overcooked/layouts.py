@@ -8,8 +8,8 @@ a digit = ingredient pile, a space = floor. Source: paper, App. A.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from string import digits
 
 import numpy as np
@@ -315,6 +315,16 @@ def get_layout(name: str) -> Layout:
             name, f"expected name and alias {name!r}, found name {layout.name!r} and alias {layout.alias!r}"
         )
     return layout
+
+
+@lru_cache(maxsize=1024)
+def with_recipes(layout: Layout, recipes: tuple[tuple[int, int, int], ...]) -> Layout:
+    """Return a layout with other recipes; equal arguments give the same object.
+
+    Raises:
+        ValueError: if a recipe has an ingredient without a pile.
+    """
+    return replace(layout, recipes=recipes)
 
 
 def add_layouts(layouts: Iterable[Layout]) -> list[Layout]:

@@ -133,6 +133,13 @@ def start(layout: Layout | Tables, positions: Array, facings: Array, recipe: Arr
     return xp.concat([positions, facings, hands, recipe[..., None], empty], axis=-1)
 
 
+def possible_recipes(layout: Layout) -> np.ndarray:
+    """Return the item bytes of all dishes that the layout's piles allow, uint8, ascending; tasks choose among them."""
+    items = np.arange(256)
+    plain = (items & (PLATE | COOKED) == 0) & (ingredient_count(items) == 3)
+    return np.flatnonzero(possible_items(layout) & plain).astype(np.uint8)
+
+
 def faults(layout: Layout, record: np.ndarray) -> list[str]:
     """Return descriptions of impossible values in records uint8 (B, S); empty if every value is in range.
 
@@ -143,7 +150,6 @@ def faults(layout: Layout, record: np.ndarray) -> list[str]:
     items = possible_items(layout)
     in_hand = items & ((np.arange(256) & PLATE > 0) | (ingredient_count(np.arange(256)) <= 1))
     in_pot = items & (np.arange(256) & PLATE == 0)
-    recipes = items & (np.arange(256) & (PLATE | COOKED) == 0) & (ingredient_count(np.arange(256)) == 3)
     cooking = state.pot_timers > 0
     checks = {
         "a position that is not reachable floor": ~layout.walkable[np.minimum(state.positions, layout.cells - 1)]
@@ -153,7 +159,7 @@ def faults(layout: Layout, record: np.ndarray) -> list[str]:
         "an impossible item in hand": ~in_hand[state.hands],
         "an impossible item on a counter": ~in_hand[state.counters],
         "an impossible item in a pot": ~in_pot[state.pot_items],
-        "an impossible recipe": ~recipes[state.recipe],
+        "an impossible recipe": ~np.isin(state.recipe, possible_recipes(layout)),
         "a delivery flag that is not 0 or 1": state.delivered > 1,
         "a pot timer above its limit": state.pot_timers > POT_STEPS,
         "a pot that does not cook exactly while it contains three raw ingredients": cooking

@@ -10,6 +10,7 @@ from icrl4aht_generation.env import Environment
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.cells import BUTTON, POT, WALL
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout
 from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.state import columns, padded_positions
@@ -101,8 +102,10 @@ class TestTables:
         stacked = stack_tables(GROUP)
         for number, layout in enumerate(GROUP):
             beyond = slice(layout.cells, None)
-            assert (stacked.kinds[number, beyond] == 1).all() and not stacked.walkable[number, beyond].any()
-            assert (stacked.faced[number][layout.walkable.nonzero()[0]] >> 16 < 255).all()
+            assert (stacked.kinds[number, beyond] == WALL).all() and not stacked.walkable[number, beyond].any()
+            faced = stacked.faced[number][layout.walkable.nonzero()[0]]
+            for kind, cells in ((POT, layout.pots), (BUTTON, layout.buttons), (WALL, layout.counters)):
+                assert set((faced[faced & 255 == kind] >> 16).tolist()) <= set(range(len(cells)))
 
     def test_without_layouts(self):
         with pytest.raises(OptionError, match="no layouts to stack"):

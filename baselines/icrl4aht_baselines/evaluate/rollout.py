@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from icrl4aht_baselines.agents.host import EgoInput, HostPolicy
 from icrl4aht_baselines.evaluate.protocols import Protocol
 from icrl4aht_data.benchmark.facts import FOUR_RECIPES, TRACKS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
-from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, with_recipes
 
 _EGO_STEPS, _TEAMMATE_STEPS = 2, 3  # key streams within an episode, distinct from those of the agent slots
 
@@ -142,9 +142,12 @@ class EvaluationRollout:
 
 @lru_cache(maxsize=64)
 def _played(layout: Layout, protocol: Protocol) -> Layout:
-    """Return a layout with the recipes that the protocol draws from."""
+    """Return a layout with the recipes that the protocol draws from; recipes of a task's own remain."""
+    published = LAYOUTS.get(layout.name)
     four = protocol.four_recipes and any(layout.name in names for names in TRACKS["layout"].values())
-    return replace(layout, recipes=FOUR_RECIPES) if four else layout
+    if not four or published is None or layout.recipes != published.recipes:
+        return layout
+    return with_recipes(layout, FOUR_RECIPES)
 
 
 def no_outcome(batch: int) -> EgoInput:

@@ -220,7 +220,7 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         if task.teammate_key in found:
             continue
         seed = FIRST_SEED + number * _SEEDS + len(found)
-        student = make_task(task.track, task.split, task.layout.name, task.teammate, seed)
+        student = make_task(task.track, task.split, task.layout.name, task.teammate, seed, task.recipes)
         found[task.teammate_key] = student
         made = provenance.get(task.task_id)
         if made is not None and made.references is not None:

@@ -249,7 +249,7 @@ def _of_source(task: Task, source: str) -> Task:
     if source == "ppo":
         return task
     seed = _first_seed(source) + _UNSAMPLED_SEEDS + task.seed
-    return make_task(task.track, task.split, task.layout.name, task.teammate, seed)
+    return make_task(task.track, task.split, task.layout.name, task.teammate, seed, task.recipes)
 
 
 def _first_seed(source: str) -> int:
