@@ -33,7 +33,7 @@ from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, check_choice, u
 from icrl4aht_data.overcooked.layouts import Layout, get_layout, with_recipes
 from icrl4aht_data.utils.files import is_inside, json_hash, parse_json, read_lines
 
-Recipe = tuple[int, int, int]
+Dish = tuple[int, int, int]
 """Ids of the three ingredients of a dish."""
 
 _S = TypeVar("_S", bound=msgspec.Struct)
@@ -63,7 +63,7 @@ class Task:
     layout_name: str
     seed: int
     teammate: dict[str, Any]
-    recipes: tuple[Recipe, ...] | None = None
+    recipes: tuple[Dish, ...] | None = None
 
     @property
     def layout(self) -> Layout:
@@ -137,7 +137,7 @@ def make_task(
     layout: str,
     teammate: dict[str, Any],
     seed: int,
-    recipes: Sequence[Recipe] | None = None,
+    recipes: Sequence[Dish] | None = None,
 ) -> Task:
     """Return a task with its id.
 
@@ -161,7 +161,7 @@ def task_id(
     layout_name: str,
     teammate: dict[str, Any],
     seed: int,
-    recipes: Sequence[Recipe] | None = None,
+    recipes: Sequence[Dish] | None = None,
 ) -> str:
     """`{track}_{split}_{layout}_{family}_t{theta_id}_s{seed}_{hash8}`, as in the published manifests.
 
@@ -246,7 +246,7 @@ class _TaskFields(msgspec.Struct, forbid_unknown_fields=True):
     layout_name: str
     seed: Annotated[int, Meta(gt=-(2**63), le=2**63 - 1)]
     teammate: dict[str, Any]
-    recipes: tuple[Recipe, ...] | None = None
+    recipes: tuple[Dish, ...] | None = None
 
 
 def parse_task(fields: Any) -> Task:

@@ -44,9 +44,9 @@ def own_layout(layout: Layout) -> PaddedLayout:
 def _padded(layout: Layout, names: tuple[str, ...]) -> PaddedLayout:
     group = [layout, *_largest_of(names)]
     tables = jax.tree.map(lambda leaf: leaf[0], stack_tables(group))
-    return PaddedLayout(
-        tables, jax.tree.map(lambda leaf: leaf[:1], oracle_params(group)), padded_positions(layout, tables)
-    )
+    facts, blank = oracle_params(group)
+    oracle = jax.tree.map(lambda leaf: leaf[:1], facts), blank
+    return PaddedLayout(tables, oracle, padded_positions(layout, tables))
 
 
 @lru_cache(maxsize=8)
