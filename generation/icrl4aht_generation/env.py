@@ -98,6 +98,17 @@ class Environment:
         return self.layout.tables._replace(recipes=self.recipes, recipe_count=np.uint32(len(self.recipes)))
 
     @property
+    def only_layout(self) -> Layout:
+        """The layout, for what is made for one.
+
+        Raises:
+            TypeError: if the environment has several layouts, or only tables.
+        """
+        if not isinstance(self.layout, Layout):
+            raise TypeError("expected an environment of one layout")
+        return self.layout
+
+    @property
     def recipe_items(self) -> np.ndarray:
         """uint8 (R,): items of the recipes that the environment draws from."""
         return self.tables.recipes
@@ -132,7 +143,7 @@ class Environment:
 
         def restarted() -> tuple[Array, Array | None]:
             layout = state.layout
-            if self.redraws:
+            if self.redraws and layout is not None:
                 layout = jnp.where(done, self._drawn_layout(state.key, episode), layout)
             first = self.first_record(state.key, episode, layout)
             return jnp.where(done[:, None], first, outcome.state), layout

@@ -49,7 +49,7 @@ class Policy(NamedTuple):
 
     params: Any
     init: Callable[[Any, Key[Array, ""]], Any]
-    act: Callable[[Any, Any, Array, Key[Array, ""]], tuple[Int[Array, ""], Any]]
+    act: Callable[[Any, Any, Any, Key[Array, ""]], tuple[Int[Array, ""], Any]]
     sees: Literal["state", "situation", "observation", "ego_input", "canonical_input"]
 
 

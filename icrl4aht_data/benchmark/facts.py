@@ -7,6 +7,7 @@ registered by other installed packages, see docs/extending.md.
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 from icrl4aht_data.errors import check_choice, unknown
 from icrl4aht_data.overcooked.layouts import further_layout_names
@@ -163,7 +164,7 @@ def check_family(family: object) -> None:
         raise unknown("teammate_family", family, families)
 
 
-def check_membership(track: object, split: object, layout: object) -> None:
+def check_membership(track: Any, split: Any, layout: Any) -> None:
     """Check that a layout (short name) belongs to a split of a track.
 
     Raises:

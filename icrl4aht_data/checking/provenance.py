@@ -58,7 +58,8 @@ def _faults(made: Provenance, entries: Sequence[Entry], seed: int | None) -> Ite
     if names is not None and first.teammate_kind not in names:
         yield f"suite.algorithms: {names}, but the teammate is of {first.teammate_kind}"
     recorded, kept, learners, noise = made.streams_recorded, made.streams_kept, made.learners or 1, made.noise or {}
-    environments, episodes = made.ego and made.ego["environments"], noise.get("episodes")
+    environments: int | None = made.ego["environments"] if made.ego else None
+    episodes = noise.get("episodes")
     stream, learner = (max(entries, key=attrgetter(name)) for name in ("env_idx", "learner"))
     other = next((entry for entry in entries if entry.episodes != episodes), first)
     # Name, value, relation, bound, and the bound in words; a value or bound that is None is unknown.

@@ -123,7 +123,7 @@ def _parse(path: Path) -> dict[str, np.ndarray]:
             parts[name].append(np.array(values[name], dtype))
         for name, known in codes.items():
             parts[name].append(np.fromiter(map(known.__getitem__, values[name]), np.int32, len(block)))
-    arrays = {
+    arrays: dict[str, np.ndarray] = {
         name: np.concatenate([np.zeros(0, _NUMBERS.get(name, np.int32)), *blocks]) for name, blocks in parts.items()
     }
     for name, known in codes.items():

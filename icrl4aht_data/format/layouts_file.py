@@ -113,8 +113,10 @@ def write_layouts(root: Path, layouts: Iterable[Layout]) -> None:
 
 def _line(layout: Layout) -> LayoutLine:
     generated = re.fullmatch(r"(\w+)-(\d+)-(\d+)", layout.name, re.ASCII)
-    origin = (generated[1], int(generated[2]), int(generated[3])) if generated else (OTHER,)
-    return LayoutLine(layout.name, layout.rows, layout.recipes, layout.indicates_delivery, *origin)
+    own = layout.name, layout.rows, layout.recipes, layout.indicates_delivery
+    if generated is None:
+        return LayoutLine(*own, OTHER)
+    return LayoutLine(*own, generated[1], int(generated[2]), int(generated[3]))
 
 
 def check_layouts_known(names: Iterable[str], path: Path) -> None:

@@ -115,7 +115,9 @@ class Selection:
     ) -> None:
         self.origin, self.root, self._shards = location, location.folder, shards
         self.index, self.info = index, index.info
-        self.options, self.obs, self.channels, self.threads = options, options.obs, options.channels, options.threads
+        self.options, self.threads = options, options.threads
+        self.obs: Obs = options.obs
+        self.channels: Channels = options.channels
         self.ids = np.arange(len(index.entries)) if ids is None else ids
         self._source: HistorySource | None = None
         if self.obs == "state" and not self.has_states:

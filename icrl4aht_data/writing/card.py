@@ -350,8 +350,9 @@ def _test_headroom(layouts: Sequence[str]) -> list[list[str]]:
     cells, rows = read_headroom(HEADROOM_PROTOCOL), []
     for family in HEURISTICS:
         known = [cells.get((layout, family)) for layout in layouts]
-        gains = [found and (f"{found['oracle'] - found['stay']:z.1f}", has_headroom(found)) for found in known]
-        rows.append([family, *(f"**{gain[0]}**" if gain and gain[1] else gain[0] if gain else "" for gain in gains)])
+        gains = ["" if found is None else f"{found['oracle'] - found['stay']:z.1f}" for found in known]
+        bold = [found is not None and has_headroom(found) for found in known]
+        rows.append([family, *(f"**{gain}**" if mark else gain for gain, mark in zip(gains, bold, strict=True))])
     return rows
 
 

@@ -130,7 +130,8 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
     found = {}
     for key, rows in table.groupby(CELL_COLUMNS, sort=False):
         blocks = [rows[name].to_numpy().reshape(rows["task"].nunique(), -1) for name in BLOCKS]
-        found[ResultCell(*map(str, key))] = CellReturns(*blocks, tuple(rows["overlap"].iloc[0].split()))
+        names: list[Any] = list(map(str, key))
+        found[ResultCell(*names)] = CellReturns(*blocks, tuple(rows["overlap"].iloc[0].split()))
     return {cell: found[cell] for cell in in_order(found)}
 
 

@@ -9,12 +9,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array
 
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.cells import FACING_OF, GOAL, NOWHERE, PILE, PLATES, POT, WALL
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.tables import Tables, stack_padded
+from icrl4aht_data.overcooked.tables import Array, Tables, stack_padded
 
 FAR = 1000
 """Time to a cell that cannot be reached, or only when the teammate steps aside; stored as NOWHERE."""

@@ -101,7 +101,7 @@ SITUATION_ORACLE = Policy((), _begin_in_situation, _act_in_situation, "situation
 """The ego for any layouts; its parameters are `oracle_params` of these."""
 
 
-def _begin(blank: UInt8[Array, " S"]) -> OracleMemory:
+def _begin(blank: Any) -> OracleMemory:
     zero, no = jnp.int32(0), jnp.asarray(False)
     return OracleMemory(jnp.asarray(blank), zero + STAY, zero, zero, zero, no, no, no)
 

@@ -74,7 +74,7 @@ class Learner:
     @cached_property
     def view(self) -> CompactView:
         """View that converts state records to inputs of the network."""
-        return CompactView(self.config.widths.encoder, (self.env.layout,))
+        return CompactView(self.config.widths.encoder, (self.env.only_layout,))
 
     @cached_property
     def ppo(self) -> PPO:
@@ -84,7 +84,7 @@ class Learner:
     def init(self, key: Key[Array, ""]) -> LearnerState:
         """Return the state of an untrained ego before the first step."""
         params_key, _, running_key = jax.random.split(key, 3)
-        params = self.network.untrained(params_key, self.env.layout.channels)
+        params = self.network.untrained(params_key, self.env.only_layout.channels)
         env_keys = stream_keys(key, self.config.environments)
         carry = init_rollout(self.env, self.players(params, self.teammate.params), env_keys)
         optimizer = ppo_optimizer(self.config).init(params)

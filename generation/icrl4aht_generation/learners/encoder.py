@@ -226,7 +226,8 @@ class WindowEncoder(nn.Module):
         if isinstance(seen, WindowWords):
             x = jnp.asarray(_required(self.view).words.channels, self.dtype)
         else:
-            x = seen.reshape(*seen.shape[:-3], VISIBLE, seen.shape[-1]).astype(self.dtype)
+            obs: Any = seen
+            x = obs.reshape(*obs.shape[:-3], VISIBLE, obs.shape[-1]).astype(self.dtype)
         for width in self.pointwise:
             x = nn.relu(orthogonal_dense(width)(x))
         return x.at[-1].set(jnp.nan)[seen.ids] if isinstance(seen, WindowWords) else x
@@ -248,7 +249,8 @@ class FlatDense(nn.Module):
         if isinstance(seen, WindowEntries):
             x, rows = seen.values, VISIBLE * _required(self.view).channels
         else:
-            x = seen.reshape(*seen.shape[:-3], -1)
+            obs: Any = seen
+            x = obs.reshape(*obs.shape[:-3], -1)
             rows = x.shape[-1]
         kernel = self.param("kernel", self._initial_kernel, (rows, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))

@@ -179,7 +179,7 @@ def network_player(
         greedy: take the most probable action instead of drawing one; bool (), if compiled code decides it.
     """
     flat, shape = agent_slots.reshape(-1), agent_slots.shape
-    view = network.view or CompactView("paper", (env.layout,))
+    view = network.view or CompactView("paper", (env.only_layout,))
 
     def forward(params, hidden, seen, partner) -> tuple[Array, Array, Array]:
         one_step = jax.tree.map(lambda leaf: leaf[None], seen)

@@ -205,7 +205,7 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], ou
         policies += [build_teammate(layout, {"family": kind, "theta": theta}) for theta in thetas]
     distances = family_distances(hamming_distances(actions_on_common_states(layout, policies)), families)
     title = f"{layout.name}: mean Hamming distance of families"
-    _show_matrix(console, _distances_picture(out, layout.name), title, list(families), ("family",) * 2, distances)
+    _show_matrix(console, _distances_picture(out, layout.name), title, list(families), ("family", "family"), distances)
 
 
 def _cross_play_picture(out: Path, layout: str, algorithm: str) -> Path:

@@ -17,12 +17,14 @@ from icrl4aht_baselines.agents.egos import find_agent, with_view
 from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
+from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, RolloutState
 from icrl4aht_baselines.experiments import EXPERIMENTS, ExperimentPlan, run_experiment
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.report.cards import model_card
 from icrl4aht_baselines.report.results import note_results, read_run
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
+from icrl4aht_generation.env import EnvState
 from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task
@@ -80,13 +82,15 @@ def test_evaluation_on_an_untrained_layout(trained, tmp_path):
 def test_jax_egos_get_canonical_channels_on_every_layout(layout):
     """The policy returns its observation instead of an action."""
     shown = Policy((), lambda params, key: (), lambda params, memory, ego_input, key: (ego_input, memory), "ego_input")
-    (record,) = random_records(layout, 1, np.random.default_rng(4))
-    own = jnp.asarray(observe(layout, record, 0))
-    ego_input = EgoInput(own, 1, 2.0, 3, False)
-    seen, _ = jax.jit(with_view(shown, layout, "canonical").act, static_argnums=(0, 1))((), (), ego_input, 0)
-    np.testing.assert_array_equal(seen.obs, observe(layout, record, 0, canonical=True))
-    assert seen._replace(obs=0) == ego_input._replace(obs=0)
-    assert with_view(shown, layout, "own") is shown
+    (record,), key = random_records(layout, 1, np.random.default_rng(4)), jax.random.split(jax.random.key(0), 1)
+    zero = jnp.zeros(1, jnp.int32)
+    before = EgoInput(zero, zero + 1, jnp.array([2.0]), zero + 3, zero > 0)
+    state = RolloutState(EnvState(key, zero, zero, jnp.asarray(record[None])), (), before)
+    for channels in ("own", "canonical"):
+        rollout = EvaluationRollout(layout, with_view(shown, channels), [], PROTOCOLS["seeded"])
+        seen: Any = rollout.ego_actions((), state, key)[0]
+        np.testing.assert_array_equal(seen.obs[0], observe(layout, record, 0, canonical=channels == "canonical"))
+        assert seen._replace(obs=0) == before._replace(obs=0)
 
 
 def test_host_egos_get_canonical_channels():

@@ -190,7 +190,7 @@ def test_tasks_on_different_layouts_in_one_batch():
     np.testing.assert_array_equal(returns[1:], alone_returns[1:])
     np.testing.assert_array_equal(after.env.record[1:], alone_after.env.record[1:])
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a[:, 1:], b[:, 1:], atol=1e-5), found, expected)
-    assert (np.asarray(found.action[:, 0]) != np.asarray(expected.action[:, 0])).any()
+    assert (np.asarray(found.seen.obs[:, 0]) != np.asarray(expected.seen.obs[:, 0])).any()
 
 
 class TestGroups:

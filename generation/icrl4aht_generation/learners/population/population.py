@@ -192,7 +192,7 @@ class Population:
     @cached_property
     def view(self) -> CompactView:
         """View that converts state records to inputs of the network."""
-        return CompactView(self.config.widths.encoder, (self.env.layout,), agents=(EGO, TEAMMATE))
+        return CompactView(self.config.widths.encoder, (self.env.only_layout,), agents=(EGO, TEAMMATE))
 
     @cached_property
     def ppo(self) -> PPO:
@@ -215,7 +215,7 @@ class Population:
         """Return the state of untrained policies, each from a seed of its own, before the first step."""
         params_key, env_key, running_key = jax.random.split(key, 3)
         # By `map`, not by `vmap`, under which the orthogonal initializers deadlock on a CPU.
-        channels = self.env.layout.channels
+        channels = self.env.only_layout.channels
         seeds = jax.random.split(params_key, self.assignment.policies)
         params = jax.lax.map(lambda seed: self.network.untrained(seed, channels), seeds)
         carry = init_rollout(self.env, self._players(params), jax.random.split(env_key, self.assignment.envs))
