@@ -257,9 +257,9 @@ def parse_task(fields: Any) -> Task:
         UnknownNameError: for names that the benchmark does not know.
     """
     task = Task(**msgspec.structs.asdict(_convert(fields, _TaskFields, "")))
+    _check_recipes(task)
     check_membership(task.track, task.split, task.layout.name)
     _check_teammate(task.teammate)
-    _check_recipes(task)
     expected = task_id(task.track, task.split, task.layout_name, task.teammate, task.seed, task.recipes)
     if task.task_id != expected:
         raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")

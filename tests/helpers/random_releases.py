@@ -13,11 +13,11 @@ import numpy as np
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
-from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance
 from icrl4aht_data.format.schema import Entry, Kind
-from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
@@ -55,7 +55,7 @@ def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Ge
     }
 
 
-def make_tasks(layouts: list[str], teammates: int = 1) -> list[Task]:
+def make_tasks(layouts: list[str], teammates: int = 1, recipes: Sequence[Dish] | None = None) -> list[Task]:
     """Return tasks with heuristic teammates of unequal parameters, of the training split if the layout is in it."""
     return [
         make_task(
@@ -64,6 +64,7 @@ def make_tasks(layouts: list[str], teammates: int = 1) -> list[Task]:
             layout,
             {"kind": "heuristic", "family": "utility_greedy", "theta_id": t, "base_seed": 0, "theta": {"x": t}},
             seed,
+            recipes,
         )
         for seed, (layout, t) in enumerate((layout, t) for layout in layouts for t in range(teammates))
     ]
@@ -85,6 +86,7 @@ def random_release(
     shard_histories: int = 1024,
     experts: Sequence[ExpertLabels | None] = (),
     sources: Sequence[str] = (),
+    recipes: Sequence[Dish] | None = None,
     overwrite: bool = False,
 ) -> dict[int, dict[str, np.ndarray]]:
     """Write a release of random actions; returns the written arrays by history id.
@@ -95,12 +97,12 @@ def random_release(
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}
     tasks = []
-    for number, task in enumerate(make_tasks(list(layouts), teammates)):
+    for number, task in enumerate(make_tasks(list(layouts), teammates, recipes)):
         histories = []
         source, expert = sources[number] if sources else None, experts[number] if experts else None
         trained = 1 if source == "noise" else learners
         for learner, stream in itertools.product(range(trained), range(streams)):
-            arrays = random_history(get_layout(task.layout_name), episodes, length, rng)
+            arrays = random_history(task.layout, episodes, length, rng)
             if oracle:
                 same = source == "noise"
                 arrays["oracle_actions"] = arrays["expert_actions"] if same else rng.integers(0, 6, episodes * length)

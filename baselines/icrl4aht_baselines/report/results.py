@@ -129,9 +129,9 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
     """Return the returns of one agent under one protocol, cells in the paper's order."""
     found = {}
     for key, rows in table.groupby(CELL_COLUMNS, sort=False):
-        blocks = [rows[name].to_numpy().reshape(rows["task"].nunique(), -1) for name in BLOCKS]
-        names: list[Any] = list(map(str, key))
-        found[ResultCell(*names)] = CellReturns(*blocks, tuple(rows["overlap"].iloc[0].split()))
+        blocks = {name: rows[name].to_numpy().reshape(rows["task"].nunique(), -1) for name in BLOCKS}
+        overlaps = tuple(rows["overlap"].iloc[0].split())
+        found[ResultCell._make(map(str, key))] = CellReturns(**blocks, overlaps=overlaps)
     return {cell: found[cell] for cell in in_order(found)}
 
 

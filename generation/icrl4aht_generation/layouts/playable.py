@@ -56,7 +56,8 @@ def _delivered(
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
     egos = oracle_params(own), oracle_params([_exchanged(layout) for layout in own])
-    carry, earned = _begin(tables, egos, keys), np.zeros(len(own), bool)
+    starts = np.array([layout.agent_cells for layout in own], np.uint8)
+    carry, earned = _begin(tables, egos, keys, starts), np.zeros(len(own), bool)
     for _ in range(hundreds):
         carry, reward = _play(tables, egos, jnp.array(playing), carry)
         earned |= np.asarray(reward) >= DELIVERY_REWARD
@@ -81,9 +82,11 @@ def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) 
 
 
 @jax.jit
-def _begin(tables: Tables, egos: tuple[Any, Any], keys: Any) -> RolloutCarry:
+def _begin(tables: Tables, egos: tuple[Any, Any], keys: Any, starts: Any) -> RolloutCarry:
+    """Return the carry of episodes that begin at the maps' starts, where an agent that stays is in nobody's way."""
     env = Environment(tables)
-    return init_rollout(env, _players(env, egos, (True, True), len(keys)), keys)
+    carry = init_rollout(env, _players(env, egos, (True, True), len(keys)), keys)
+    return carry._replace(env=carry.env._replace(record=carry.env.record.at[:, :2].set(starts)))
 
 
 @jax.jit

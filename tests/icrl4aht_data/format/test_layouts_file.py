@@ -1,0 +1,166 @@
+"""Releases that carry layouts, and tasks that fix their dishes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.benchmark.tasks import make_task, parse_task, read_tasks, task_fields, write_tasks
+from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.errors import IndexFormatError, TaskFormatError, UnknownNameError
+from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.schema import FORMAT_VERSION, LAYOUTS_FILE, TASKS
+from icrl4aht_data.overcooked import layouts as known_layouts
+from icrl4aht_data.overcooked.layouts import Layout, add_layouts, get_layout
+from icrl4aht_data.overcooked.state import columns
+from tests.helpers.random_releases import make_tasks, random_release
+
+ROWS = ("WPWWW", "0A A1", "W   W", "WBWXW")
+MINE = Layout("mine-3-5", "mine-3-5", ROWS, ((0, 0, 1), (0, 1, 1)))
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch):
+    """Each test begins like a process that has not opened a release with layouts."""
+    monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+
+
+@pytest.fixture
+def root(tmp_path, fresh, monkeypatch) -> Path:
+    """Return a release with histories on a layout of its own and on a published one, unknown to this process."""
+    add_layouts([MINE])
+    random_release(tmp_path / "release", layouts=("coord_simple", "mine-3-5"), teammates=1, streams=2)
+    monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+    with pytest.raises(UnknownNameError):
+        get_layout("mine-3-5")
+    return tmp_path / "release"
+
+
+def rewritten(root: Path, lines: list[Any]) -> Path:
+    (root / LAYOUTS_FILE).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_manifest(root)
+    return root
+
+
+def stored(root: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (root / LAYOUTS_FILE).read_text().splitlines()]
+
+
+class TestRelease:
+    def test_layouts_come_with_it(self, root):
+        assert stored(root) == [
+            {
+                "name": "mine-3-5",
+                "map": list(ROWS),
+                "recipes": [[0, 0, 1], [0, 1, 1]],
+                "indicates_delivery": False,
+                "family": "mine",
+                "seed": 3,
+                "number": 5,
+            }
+        ]
+        ds = load_icrl4aht(root, obs="uint8", channels="canonical")
+        assert ds.info.format_version == FORMAT_VERSION
+        assert [layout.name for layout in ds.layouts] == ["coord_simple", "mine-3-5"]
+        assert ds.layouts[1].rows == ROWS and ds.layouts[1].recipes == MINE.recipes
+        batch = ds.ad(batch_size=4, length=20, seed=0)[0]
+        assert batch.obs.shape == (4, 20, 5, 5, 46)
+        assert verify_release(root, level="deep").ok
+
+    def test_filter_by_family(self, root):
+        ds = load_icrl4aht(root, layout_family="mine")
+        assert set(ds.column("layout")) == {"mine-3-5"} and len(ds) == 2
+        assert set(load_icrl4aht(root, layout_family="published").column("layout")) == {"coord_simple"}
+        assert len(load_icrl4aht(root, layout_family=["mine", "published"])) == 4
+        with pytest.raises(UnknownNameError, match=r"layout_family 'rooms'; valid: published, mine"):
+            load_icrl4aht(root, layout_family="rooms")
+
+    def test_a_dataset_brings_them_to_another_process(self, root, monkeypatch):
+        sent = pickle.dumps(load_icrl4aht(root))
+        monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+        ds = pickle.loads(sent)
+        assert ds[-1].obs.shape == (120, 5, 5, 35) and get_layout("mine-3-5").rows == ROWS
+
+    def test_without_layouts_of_its_own_it_has_no_file(self, tmp_path):
+        random_release(tmp_path / "plain", layouts=("coord_simple",), teammates=1, streams=1)
+        assert not (tmp_path / "plain" / LAYOUTS_FILE).exists()
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            (lambda lines: [], r"unknown layout .*'mine-3-5'"),
+            (lambda lines: lines * 2, "line 2: layout 'mine-3-5' is listed twice"),
+            (lambda lines: [lines[0] | {"name": "coord_simple"}], "layout 'coord_simple': differs from the layout"),
+            (lambda lines: [lines[0] | {"map": ["WPWWW", *ROWS[1:3], "WBWWW"]}], "its map has not a goal"),
+            (lambda lines: [lines[0] | {"map": ["WPWWW", *ROWS[1:3], "WWWXW"]}], "its map has not a pile of plates"),
+            (lambda lines: [lines[0] | {"map": ["W" * 5] * 48 + list(ROWS)}], "260 cells and 2 piled"),
+            (lambda lines: [lines[0] | {"map": ["WP2W3", *ROWS[1:]]}], "20 cells and 4 piled ingredient types"),
+            (lambda lines: [lines[0] | {"recipes": [[0, 0, 2]]}], r"recipes use ingredients \[2\]"),
+            (lambda lines: [lines[0] | {"recipes": []}], "recipes"),
+            (lambda lines: [lines[0] | {"colour": 1}], "colour"),
+            (lambda lines: [lines[0] | {"name": "mine\x1b[31m"}], "name"),
+        ],
+    )
+    def test_refused(self, root, change, message):
+        with pytest.raises(IndexFormatError, match=message):
+            load_icrl4aht(rewritten(root, change(stored(root))))
+
+    def test_one_name_for_two_maps(self, root, tmp_path):
+        load_icrl4aht(root)
+        other = [stored(root)[0] | {"map": ["WWPWW", *ROWS[1:]]}]
+        with pytest.raises(IndexFormatError, match="give it another name"):
+            load_icrl4aht(rewritten(root, other))
+
+
+class TestRecipesOfATask:
+    def test_they_replace_the_layouts(self, tmp_path):
+        (plain,), (task,) = make_tasks(["demo_wide"]), make_tasks(["demo_wide"], recipes=((0, 0, 1),))
+        assert task.task_id != plain.task_id and task.layout.recipes == ((0, 0, 1),)
+        assert plain.layout is get_layout("demo_wide") and task.layout is task.layout
+        assert task.teammate_key != plain.teammate_key
+        write_tasks(tmp_path / "tasks.jsonl", [plain, task])
+        assert read_tasks(tmp_path / "tasks.jsonl") == [plain, task]
+        assert "recipes" not in json.loads((tmp_path / "tasks.jsonl").read_text().splitlines()[0])
+
+    @pytest.mark.parametrize(
+        ("recipes", "message"),
+        [
+            ([], "expected different ones, at least one"),
+            ([[0, 0, 1], [0, 1, 0]], "expected different ones"),
+            ([[0, 0, 9]], r"recipes use ingredients \[9\] that have no pile"),
+            ([[0, 0]], "recipes"),
+            ("000", "recipes"),
+        ],
+    )
+    def test_refused(self, recipes, message):
+        (task,) = make_tasks(["demo_wide"])
+        with pytest.raises(TaskFormatError, match=message):
+            parse_task(task_fields(task) | {"recipes": recipes})
+
+    def test_made_with_impossible_ones(self):
+        (task,) = make_tasks(["demo_wide"])
+        with pytest.raises(TaskFormatError, match="no pile"):
+            make_task(task.track, task.split, "demo_wide", task.teammate, 0, [(0, 0, 7)])
+
+    def test_the_replay_expects_them(self, tmp_path):
+        root = tmp_path / "release"
+        random_release(root, layouts=("coord_simple",), teammates=1, streams=1, recipes=((0, 0, 1),))
+        ds = load_icrl4aht(root)
+        wanted = get_layout("coord_simple").recipe_item((0, 0, 1))
+        assert set(ds[0].state[:, columns(ds.layouts[0]).recipe]) == {wanted}
+        np.testing.assert_array_equal(ds[0].obs, load_icrl4aht(root, cache="stream")[0].obs)
+        assert ds.environment_parameters(0)["recipes"] == [[0, 0, 1]]
+        assert verify_release(root, level="deep").ok
+        (task,) = read_tasks(root / TASKS)
+        plain = dataclasses.replace(task, recipes=None)
+        write_tasks(root / TASKS, [plain])  # the same id: only the recipes of the histories tell
+        write_manifest(root)
+        with pytest.raises(TaskFormatError, match="does not match the task's content"):
+            read_tasks(root / TASKS)
