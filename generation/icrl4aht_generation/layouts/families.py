@@ -31,9 +31,9 @@ LAYOUT_SPLITS = {"train": 0.8, "validation": 0.1, "test": 0.1}
 def generate_layouts(family: str, seed: int, count: int, *, split: str | None = None) -> list[Layout]:
     """Return the first layouts of a family.
 
-    None equals a published layout or another one of the list, mirrored or rotated, and `check_solvable` accepts each. A
-    layout is a function of its family, seed and number, which its name tells: templates-0-17. With a smaller count the
-    result is the beginning of a longer one.
+    No two of them and none of the published layouts are equal, also when they are mirrored or rotated, and
+    `check_solvable` accepts each. A layout is a function of its family, seed and number, which make its name, such as
+    templates-0-17. With a smaller count the result is the beginning of a longer one.
 
     Args:
         family: "rearranged", "templates" or "rooms".

@@ -63,9 +63,9 @@ def select_histories(
 ) -> TaskHistories | LeftOutTask:
     """Choose the histories of a task that a release keeps.
 
-    A noise history is always kept, and of the streams of learners the best ones. With `profile.least_improvement`, on
-    layouts with headroom, only those streams are kept that improve by this, and tasks are left out with whose teammate
-    the ego does not matter. With `profile.least_rise`, so are tasks there whose kept histories rise by less.
+    A noise history is always kept; of the streams of learners, the best are kept. On layouts with headroom,
+    `profile.least_improvement` also drops the streams that improve by less, and the tasks whose teammate makes no
+    difference to the ego; `profile.least_rise` drops the tasks whose kept histories rise by less.
 
     Args:
         artefacts: folder of the finished artefacts.

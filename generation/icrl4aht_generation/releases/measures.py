@@ -108,7 +108,7 @@ def recorded_provenance(suite: Path) -> dict[str, Provenance]:
 def _measure(
     layout: Layout, tasks: Sequence[Task], suite: Path, headroom: Mapping[str, ReferenceEgos]
 ) -> list[TeammateFacts]:
-    """Measure teammates of one layout; how unlike the test they act, only of learned ones.
+    """Measure the returns with teammates of one layout, and the distances of learned ones to the test teammates.
 
     For heuristics outside the table, such as presets, the card says that the test has their family. Measuring their
     distances would take longer than a small rebuild.
