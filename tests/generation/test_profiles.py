@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,7 @@ from icrl4aht_generation.profiles import FOLDER, Profile, load_profile, profile_
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS
-from icrl4aht_data.benchmark.tasks import make_task, read_tasks, task_id, write_tasks
+from icrl4aht_data.benchmark.tasks import make_task, read_tasks, task_fields, task_id, write_tasks
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 
 VALID = """
@@ -298,12 +297,12 @@ def test_task_files_round_trip(tmp_path):
     write_tasks(path, tasks)
     assert read_tasks(path) == tasks
     lines = path.read_text(encoding="utf-8").splitlines()
-    assert [json.loads(line) for line in lines] == [asdict(task) for task in tasks]
+    assert [json.loads(line) for line in lines] == [task_fields(task) for task in tasks]
     assert list(json.loads(lines[0])) == ["task_id", "track", "split", "layout_name", "seed", "teammate"]
 
 
 def _lines() -> list[str]:
-    return [json.dumps(asdict(work.task)) for work in load_profile("mini").works()[:2]]
+    return [json.dumps(task_fields(work.task)) for work in load_profile("mini").works()[:2]]
 
 
 def _with(line: str, **fields) -> str:

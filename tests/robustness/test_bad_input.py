@@ -78,14 +78,14 @@ def test_no_release_here(tmp_path):
 @pytest.mark.parametrize(
     ("version", "error", "what_to_do"),
     [
-        (5, FormatTooNewError, "pip install -U icrl4aht-data"),
+        (6, FormatTooNewError, "pip install -U icrl4aht-data"),
         (1, FormatTooOldError, "fetch the release again"),
         (3, FormatTooOldError, "convert it to version 4 with `icrl4aht-data convert` of commit 71f723c"),
     ],
 )
 def test_other_format_versions(damaged, version, error, what_to_do):
     (damaged / "meta" / "info.json").write_text(json.dumps({"format_version": version, "renamed": 1}))
-    with pytest.raises(error, match=rf"info\.json: format version {version}, this package reads 4.*{what_to_do}"):
+    with pytest.raises(error, match=rf"info\.json: format version {version}, this package reads 4, 5.*{what_to_do}"):
         load(damaged)
 
 

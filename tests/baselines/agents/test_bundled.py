@@ -140,7 +140,7 @@ def test_the_package_bundles_models_that_play_and_have_cards():
             trained = read_trained(folder)
             for layout in {"teammate": ("demo_wide", "coord_ring"), "layout": ("asymm_right", "cramped_down")}[track]:
                 policy = find_agent(model.name).make(get_layout(layout))
-                assert policy.sees == "ego_input" and trained.channels == "canonical"
+                assert policy.sees == "canonical_input" and trained.channels == "canonical"
 
 
 def test_parameters_of_another_model_are_refused(run, tmp_path):
