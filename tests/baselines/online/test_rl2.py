@@ -101,7 +101,7 @@ def test_episodes_for_learning(trainer):
     player, state = trainer.players[0], trainer.init()
     tasks, key = state.tasks[0], jax.random.key(3)
     for number in range(3):  # unfinished tasks continue in the next episode
-        after, played, returns = player.episode(state.params, trainer._mates[0], tasks, jax.random.fold_in(key, number))
+        after, played, returns = player.compiled(state.params, player.mates, tasks, jax.random.fold_in(key, number))
         assert played.action.shape == (100, 8)
         np.testing.assert_array_equal(played.seen.prev_action[1:], played.action[:-1])
         np.testing.assert_allclose(played.reward.sum(axis=0) / PLAY_REWARD_SCALE, returns, rtol=1e-5)
