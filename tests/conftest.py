@@ -29,6 +29,9 @@ from tests.helpers.tiny import PAIR, TINY
 from tests.helpers.two_sources import two_source_release
 from tests.helpers.xla_flags import add_xla_flag, is_xla_flag
 
+COMPILATIONS: list[float] = []
+"""Seconds of each compilation of this process."""
+
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
     "jax_compilation_cache_dir": os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".cache" / "jax"),
@@ -54,11 +57,17 @@ def pytest_configure() -> None:
     os.environ.setdefault("JAX_PLATFORMS", "cpu")  # bits and tolerances are a CPU's, and workers share no GPU
     jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
     os.environ.setdefault("PJRT_NPROC", "1")  # what the profiles of the tests choose, before JAX is first used
+    jax.monitoring.register_event_duration_secs_listener(_count_compilation)
     for name, value in COMPILATION_CACHE.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)
     if "PYTEST_XDIST_WORKER" not in os.environ:
         _remove_unfinished_entries(Path(COMPILATION_CACHE["jax_compilation_cache_dir"]))
+
+
+def _count_compilation(event: str, seconds: float, **_: Any) -> None:
+    if event == "/jax/core/compile/backend_compile_duration":
+        COMPILATIONS.append(seconds)
 
 
 def _remove_unfinished_entries(folder: Path) -> None:
@@ -76,17 +85,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Report a worker's memory to the main process."""
+    """Report a worker's memory and compilations to the main process."""
     if hasattr(session.config, "workeroutput"):
         peak, now = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024, psutil.Process().memory_info().rss >> 20
-        session.config.workeroutput["memory"] = f"{peak} MB at most, {now} MB at the end"  # type: ignore[attr-defined]
+        session.config.workeroutput["used"] = (  # type: ignore[attr-defined]
+            f"{peak} MB at most, {now} MB at the end; {len(COMPILATIONS)} compilations in {sum(COMPILATIONS):.0f} s"
+        )
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node) -> None:
-    """Print the memory of a worker."""
+    """Print the memory and the compilations of a worker."""
     terminal = node.config.pluginmanager.get_plugin("terminalreporter")
-    terminal.write_line(f"\n{node.gateway.id}: {getattr(node, 'workeroutput', {}).get('memory')}")
+    terminal.write_line(f"\n{node.gateway.id}: {getattr(node, 'workeroutput', {}).get('used')}")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -85,7 +85,7 @@ def evaluate_command(
     training nor test. Split diverse has validation tasks with more kinds of teammates than the published training
     ranges.
     """
-    from icrl4aht_baselines.evaluate.evaluator import evaluate
+    from icrl4aht_baselines.evaluate.evaluator import count_programs, evaluate
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
     from icrl4aht_baselines.report.page import summary_lines
     from icrl4aht_baselines.report.results import note_results, read_run
@@ -109,7 +109,8 @@ def evaluate_command(
     note_results(out, ego.run, chosen)
     for line in summary_lines([read_run(out)]):
         click.echo(line)
-    click.echo(f"{counted_noun(len(chosen), 'result')} in {out}; `icrl4aht-data report {out}` shows them")
+    programs = counted_noun(count_programs(ego.make, chosen), "compiled program")
+    click.echo(f"{counted_noun(len(chosen), 'result')} of {programs} in {out}; `icrl4aht-data report {out}` shows them")
 
 
 @click.command("report")

@@ -8,7 +8,7 @@ evaluated in the same batch or process.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -127,11 +127,8 @@ def _evaluate_groups(
     played: Callable[[int], None],
 ) -> Iterator[list[Result]]:
     """Yield the results of groups of tasks that share a compiled program, in the order in which they finish."""
-    layouts = list(dict.fromkeys(task.layout for task in tasks))
-    egos = {layout: make_ego(layout) for layout in layouts}
-    groups: dict[Any, list[Task]] = defaultdict(list)
-    for task in tasks:
-        groups[_program(task, egos[task.layout], make_ego)].append(task)
+    egos = {layout: make_ego(layout) for layout in dict.fromkeys(task.layout for task in tasks)}
+    groups = _by_program(make_ego, egos, tasks)
 
     def run(group: list[Task]) -> list[Result]:
         prepared = prepare_rollout(oracle if make_ego is oracle else egos.__getitem__, group, protocol, seeds, suite)
@@ -143,11 +140,26 @@ def _evaluate_groups(
     stopped = Event()
     with ThreadPoolExecutor(1 if outside else min(4, usable_cores())) as pool:
         try:
-            for future in as_completed([pool.submit(run, group) for group in groups.values()]):
+            for future in as_completed([pool.submit(run, group) for group in groups]):
                 yield future.result()
         finally:
             stopped.set()
             pool.shutdown(cancel_futures=True)
+
+
+def count_programs(make_ego: MakeEgo, tasks: Sequence[Task]) -> int:
+    """Return the number of programs that an evaluation of these tasks compiles, see `evaluate`."""
+    return len(_by_program(make_ego, {task.layout: make_ego(task.layout) for task in tasks}, tasks))
+
+
+def _by_program(
+    make_ego: MakeEgo, egos: Mapping[Layout, Policy | HostPolicy], tasks: Sequence[Task]
+) -> list[list[Task]]:
+    """Return the groups of tasks that one compiled program plays."""
+    groups: dict[Any, list[Task]] = defaultdict(list)
+    for task in tasks:
+        groups[_program(task, egos[task.layout], make_ego)].append(task)
+    return list(groups.values())
 
 
 def _program(task: Task, ego: Policy | HostPolicy, make_ego: MakeEgo) -> tuple[Any, ...]:
