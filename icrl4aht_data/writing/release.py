@@ -148,6 +148,8 @@ def write_release(
     ids = [task.task.task_id for task in new]
     if not new or len(set(ids)) < len(ids):
         raise OptionError(f"expected at least one task and none twice, found {ids}")
+    if empty := [task.task.task_id for task in new if task.streams < 1]:
+        raise OptionError(f"task {empty[0]}: announced without histories; expected at least one, or leave the task out")
     named = [task.task.task_id for task in new if isinstance(task.task, NamedTask)]
     if named and (kind in KINDS or len(named) < len(ids)):
         raise OptionError(

@@ -139,6 +139,7 @@ def fail() -> list[NewHistory]:
         (lambda a: a | {"dones": np.roll(a["dones"], 1)}, 2, "10 steps"),
         (lambda a: a, 1, "2 histories, but 1 were announced"),
         (lambda a: a, 3, "2 histories, but 3 were announced"),
+        (lambda a: a, 0, "announced without histories"),
     ],
 )
 def test_invalid_histories_are_refused_without_leftovers(tmp_path, spoil, streams, message):
