@@ -203,6 +203,6 @@ def _index_of(values: np.ndarray) -> np.ndarray:
     return lookup
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)  # up to 4 MB each; a release may have hundreds of layouts, of which a batch mixes many
 def _renderer(layout: Layout, dtype: str, canonical: bool) -> _Renderer:
     return _Renderer(layout, dtype, canonical)
