@@ -171,6 +171,7 @@ def test_a_first_step_is_not_mirrored(layers):
     np.testing.assert_allclose(np.asarray(both[1][0]), np.asarray(alone), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_tasks_on_different_layouts_in_one_batch():
     """Each task plays and learns as it does in a batch of its own layout."""
     layouts = rearranged_layouts(LAYOUT, 3)[::2]

@@ -40,6 +40,7 @@ def test_unseen_layouts_are_not_training_layouts():
     assert {(one.name, one.recipes) for one in new} == {(layout.name, layout.recipes)}
 
 
+@pytest.mark.slow
 def test_returns_equal_playing_each_layout_alone():
     found = unseen_returns({"oracle": AGENTS["oracle"]}, TASKS, 3, 2)["oracle"]["cramped_up", "H1"]
     assert found.shape == (3, 2)
