@@ -225,8 +225,7 @@ def read_info(root: Path) -> ReleaseInfo:
     if version > FORMAT_VERSION:
         raise FormatTooNewError(f"{found}: `pip install -U {PACKAGE}`")
     raise FormatTooOldError(
-        f"{found}: fetch the release again, or convert it to version 4 with `icrl4aht-data convert` of "
-        f"{_CONVERTER}"
+        f"{found}: fetch the release again, or convert it to version 4 with `icrl4aht-data convert` of {_CONVERTER}"
     )
 
 

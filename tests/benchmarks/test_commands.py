@@ -42,8 +42,10 @@ def test_collection(built):
 def test_environments(monkeypatch):
     monkeypatch.setattr(bench_env, "STEPS", 8)
     lines = run(bench_env, "--layout cramped_up --environments 2 --rounds 1")
-    assert [line["written"] for line in lines] == ["uint8", "state", "float32"]
-    for line in lines:
+    assert [line["part"] for line in lines] == ["layouts", "steps", "steps", "steps"]
+    assert [line["written"] for line in lines[1:]] == ["uint8", "state", "float32"]
+    check_ratio(lines[0], "jaxmarl")
+    for line in lines[1:]:
         check_ratio(line, "jaxmarl")
 
 

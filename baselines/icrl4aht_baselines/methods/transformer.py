@@ -97,7 +97,8 @@ class TransformerBlock(nn.Module):
 
     def _project(self, x_BxNxD: Array, positions_N: Int[Array, " N"]) -> list[Float[Array, "B N H Dh"]]:
         """Return queries, keys and values."""
-        qkv_BxNx3xHxDh = self.qkv(self.attention_norm(x_BxNxD)).reshape(*x_BxNxD.shape[:2], 3, self.heads, -1)
+        *batch, width = x_BxNxD.shape  # not -1 for Dh, which a context without steps leaves open
+        qkv_BxNx3xHxDh = self.qkv(self.attention_norm(x_BxNxD)).reshape(*batch, 3, self.heads, width // self.heads)
         q, k, v = (qkv_BxNx3xHxDh[:, :, i] for i in range(3))
         return [_rotate(q, positions_N), _rotate(k, positions_N), v] if self.rope else [q, k, v]
 

@@ -25,8 +25,10 @@ from icrl4aht_generation.policy import Situation
 _AT_ONCE = 512  # layouts of one batch; every batch runs the same program
 _STEPS = 100
 
-_TRIES = ((1, (True, True)), (4, (True, True)), (4, (True, False)), (4, (False, True)))
-"""Hundreds of steps, and which of the two agents play while the other stays: most layouts need only the first."""
+_BOTH, _EGO, _TEAMMATE = (True, True), (True, False), (False, True)
+_TRIES = ((1, _BOTH, True), (4, _BOTH, True), (4, _EGO, True), (4, _TEAMMATE, True), (4, _BOTH, False))
+"""Hundreds of steps, which of the two agents play while the other stays, and whether they begin on the map's starts
+rather than on drawn cells. Most layouts need only the first."""
 
 
 def layouts_delivered(
@@ -39,25 +41,30 @@ def layouts_delivered(
         checked: called with the number of layouts whose answer was found since the last call, for progress.
     """
     found, largest = np.zeros(len(layouts), bool), largest_layouts(layouts)
-    for hundreds, playing in _TRIES:
+    for hundreds, playing, at_starts in _TRIES:
         missing = np.flatnonzero(~found)
         for start in range(0, len(missing), _AT_ONCE):
             numbers = missing[start : start + _AT_ONCE]
-            found[numbers] = _delivered(layouts, largest, numbers, hundreds, playing)
+            found[numbers] = _delivered(layouts, largest, numbers, hundreds, playing, at_starts)
             checked(int(found[numbers].sum()))
     checked(int((~found).sum()))
     return found
 
 
 def _delivered(
-    layouts: Sequence[Layout], largest: list[Layout], numbers: np.ndarray, hundreds: int, playing: tuple[bool, bool]
+    layouts: Sequence[Layout],
+    largest: list[Layout],
+    numbers: np.ndarray,
+    hundreds: int,
+    playing: tuple[bool, bool],
+    at_starts: bool,
 ) -> Bool[np.ndarray, " numbers"]:
     # The largest layouts give all batches equal shapes, and short batches repeat layouts, so that all share a program.
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
     egos = oracle_params(own), oracle_params([_exchanged(layout) for layout in own])
     starts = np.array([layout.agent_cells for layout in own], np.uint8)
-    carry, earned = _begin(tables, egos, keys, starts), np.zeros(len(own), bool)
+    carry, earned = _begin(tables, egos, keys, starts, at_starts), np.zeros(len(own), bool)
     for _ in range(hundreds):
         carry, reward = _play(tables, egos, jnp.array(playing), carry)
         earned |= np.asarray(reward) >= DELIVERY_REWARD
@@ -82,11 +89,13 @@ def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) 
 
 
 @jax.jit
-def _begin(tables: Tables, egos: tuple[Any, Any], keys: Any, starts: Any) -> RolloutCarry:
-    """Return the carry of episodes that begin at the maps' starts, where an agent that stays is in nobody's way."""
+def _begin(tables: Tables, egos: tuple[Any, Any], keys: Any, starts: Any, at_starts: Any) -> RolloutCarry:
+    """Return the carry of episodes on drawn cells or on the maps' starts, where an agent is in nobody's way."""
     env = Environment(tables)
     carry = init_rollout(env, _players(env, egos, (True, True), len(keys)), keys)
-    return carry._replace(env=carry.env._replace(record=carry.env.record.at[:, :2].set(starts)))
+    record = carry.env.record
+    moved = jnp.where(at_starts, record.at[:, :2].set(starts), record)
+    return carry._replace(env=carry.env._replace(record=moved))
 
 
 @jax.jit

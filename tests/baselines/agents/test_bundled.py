@@ -28,6 +28,7 @@ from PIL import Image
 
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
 from icrl4aht_data.overcooked.layouts import get_layout
 
 MODEL = ModelOptions(layers=1, width=8, heads=2, encoder="mlp")
@@ -195,6 +196,6 @@ class TestPlayMode:
 
 
 def _ego_input(rng: np.random.Generator, done: bool) -> EgoInput:
-    obs = rng.integers(0, 2, (5, 5, 45), dtype=np.uint8)
+    obs = rng.integers(0, 2, (5, 5, len(CANONICAL_CHANNELS)), dtype=np.uint8)
     numbers = np.int32(rng.integers(6)), np.float32(rng.choice([0, 20])), np.int32(rng.integers(6))
     return EgoInput(obs, *numbers, np.bool_(done))

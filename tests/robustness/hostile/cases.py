@@ -200,8 +200,9 @@ _deep_theta = lines(lambda values: values[0]["teammate"]["theta"].update(x=neste
 _deep_files = {f"deep: {name}": replaced(name, deep(500)) for name in (INFO, PROVENANCE)}
 add_hashed("levels deep", _deep_files | {"tasks: deep theta": _deep_theta})
 _endless_line = content(b"a" * 2**24)
-add_hashed("a line has more than", {"index: one endless line": replaced(HISTORIES, _endless_line)})
-add_hashed("expected at most", {"tasks: one endless line": replaced(TASKS, _endless_line)})
+add_hashed(
+    "expected at most", {f"{of}: one endless line": replaced(file, _endless_line) for of, file in _endless.items()}
+)
 add_hashed("of length <= 512", {"index: wide names": lines(many_names)})
 add_hashed("line 1: ", {"index: a surrogate": entry(task_id="\ud800")})
 add_hashed("line 1: JSON is malformed", {"index: not a number": entry(score=float("nan"))})
@@ -327,8 +328,9 @@ _SHARED: dict[str, dict[str, ChangeFile]] = {
         "link to a file": link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
         "link to a pipe": link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
     },
-    "in other files": {"external storage": actions(external), "virtual": actions(virtual)},
-    r"filters \[32004\]": {"a plugin's filter": actions(filtered)},
+    "a local heap": {"external storage": actions(external)},
+    "in other files": {"virtual": actions(virtual)},
+    r"found \(\[32004\]": {"a plugin's filter": actions(filtered)},
     "expected numbers": {
         "texts": typed(h5py.string_dtype()),
         "references": typed(h5py.ref_dtype),
