@@ -65,9 +65,9 @@ def pytest_configure() -> None:
         _remove_unfinished_entries(Path(COMPILATION_CACHE["jax_compilation_cache_dir"]))
 
 
-def _count_compilation(event: str, seconds: float, **_: Any) -> None:
+def _count_compilation(event: str, duration_secs: float, **kwargs: Any) -> None:
     if event == "/jax/core/compile/backend_compile_duration":
-        COMPILATIONS.append(seconds)
+        COMPILATIONS.append(duration_secs)
 
 
 def _remove_unfinished_entries(folder: Path) -> None:

@@ -97,8 +97,7 @@ class TransformerBlock(nn.Module):
 
     def _project(self, x_BxNxD: Array, positions_N: Int[Array, " N"]) -> list[Float[Array, "B N H Dh"]]:
         """Return queries, keys and values."""
-        *batch, width = x_BxNxD.shape  # not -1 for Dh, which a context without steps leaves open
-        qkv_BxNx3xHxDh = self.qkv(self.attention_norm(x_BxNxD)).reshape(*batch, 3, self.heads, width // self.heads)
+        qkv_BxNx3xHxDh = self.qkv(self.attention_norm(x_BxNxD)).reshape(*x_BxNxD.shape[:2], 3, self.heads, -1)
         q, k, v = (qkv_BxNx3xHxDh[:, :, i] for i in range(3))
         return [_rotate(q, positions_N), _rotate(k, positions_N), v] if self.rope else [q, k, v]
 
@@ -172,8 +171,10 @@ class Transformer(nn.Module):
         return TransformerMemory((AttentionCache(zeros, zeros),) * self.layers, jnp.int32(0))
 
     def start_after(self, x_NxD: Float[Array, "N D"], context: int) -> TransformerMemory:
-        """Return a memory for `context` tokens that holds a sequence; N is not 0."""
+        """Return a memory for `context` tokens that holds a sequence."""
         length, caches = len(x_NxD), []
+        if not length:  # DPT without a context
+            return self.start(context)
         for block in self.blocks:
             x_NxD, cache = block.cache(x_NxD, jnp.arange(length))
             behind = ((0, 0), (0, context - length), (0, 0))

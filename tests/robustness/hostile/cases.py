@@ -200,9 +200,8 @@ _deep_theta = lines(lambda values: values[0]["teammate"]["theta"].update(x=neste
 _deep_files = {f"deep: {name}": replaced(name, deep(500)) for name in (INFO, PROVENANCE)}
 add_hashed("levels deep", _deep_files | {"tasks: deep theta": _deep_theta})
 _endless_line = content(b"a" * 2**24)
-add_hashed(
-    "expected at most", {f"{of}: one endless line": replaced(file, _endless_line) for of, file in _endless.items()}
-)
+for _of, _file in {"index": HISTORIES, "tasks": TASKS}.items():
+    add_hashed("expected at most", {f"{_of}: one endless line": replaced(_file, _endless_line)})
 add_hashed("of length <= 512", {"index: wide names": lines(many_names)})
 add_hashed("line 1: ", {"index: a surrogate": entry(task_id="\ud800")})
 add_hashed("line 1: JSON is malformed", {"index: not a number": entry(score=float("nan"))})
