@@ -327,9 +327,8 @@ _SHARED: dict[str, dict[str, ChangeFile]] = {
         "link to a file": link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
         "link to a pipe": link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
     },
-    "a local heap": {"external storage": actions(external)},
-    "in other files": {"virtual": actions(virtual)},
-    r"found \(\[32004\]": {"a plugin's filter": actions(filtered)},
+    "in other files|a local heap": {"external storage": actions(external), "virtual": actions(virtual)},
+    r"filters \[32004\]|found \(\[32004\]": {"a plugin's filter": actions(filtered)},
     "expected numbers": {
         "texts": typed(h5py.string_dtype()),
         "references": typed(h5py.ref_dtype),
