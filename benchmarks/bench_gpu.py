@@ -45,7 +45,7 @@ from icrl4aht_baselines.methods.options import SIZES, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_baselines.training.trainer import Trainer
-from icrl4aht_generation.collection.options import request_determinism
+from icrl4aht_generation.jobs.options import request_determinism
 from icrl4aht_generation.learners.config import EncoderKind, PPOConfig, Widths
 from icrl4aht_generation.learners.ego import Learner, compiled_update
 from icrl4aht_generation.learners.resume import xla_threads

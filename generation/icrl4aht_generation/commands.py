@@ -30,9 +30,8 @@ from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, check_output
-from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars
-from icrl4aht_generation.collection.options import CollectOptions, allocate_gpu_memory_on_demand, request_determinism
+from icrl4aht_generation.jobs.command_line import queue_options, read_queue_options
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
 from icrl4aht_generation.layouts.sheet import save_sheet
 from icrl4aht_generation.learners.config import PPOConfig, Widths
@@ -97,7 +96,7 @@ _threads_option = click.option(
     show_default="the profile's tasks",
 )
 @click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
-@topic("Machines", _threads_option, dataclass_options(CollectOptions, "collect"))
+@topic("Machines", _threads_option, queue_options)
 @topic("Egos, instead of the profile's values", _ego_options)
 def generate(
     profile_name: str,
@@ -108,14 +107,14 @@ def generate(
     task_file: Path | None,
     bundle: bool,
     xla_threads: int | None,
-    collect: dict[str, Any],
+    queue: dict[str, Any],
     ego: dict[str, Any],
 ) -> None:
     """Rebuild a release, or resume a rebuild.
 
     Trains the learned teammates of a profile, then collects its tasks into OUT/artefacts: egos that learn (source ppo),
     noise histories (source noise), or both. Packs the release OUT/lite or OUT/full. Unfinished work resumes from its
-    last save. This process trains the teammates, the executor collects the tasks. Tasks that fail are listed in
+    last save. The executor trains the teammates and collects the tasks. Tasks that fail are listed in
     OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1. Hyper-parameters of the egos
     replace those of the profile.
     """
@@ -124,12 +123,7 @@ def generate(
 
     if bundle and "lite" not in kind:
         raise click.UsageError("--bundle needs --kind lite")
-    options = replace_options(CollectOptions(), collect)
-    if options.executor == "local" and (options.address or options.workers):
-        raise click.UsageError("--address and --workers need --executor ray")
-    request_determinism()
-    if options.executor == "ray":
-        allocate_gpu_memory_on_demand()
+    options = read_queue_options(queue)
     profile = _profile_with_threads(profile_name, xla_threads).with_ego(ego)
     tasks = read_tasks(task_file) if task_file else None
     sources = recorded_sources(task_file.parent.parent) if task_file else {}
@@ -370,13 +364,15 @@ _algorithms_option = click.option(
 )
 
 
-@click.command(epilog=examples("icrl4aht-data teammates --profile mini --layout cramped_up --algorithm fcp"))
+@click.command(
+    cls=TopicCommand, epilog=examples("icrl4aht-data teammates --profile mini --layout cramped_up --algorithm fcp")
+)
 @_profile_option
 @_layouts_option("the profile's")
 @_algorithms_option
 @click.option("--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Write the populations here.")
 @click.option("--seed", type=SEED, default=0, help="Seed of their training.")
-@_threads_option
+@topic("Machines", _threads_option, queue_options)
 def teammates(
     profile_name: str,
     layouts: tuple[str, ...],
@@ -384,6 +380,7 @@ def teammates(
     suite: Path,
     seed: int,
     xla_threads: int | None,
+    queue: dict[str, Any],
 ) -> None:
     """Train populations of teammates.
 
@@ -393,7 +390,7 @@ def teammates(
     """
     from icrl4aht_generation.populations.build import build_suite
 
-    request_determinism()
+    options = read_queue_options(queue)
     profile = _profile_with_threads(profile_name, xla_threads)
     if layouts:
         wanted = dict.fromkeys((get_layout(name).name for name in layouts), algorithms)
@@ -402,7 +399,7 @@ def teammates(
         wanted = {layout: [name for name in names if name in algorithms] for layout, names in available.items()}
         if not any(wanted.values()):
             raise OptionError(f"profile {profile.name} has no teammates by {', '.join(algorithms)}: name a --layout")
-    build_suite(profile, suite, wanted, seed, console)
+    build_suite(profile, suite, wanted, seed, console, options)
 
 
 @click.command()

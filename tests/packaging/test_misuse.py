@@ -9,8 +9,8 @@ from pathlib import Path
 
 import click
 import pytest
-from icrl4aht_generation.collection import ray_executor as on_ray
-from icrl4aht_generation.collection.options import CollectOptions
+from icrl4aht_generation.jobs import ray_executor as on_ray
+from icrl4aht_generation.jobs.options import QueueOptions
 
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli, run
@@ -63,7 +63,7 @@ release build a b --out c | unexpected extra argument
 upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
 generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, small, smoke.
 generate --out g --seed -1 | -1 is not in the range 0<=x<=4294967295
-generate --out g --workers 2 | --address and --workers need --executor ray
+generate --out g --address there:1 | --address needs --executor ray
 research speed --layout x | unknown layout 'x'; valid: coord_simple,
 teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
 train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline, rl2.
@@ -179,7 +179,7 @@ def test_bugs_are_raised(monkeypatch):
 def test_unreachable_ray_is_reported():
     with (
         pytest.raises(OptionError, match=r"Ray at 127\.0\.0\.1:1 cannot be reached: .*; check the address"),
-        on_ray._connected(CollectOptions("ray", "127.0.0.1:1")),
+        on_ray._connected(QueueOptions("ray", "127.0.0.1:1")),
     ):
         pass
 

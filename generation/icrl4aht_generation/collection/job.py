@@ -1,28 +1,18 @@
-"""What the executors of a collection share: jobs, their outcomes, the log of failures, and the progress."""
+"""The tasks of a rebuild as jobs of a queue."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
 
-from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.utils.files import NO_ROOM, atomic_write, process_lock, read_text
 from icrl4aht_generation.collection.noise import is_noise_finished, run_noise
-from icrl4aht_generation.collection.task import UpdateCallback, run_task
-from icrl4aht_generation.collection.task_folder import is_task_finished
-from icrl4aht_generation.learners.resume import BusyError
+from icrl4aht_generation.collection.task import run_task
+from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing
+from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
-
-FAILED = "failed.jsonl"
-"""File name of the log of failed units of work and their errors; its `task_id` is the name of the artefact."""
-
-
-class CollectionError(Icrl4ahtError):
-    """Error: some tasks have no finished artefact."""
 
 
 def _functions(source: str) -> tuple[Callable[..., bool], Callable[..., bool]]:
@@ -31,126 +21,67 @@ def _functions(source: str) -> tuple[Callable[..., bool], Callable[..., bool]]:
 
 
 @dataclass(frozen=True)
-class TaskOutcome:
-    """Result of a unit of work.
+class CollectionJob:
+    """The job that makes the artefact of one unit of work.
 
     Attributes:
         work: the unit.
-        status: "done", now or before; "busy", another collector works on it; "failed".
-        attempts: how often it was tried.
-        error: type and message of the last error.
-        trace: its traceback.
+        profile: its profile.
+        artefacts: folder of all artefacts.
+        suite: folder of the learned teammates, if the tasks have any.
     """
 
     work: Work
-    status: Literal["done", "busy", "failed"]
-    attempts: int = 1
-    error: str = ""
-    trace: str = ""
-
-
-@dataclass(frozen=True)
-class CollectionJob:
-    """Collects single units of work; it is called in this process or in a worker's.
-
-    Attributes:
-        profile: the profile of all tasks.
-        artefacts: folder of all artefacts.
-        suite: folder of the learned teammates, if the tasks have any.
-        wait: whether to wait for other collectors instead of reporting "busy".
-    """
-
     profile: Profile
     artefacts: Path
-    suite: Path | None
-    wait: bool
-
-    def folder(self, work: Work) -> Path:
-        """Return the folder of the artefact."""
-        return self.artefacts / work.name
-
-    def is_finished(self, work: Work) -> bool:
-        """Return whether the artefact is complete and unchanged."""
-        return _functions(work.source)[1](self.folder(work), work, self.profile)
-
-    def __call__(self, work: Work, on_update: UpdateCallback = lambda update, metrics: None) -> Literal["done", "busy"]:
-        try:
-            run, _ = _functions(work.source)
-            run(work, self.profile, self.folder(work), on_update, suite=self.suite, wait=self.wait)
-        except BusyError:
-            return "busy"
-        return "done"
-
-
-class FailureLog:
-    """One line per failed task that still has no artefact. Collectors may share the file.
-
-    On a full disk, changes are kept in memory until a later write succeeds.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._waiting: dict[str, dict[str, Any] | None] = {}  # name -> its new line, or None to remove it
+    suite: Path | None = None
 
     @property
-    def is_written(self) -> bool:
-        """Whether all changes have been written to the disk."""
-        return not self._waiting
+    def name(self) -> str:
+        """Name of the artefact."""
+        return self.work.name
 
-    def add(self, outcome: TaskOutcome) -> None:
-        """Add a task's line, or replace the one of an earlier attempt."""
-        name, details = outcome.work.name, {"attempts": outcome.attempts, "error": outcome.error}
-        self._change({name: {"task_id": name, **details, "traceback": outcome.trace}})
+    @property
+    def label(self) -> str:
+        """Layout, teammate, source and learner."""
+        learner = f", learner {self.work.learner}" if self.work.learner else ""
+        source = "" if self.work.source == "ppo" else f", {self.work.source}"
+        return f"{self.work.task.layout.name} with {self.work.task.teammate_kind}{source}{learner}"
 
-    def forget(self, names: Iterable[str]) -> None:
-        """Remove the lines of tasks that are finished."""
-        self._change(dict.fromkeys(names))
+    @property
+    def folder(self) -> Path:
+        """Folder of the artefact."""
+        return self.artefacts / self.work.name
 
-    def _change(self, changes: dict[str, dict[str, Any] | None]) -> None:
-        self._waiting |= changes
-        try:
-            with process_lock(self.path.with_name(f".{self.path.name}.lock")):
-                found = [json.loads(x) for x in read_text(self.path).splitlines()] if self.path.exists() else []
-                before = {line["task_id"]: line for line in found}
-                after = {name: line for name, line in (before | self._waiting).items() if line}
-                if not after:
-                    self.path.unlink(missing_ok=True)
-                elif after != before:
-                    with atomic_write(self.path) as partial:
-                        partial.write_text("".join(json.dumps(x) + "\n" for x in after.values()), encoding="utf-8")
-            self._waiting.clear()
-        except OSError as error:
-            if error.errno not in NO_ROOM:
-                raise
+    @cached_property
+    def updates(self) -> int:
+        """Updates of the ego, or of the noise."""
+        return self.profile.updates(self.work)
 
+    @property
+    def xla_threads(self) -> int | None:
+        """Threads of the profile."""
+        return self.profile.xla_threads
 
-class TaskBoard:
-    """Progress display that sums the reports of single tasks.
+    def is_finished(self) -> bool:
+        """Return whether the artefact is complete and unchanged."""
+        return _functions(self.work.source)[1](self.folder, self.work, self.profile)
 
-    Args:
-        show: function of `progress_bars`.
-        updates: name of each task's artefact -> number of its updates.
-    """
+    def progress(self) -> tuple[int, float] | None:
+        """Return what the artefact's timing states, see `jobs.job.Job`."""
+        timing = last_timing(self.folder)
+        return (int(timing["update"]) + 1, timing["steps_per_second"]) if timing else None
 
-    def __init__(self, show: Callable[..., None], updates: Mapping[str, int]) -> None:
-        self._show_bar, self._updates = show, dict(updates)
-        self._ended: set[str] = set()
-        self._running: dict[str, tuple[int, float]] = {}
-        self._show()
+    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
+        """Make the artefact, see `jobs.job.Job`."""
 
-    def show_running(self, name: str, updates: int, steps_per_second: float) -> None:
-        """Show the number of updates that a running task has done."""
-        self._running[name] = updates, steps_per_second
-        self._show()
+        def on_metrics(update: int, metrics: dict[str, float]) -> None:
+            on_update(update + 1, metrics["steps_per_second"])
 
-    def show_ended(self, name: str) -> None:
-        """Show that a task is finished or has failed."""
-        self._running.pop(name, None)
-        self._ended.add(name)
-        self._show()
+        run, _ = _functions(self.work.source)
+        run(self.work, self.profile, self.folder, on_metrics, suite=self.suite, wait=wait)
 
-    def _show(self) -> None:
-        updates = sum(self._updates[name] for name in self._ended) + sum(done for done, _ in self._running.values())
-        speed = sum(speed for _, speed in self._running.values())
-        note = f"{len(self._ended)}/{len(self._updates)} tasks" + (f", {speed:,.0f} steps/s" if speed else "")
-        self._show_bar("all tasks", updates, sum(self._updates.values()), note)
+    def finished_text(self) -> str:
+        """Return the text on the finished artefact."""
+        progress = self.progress()
+        return f"finished at {progress[1]:,.0f} steps/s" if progress else "finished"

@@ -13,12 +13,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -36,7 +34,7 @@ from icrl4aht_generation.collection.record import HistoryArrays, array_shapes, r
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
-from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, xla_threads
+from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, last_line, xla_threads
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
 
@@ -262,9 +260,6 @@ class ArtefactWriter:
         del self._histories
 
 
-def last_timing(folder: Path) -> dict[str, float] | None:
+def last_timing(folder: Path) -> dict[str, Any] | None:
     """Return the last line of an artefact's timing, finished or not; None if there is none yet."""
-    for path in (partial_folder(folder) / TIMING, folder / TIMING):
-        with suppress(OSError, ValueError, IndexError):
-            return json.loads(path.read_text(encoding="utf-8").splitlines()[-1])
-    return None
+    return last_line(partial_folder(folder) / TIMING) or last_line(folder / TIMING)

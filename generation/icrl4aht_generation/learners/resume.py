@@ -84,6 +84,13 @@ def software_versions() -> dict[str, str | int | None]:
     }
 
 
+def last_line(path: Path) -> dict[str, Any] | None:
+    """Return the last complete line of a log of JSON lines, perhaps still written; None if there is none."""
+    with suppress(OSError, ValueError, IndexError):
+        return json.loads(path.read_text(encoding="utf-8").splitlines()[-1])
+    return None
+
+
 def differing_settings(found: Mapping[str, Any], expected: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Settings that differ, by dotted name: (found, expected), None for a missing one. Tuples equal lists."""
     one, other = _flat(json.loads(json.dumps(found))), _flat(json.loads(json.dumps(expected)))

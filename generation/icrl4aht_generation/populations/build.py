@@ -22,18 +22,18 @@ from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import check_output
-from icrl4aht_data.utils.progress import progress_bars
-from icrl4aht_generation.learners.resume import BusyError
+from icrl4aht_generation.jobs.options import QueueOptions
+from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.plotting import plot_matrix
 from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR
 from icrl4aht_generation.populations.diversity import actions_on_common_states, family_distances, hamming_distances
 from icrl4aht_generation.populations.select import TeammateSelection, select_teammates, write_manifests
 from icrl4aht_generation.populations.train import (
+    PopulationJob,
     PopulationRun,
     is_trained,
     play_matrix,
     suite_checkpoints,
-    train_population,
 )
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.teammates.instances import published_thetas
@@ -47,6 +47,7 @@ def build_suite(
     algorithms: Mapping[str, Sequence[str]],
     seed: int,
     console: Console,
+    options: QueueOptions | None = None,
 ) -> list[TeammateSelection]:
     """Train what is unfinished, then write manifests of tasks with the teammates of every finished population.
 
@@ -58,11 +59,13 @@ def build_suite(
         algorithms: layout -> algorithms.
         seed: seed of the suite.
         console: where progress is printed.
+        options: how populations are trained.
 
     Returns:
         The selected teammates of each population in `algorithms`.
 
     Raises:
+        FailedJobsError: if a population could not be trained.
         OptionError: if matplotlib is not installed.
     """
     check_can_draw()  # fail before the long training, not after it
@@ -70,10 +73,10 @@ def build_suite(
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)
     config = profile.teammates
-    todo = population_runs(profile, algorithms, seed)
-    wanted = [(run.layout.name, run.algorithm) for run in todo]
-    for wait in (False, True):
-        todo = [run for run in todo if not _train(run, suite / run.layout.name / run.algorithm, wait, console)]
+    runs = population_runs(profile, algorithms, seed)
+    jobs = [PopulationJob(run, suite, profile.xla_threads) for run in runs]
+    run_jobs(jobs, suite, console, options or QueueOptions(), PopulationJob.finished_text)
+    wanted = [(run.layout.name, run.algorithm) for run in runs]
     selections = [
         select_teammates(suite, name, algorithm, config.train, config.heldout, seed)
         for name in training_layouts()
@@ -110,32 +113,6 @@ def population_runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], s
 def training_layouts() -> list[str]:
     """Return the layouts of all training tasks."""
     return list(dict.fromkeys(name for track in TRACKS for name in track_layouts(track, "train")))
-
-
-def _train(run: PopulationRun, folder: Path, wait: bool, console: Console) -> bool:
-    """Return whether the population is finished now; False if another process trains it."""
-    label = f"{run.algorithm} on {run.layout.name}"
-    last: dict[str, float] = {}
-    with progress_bars(unit="updates") as show:
-        show(label, 0, run.updates, "compiling")
-
-        def on_update(update: int, updates: int, metrics: dict[str, float]) -> None:
-            last.update(metrics)
-            note = f"{metrics['steps_per_second']:,.0f} steps/s, self-play {last.get('self_play', 0.0):.1f}"
-            show(label, update, updates, note)
-
-        try:
-            if not train_population(run, folder, on_update, wait=wait):
-                console.print(f"{label}: finished before")
-                return True
-        except BusyError:
-            console.print(f"{label}: another process is training it")
-            return False
-    console.print(
-        f"{label}: {last['step']:,} steps a member at {last['steps_per_second']:,.0f} steps/s (all environments), "
-        f"last self-play return {last.get('self_play', 0.0):.1f} (400 steps)"
-    )
-    return True
 
 
 def report_diversity(

@@ -29,6 +29,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
 from icrl4aht_generation.env import Environment
+from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.checkpoint import (
     POLICY_CARD,
     POLICY_CHECKPOINTS,
@@ -46,10 +47,12 @@ from icrl4aht_generation.learners.population.lbrdiv import LBRDiv
 from icrl4aht_generation.learners.population.population import Population, PopulationState
 from icrl4aht_generation.learners.resume import (
     METRICS,
+    TIMING,
     RunLog,
     SaveInterval,
     StateFile,
     differing_settings,
+    last_line,
     run_lock,
     software_versions,
 )
@@ -196,6 +199,65 @@ def train_population(
             return False
         _PopulationTraining(run, folder, on_update, save_seconds).train()
         return True
+
+
+@dataclass(frozen=True)
+class PopulationJob:
+    """The training of a population as a job of a queue, see `jobs.job.Job`.
+
+    Attributes:
+        population: the population.
+        suite: folder of the suite.
+        xla_threads: threads of XLA on a CPU; None for all cores.
+    """
+
+    population: PopulationRun
+    suite: Path
+    xla_threads: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Layout and algorithm, the population's folder in the suite."""
+        return f"{self.population.layout.name}/{self.population.algorithm}"
+
+    @property
+    def label(self) -> str:
+        """Algorithm and layout."""
+        return f"{self.population.algorithm} on {self.population.layout.name}"
+
+    @property
+    def updates(self) -> int:
+        """Updates of all stages."""
+        return self.population.updates
+
+    def is_finished(self) -> bool:
+        """Return whether the population is complete and unchanged."""
+        return is_population_finished(self.suite / self.name, self.population)
+
+    def progress(self) -> tuple[int, float] | None:
+        """Return what the population's timing states."""
+        timing = last_line(self.suite / self.name / TIMING)
+        if timing is None:
+            return None
+        return timing["stage"] * self.population.config.updates + timing["update"] + 1, timing["steps_per_second"]
+
+    def run(self, on_update: OnUpdate, wait: bool) -> None:
+        """Train the population."""
+
+        def on_metrics(update: int, updates: int, metrics: dict[str, float]) -> None:
+            on_update(update, metrics["steps_per_second"])
+
+        train_population(self.population, self.suite / self.name, on_metrics, wait=wait)
+
+    def finished_text(self) -> str:
+        """Return the text on the finished population: steps, speed and the last return in self-play."""
+        folder = self.suite / self.name
+        metrics, progress = last_line(folder / METRICS) or {}, self.progress()
+        speed = f" at {progress[1]:,.0f} steps/s (all environments)" if progress else ""
+        return (
+            f"{metrics.get('step', 0):,} steps a member{speed}, last self-play return "
+            f"{metrics.get('self_play', 0.0):.1f} (400 steps)"
+        )
 
 
 class _PopulationTraining:

@@ -18,9 +18,10 @@ from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.writing.card import facts as release_facts
 from icrl4aht_data.writing.card import teammate_name
 from icrl4aht_data.writing.statistics import print_learning, print_statistics
-from icrl4aht_generation.collection.job import FAILED, CollectionError
-from icrl4aht_generation.collection.options import CollectOptions
-from icrl4aht_generation.collection.run import collect_tasks
+from icrl4aht_generation.collection.job import CollectionJob
+from icrl4aht_generation.jobs.job import FAILED, FailedJobsError
+from icrl4aht_generation.jobs.options import QueueOptions
+from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.populations.build import build_suite
 from icrl4aht_generation.populations.headroom import learned_headroom
 from icrl4aht_generation.populations.select import THRESHOLD, make_tasks
@@ -40,7 +41,7 @@ def build_releases(
     out: Path,
     kinds: Sequence[Kind],
     console: Console,
-    options: CollectOptions | None = None,
+    options: QueueOptions | None = None,
     suite: Path | None = None,
     seed: int = 0,
     tasks: Sequence[Task] | None = None,
@@ -53,7 +54,7 @@ def build_releases(
         out: folder of the rebuild; tasks are collected under out/artefacts.
         kinds: kinds of releases.
         console: where progress is printed.
-        options: how tasks are collected.
+        options: how populations are trained and tasks collected.
         suite: folder of the learned teammates: a suite, by default out/suite, or with `tasks` also the folder
             TEAMMATES of a release.
         seed: seed of the suite.
@@ -64,21 +65,23 @@ def build_releases(
         The release folders.
 
     Raises:
-        CollectionError: if a task could not be collected; nothing is packed then.
+        FailedJobsError: if a task could not be collected; nothing is packed then.
         OptionError: if `out` has files that no rebuild makes, if something but a release of this profile is at
             out/<kind>, or if matplotlib is not installed.
     """
     check_can_draw()  # fail before the long training, not after it
     for kind in kinds:
         check_release_folder(out / kind, profile)
+    options = options or QueueOptions()
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
     names = {"artefacts", SUITE, FAILED, f".{FAILED}.lock", _PACKING_LOCK, *KINDS, *(f".{kind}.old" for kind in KINDS)}
     check_own_folder(out, names | ({suite.name} if suite.parent == out else set()), "a rebuild")
     if tasks is None:
-        works, headroom, left_out = train_teammates(profile, suite, seed, console)
+        works, headroom, left_out = train_teammates(profile, suite, seed, console, options)
     else:
         works, headroom, left_out = profile.works_of(tasks, sources or {}), {}, []
-    collect_tasks(works, profile, out, console, options or CollectOptions(), suite)
+    jobs = [CollectionJob(work, profile, out / "artefacts", suite) for work in works]
+    run_jobs(jobs, out, console, options, CollectionJob.finished_text)
     tasks = list({work.task.task_id: work.task for work in works}.values())
     artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
     with process_lock(out / _PACKING_LOCK):  # another collector on this folder packs the same releases
@@ -104,7 +107,7 @@ def build_releases(
 
 
 def train_teammates(
-    profile: Profile, suite: Path, seed: int, console: Console
+    profile: Profile, suite: Path, seed: int, console: Console, options: QueueOptions
 ) -> tuple[list[Work], dict[str, ReferenceEgos], list[LeftOutTask]]:
     """Return the units of work of a profile, for which its learned teammates are trained first.
 
@@ -113,11 +116,11 @@ def train_teammates(
         it does not.
 
     Raises:
-        CollectionError: if there is no task, because no teammate is good enough.
+        FailedJobsError: if there is no task, because no teammate is good enough.
     """
     if not profile.algorithms:
         return profile.works(), {}, []
-    selections = build_suite(profile, suite, profile.algorithms, seed, console)
+    selections = build_suite(profile, suite, profile.algorithms, seed, console, options)
     learned = make_tasks(suite, selections, "train")
     headroom = learned_headroom(learned, suite)
     of_teammate = {task.teammate_key: headroom[task.task_id] for task in learned}
@@ -132,13 +135,13 @@ def train_teammates(
             task, name = work.task, teammate_name(work.task)
             left_out.append(LeftOutTask(task.task_id, task.layout.name, name, work.source, 0, 0, None, None, reason))
     if not works and left_out:
-        raise CollectionError(
+        raise FailedJobsError(
             f"{suite}: the ego matters with none of the learned teammates: train others, or add drawn heuristics "
             f"([tasks.sampled]) to profile {profile.name}"
         )
     if not works:
         names = dict.fromkeys(chain(*profile.algorithms.values()))
-        raise CollectionError(
+        raise FailedJobsError(
             f"{suite}: no checkpoint of {', '.join(names)} exceeds the return of {THRESHOLD:g} that a "
             f"teammate needs: raise teammates.total_steps in profile {profile.name}"
         )

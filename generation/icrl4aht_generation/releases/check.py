@@ -12,8 +12,8 @@ import numpy as np
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_generation.collection.job import FAILED
 from icrl4aht_generation.collection.task_folder import FILTER_CURVES, LABELLER_RETURNS, METADATA
+from icrl4aht_generation.jobs.job import FAILED
 from icrl4aht_generation.learners.resume import TIMING
 from icrl4aht_generation.populations.train import POPULATION
 

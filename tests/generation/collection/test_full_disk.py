@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from icrl4aht_generation.collection import job
-from icrl4aht_generation.collection.job import FailureLog, TaskOutcome
 from icrl4aht_generation.collection.record import array_shapes
 from icrl4aht_generation.collection.task import run_task
 from icrl4aht_generation.collection.task_folder import LEARNER, ArtefactWriter, DiskFullError, partial_folder
+from icrl4aht_generation.jobs import job
+from icrl4aht_generation.jobs.job import FailureLog, JobOutcome
 from icrl4aht_generation.learners.resume import StateFile
 from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_generation.profiles.work import Work
@@ -84,7 +84,7 @@ def test_failures_wait_for_room(task, tmp_path, monkeypatch):
     def full(path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    log, outcome = FailureLog(tmp_path / "failed.jsonl"), TaskOutcome(task[0], "failed", 1, "DiskFullError: no room")
+    log, outcome = FailureLog(tmp_path / "failed.jsonl"), JobOutcome(task[0], "failed", 1, "DiskFullError: no room")
     with monkeypatch.context() as patch:
         patch.setattr(job, "atomic_write", full)
         log.add(outcome)

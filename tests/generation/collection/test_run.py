@@ -14,10 +14,10 @@ from types import SimpleNamespace
 import psutil
 import pytest
 from icrl4aht_generation.collection import job
-from icrl4aht_generation.collection.job import CollectionError, TaskBoard
-from icrl4aht_generation.collection.options import CollectOptions
-from icrl4aht_generation.collection.run import collect_tasks
 from icrl4aht_generation.collection.task_folder import LEARNER, partial_folder
+from icrl4aht_generation.jobs.job import FailedJobsError, JobBoard, run_job
+from icrl4aht_generation.jobs.options import QueueOptions
+from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.learners.resume import BusyError, run_lock
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.check import compare_rebuilds
@@ -40,11 +40,12 @@ def failures(out: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def collect(tasks, out: Path, **options) -> str:
+def collect(tasks, out: Path, console: Console | None = None, **options) -> str:
     """Collect the tasks and return the printed output."""
-    output = StringIO()
-    collect_tasks(tasks[0], tasks[1], out, Console(file=output, width=200), CollectOptions(**options))
-    return output.getvalue()
+    console = console or Console(file=StringIO(), width=500)
+    jobs = [CollectionJob(work, tasks[1], out / "artefacts") for work in tasks[0]]
+    run_jobs(jobs, out, console, QueueOptions(**options), CollectionJob.finished_text)
+    return console.file.getvalue()  # type: ignore[attr-defined]
 
 
 def failing(monkeypatch, *errors: Exception | None) -> list[int]:
@@ -64,7 +65,7 @@ def failing(monkeypatch, *errors: Exception | None) -> list[int]:
 
 def test_a_failing_task_is_reported_and_others_finish(tasks, tmp_path, monkeypatch):
     calls = failing(monkeypatch, ZeroDivisionError("no steps"))
-    with pytest.raises(CollectionError, match=r"1 of 2 tasks have no artefact: .*_s0_.*failed\.jsonl has the reasons"):
+    with pytest.raises(FailedJobsError, match=r"1 of 2 jobs are unfinished: .*_s0_.*failed\.jsonl has the reasons"):
         collect(tasks, tmp_path)
     assert calls == [0, 1]
     (line,) = failures(tmp_path)
@@ -80,7 +81,7 @@ def test_retries(tasks, tmp_path, monkeypatch):
     collect(tasks, tmp_path, retries=2)
     assert calls == [0, 0, 0, 1]
     calls = failing(monkeypatch, *[OSError("always")] * 3)
-    with pytest.raises(CollectionError):
+    with pytest.raises(FailedJobsError):
         collect(tasks, tmp_path, retries=2)
     assert calls == [0, 0, 0, 1]
     assert [line["attempts"] for line in failures(tmp_path)] == [3]
@@ -88,7 +89,7 @@ def test_retries(tasks, tmp_path, monkeypatch):
 
 def test_fail_fast(tasks, tmp_path, monkeypatch):
     calls = failing(monkeypatch, OSError("first"))
-    with pytest.raises(CollectionError, match=r"failed\.jsonl: the first failure: OSError: first"):
+    with pytest.raises(FailedJobsError, match=r"failed\.jsonl: the first failure: OSError: first"):
         collect(tasks, tmp_path, fail_fast=True)
     assert calls == [0]
     assert len(failures(tmp_path)) == 1
@@ -103,7 +104,7 @@ def test_an_interrupt_is_no_failure(tasks, tmp_path, monkeypatch):
 
 def test_tasks_of_another_collector_come_last(tasks, tmp_path, monkeypatch):
     calls = failing(monkeypatch, BusyError("busy"))
-    assert "another collector works on it" in collect(tasks, tmp_path)
+    assert "another process works on it" in collect(tasks, tmp_path)
     assert calls == [0, 1, 0]
 
 
@@ -113,22 +114,22 @@ def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
     folder = tmp_path / "artefacts" / work.name
     folder.parent.mkdir()
     with run_lock(folder):
-        assert job.CollectionJob(profile, folder.parent, None, wait=False)(work) == "busy"
+        assert run_job(CollectionJob(work, profile, folder.parent), wait=False) == "busy"
         shutil.copytree(pair / "artefacts" / work.name, folder)
     before = (folder / "metadata.json").stat().st_mtime_ns
-    assert job.CollectionJob(profile, folder.parent, None, wait=True)(work) == "done"
+    assert run_job(CollectionJob(work, profile, folder.parent), wait=True) == "done"
     assert (folder / "metadata.json").stat().st_mtime_ns == before
 
 
 def test_a_full_disk_ends_one_task(tasks, pair, tmp_path, monkeypatch):
     """The first task fails on the full disk, the second finishes, and the failure is logged."""
-    works, profile = tasks
+    works, _ = tasks
     second = tmp_path / "artefacts" / works[1].name
     shutil.copytree(pair / "artefacts" / second.name, partial_folder(second))
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=10**9, used=10**9, free=5_000))
     output = StringIO()
-    with pytest.raises(CollectionError, match=f"1 of 2 tasks have no artefact: {works[0].name}; "):
-        collect_tasks(works, profile, tmp_path, Console(file=output, width=500), CollectOptions())
+    with pytest.raises(FailedJobsError, match=f"1 of 2 jobs are unfinished: {works[0].name}; "):
+        collect(tasks, tmp_path, Console(file=output, width=500))
     assert second.is_dir()
     (failure,) = failures(tmp_path)
     assert failure["error"].startswith("DiskFullError: ")
@@ -149,7 +150,7 @@ def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(built, pair, tmp_pa
     with pytest.raises(SystemExit, match="1"):
         main()
     captured = capsys.readouterr()
-    assert "1 of 2 tasks have no artefact" in captured.err
+    assert "1 of 2 jobs are unfinished" in captured.err
     assert "finished before" in captured.out
     assert not (tmp_path / "lite").exists()
 
@@ -193,7 +194,7 @@ def test_ray_with_two_workers(built, pair, tmp_path):
         time.sleep(0.2)
     output, errors = process.communicate()
     assert process.returncode == 1, output + errors
-    assert "1 of 2 tasks have no artefact" in errors
+    assert "1 of 2 jobs are unfinished" in errors
     (line,) = failures(tmp_path)
     assert line["attempts"] == 2
     assert line["error"].startswith("OptionError: ")
@@ -217,13 +218,13 @@ def test_workers_of_a_cluster_are_its_own(tasks, tmp_path):
 
 def test_the_board_counts_tasks_updates_and_speed():
     shown = []
-    board = TaskBoard(lambda *bar: shown.append(bar), {"one": 10, "two": 10})
+    board = JobBoard(lambda *bar: shown.append(bar), {"one": 10, "two": 10})
     board.show_running("one", 5, 1_000.0)
     board.show_running("two", 2, 500.0)
     board.show_ended("one")
     assert shown == [
-        ("all tasks", 0, 20, "0/2 tasks"),
-        ("all tasks", 5, 20, "0/2 tasks, 1,000 steps/s"),
-        ("all tasks", 7, 20, "0/2 tasks, 1,500 steps/s"),
-        ("all tasks", 12, 20, "1/2 tasks, 500 steps/s"),
+        ("all jobs", 0, 20, "0/2 jobs"),
+        ("all jobs", 5, 20, "0/2 jobs, 1,000 steps/s"),
+        ("all jobs", 7, 20, "0/2 jobs, 1,500 steps/s"),
+        ("all jobs", 12, 20, "1/2 jobs, 500 steps/s"),
     ]

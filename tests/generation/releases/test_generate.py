@@ -14,8 +14,8 @@ import pytest
 from click.testing import CliRunner
 from icrl4aht_generation.collection import job
 from icrl4aht_generation.collection import task_folder as artefacts
-from icrl4aht_generation.collection.job import CollectionError
 from icrl4aht_generation.collection.task_folder import METADATA
+from icrl4aht_generation.jobs.job import FailedJobsError
 from icrl4aht_generation.learners.checkpoint import load_policy
 from icrl4aht_generation.populations import select
 from icrl4aht_generation.populations import train as suite
@@ -233,7 +233,7 @@ def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
 def test_all_teammates_below_the_threshold(learned, tmp_path):
     shutil.copytree(learned / "suite", tmp_path / "suite")
     with pytest.raises(
-        CollectionError, match=r"no checkpoint of fcp, brdiv exceeds the return of 20 .*raise teammates"
+        FailedJobsError, match=r"no checkpoint of fcp, brdiv exceeds the return of 20 .*raise teammates"
     ):
         build.build_releases(
             load_profile(str(learned.parent / "learned.toml")), tmp_path, ["lite"], Console(file=StringIO())

@@ -1,4 +1,4 @@
-"""Tasks on Ray, which schedules them, assigns a GPU to each if there are any, and retries failed ones.
+"""Jobs on Ray, which schedules them, assigns a GPU to each if there are any, and retries failed ones.
 
 A Ray that is started here listens on 127.0.0.1 only, without dashboard and usage reports.
 """
@@ -15,64 +15,52 @@ from rich.text import Text
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.install_hints import install_command
-from icrl4aht_generation.collection.job import CollectionJob, TaskBoard, TaskOutcome
-from icrl4aht_generation.collection.options import CollectOptions, request_determinism
-from icrl4aht_generation.collection.task_folder import last_timing
-from icrl4aht_generation.learners.resume import limit_xla_threads
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.jobs.job import Job, JobBoard, JobOutcome, run_in_worker
+from icrl4aht_generation.jobs.options import QueueOptions
 
 _POLL_SECONDS = 1.0
 _CONNECT_SECONDS = 10.0
-_OBJECT_STORE_BYTES = 100 * 2**20  # tasks go to the workers, artefacts to the disk; nothing large passes through Ray
+_OBJECT_STORE_BYTES = 100 * 2**20  # jobs go to the workers, results to the disk; nothing large passes through Ray
 
 
-def run_on_ray(
-    job: CollectionJob, tasks: Sequence[Work], board: TaskBoard, options: CollectOptions
-) -> Generator[TaskOutcome]:
-    """Run tasks as workers are free. The artefacts' folder must be shared by all machines.
+def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
+    """Run jobs as workers are free. Their folders must be shared by all machines.
 
     Raises:
         OptionError: if Ray is not installed, or cannot be reached.
     """
-    if not tasks:
+    if not jobs:
         return
     with _connected(options) as ray:
         accelerated = ray.cluster_resources().get("GPU", 0) > 0
         remote = ray.remote(
             num_cpus=1,
             num_gpus=int(accelerated),
-            max_calls=1,  # a process for each task, so that its memory is released
+            max_calls=1,  # a process for each job, so that its memory is released
             max_retries=options.retries,
             retry_exceptions=True,
-        )(_work)
-        pending = {remote.remote(job, work): work for work in tasks}
+        )(run_in_worker)
+        pending = {remote.remote(job, wait): job for job in jobs}
         try:
             while pending:
                 ready, _ = ray.wait(list(pending), num_returns=1, timeout=_POLL_SECONDS)
                 for reference in ready:
                     yield _outcome(ray, reference, pending.pop(reference), options)
-                for work in pending.values():  # workers report through their artefacts' timing files
-                    if timing := last_timing(job.folder(work)):
-                        board.show_running(work.name, int(timing["update"]) + 1, timing["steps_per_second"])
+                for job in pending.values():  # workers report through their folders
+                    if progress := job.progress():
+                        board.show_running(job.name, *progress)
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)
 
 
-def _work(job: CollectionJob, work: Work) -> str:
-    request_determinism()
-    if job.profile.xla_threads:
-        limit_xla_threads(job.profile.xla_threads)
-    return job(work)
-
-
-def _outcome(ray: Any, reference: Any, work: Work, options: CollectOptions) -> TaskOutcome:
+def _outcome(ray: Any, reference: Any, job: Job, options: QueueOptions) -> JobOutcome:
     try:
-        return TaskOutcome(work, ray.get(reference))
-    except ray.exceptions.RayError as error:  # raised by the task, or the worker died
+        return JobOutcome(job, ray.get(reference))
+    except ray.exceptions.RayError as error:  # raised by the job, or the worker died
         cause = getattr(error, "cause", error)
         trace = Text.from_ansi(str(error)).plain
-        return TaskOutcome(work, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
+        return JobOutcome(job, "failed", options.retries + 1, f"{type(cause).__name__}: {cause}", trace)
 
 
 def _check_reachable(address: str | None) -> None:
@@ -89,7 +77,7 @@ def _check_reachable(address: str | None) -> None:
 
 
 @contextmanager
-def _connected(options: CollectOptions) -> Iterator[Any]:
+def _connected(options: QueueOptions) -> Iterator[Any]:
     if options.address is None:
         # Read when Ray is first imported. The name is misleading: this makes Ray's servers listen on the loopback
         # address.

@@ -1,4 +1,4 @@
-"""Options of a collection, and environment variables that JAX reads when it is first used."""
+"""Options of a queue, and environment variables that JAX reads when it is first used."""
 
 from __future__ import annotations
 
@@ -10,18 +10,16 @@ from icrl4aht_data.utils.options import Count, Natural, Option, check_options
 
 
 @dataclass(frozen=True)
-class CollectOptions:
-    """Options of collecting tasks; the help text of each field describes it."""
+class QueueOptions:
+    """Options of running jobs; the help text of each field describes it."""
 
-    executor: Annotated[Literal["local", "ray"], Option("Run one task at a time here, or use Ray.")] = "local"
+    executor: Annotated[Literal["local", "ray"], Option("Run jobs in processes of this machine, or use Ray.")] = "local"
     address: Annotated[
         str | None, Option("HOST:PORT of a running Ray cluster.", default="start a local Ray for this command")
     ] = None
-    workers: Annotated[
-        Count | None, Option("Tasks at a time on the local Ray.", default="one per GPU, or per core")
-    ] = None
-    retries: Annotated[Natural, Option("Further attempts for a task that failed.")] = 0
-    fail_fast: Annotated[bool, Option("Start no task after one has failed.")] = False
+    workers: Annotated[Count | None, Option("Jobs at a time.", default="one; with Ray one per GPU, or per core")] = None
+    retries: Annotated[Natural, Option("Further attempts for a job that failed.")] = 0
+    fail_fast: Annotated[bool, Option("Start no job after one has failed.")] = False
 
     def __post_init__(self) -> None:
         check_options(self)

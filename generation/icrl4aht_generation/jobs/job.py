@@ -1,0 +1,178 @@
+"""What the executors of a queue share: jobs, their outcomes, the log of failures, and the progress."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.utils.files import NO_ROOM, atomic_write, process_lock, read_text
+from icrl4aht_generation.jobs.options import request_determinism
+from icrl4aht_generation.learners.resume import BusyError, limit_xla_threads
+
+FAILED = "failed.jsonl"
+"""File name of the log of failed jobs and their errors; its `task_id` is the name of the job."""
+
+OnUpdate = Callable[[int, float], None]
+"""Called with (updates done, steps per second)."""
+
+
+class FailedJobsError(Icrl4ahtError):
+    """Error: some jobs have not finished."""
+
+
+class Job(Protocol):
+    """A long computation that makes one folder and resumes by itself. Jobs are pickled for workers."""
+
+    @property
+    def name(self) -> str:
+        """Name that no other job of the queue has."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """Name for people."""
+        ...
+
+    @property
+    def updates(self) -> int:
+        """Number of its updates, the unit of its progress."""
+        ...
+
+    @property
+    def xla_threads(self) -> int | None:
+        """Threads of XLA on a CPU, on which its bits depend; None for all cores."""
+        ...
+
+    def is_finished(self) -> bool:
+        """Return whether its result is complete and unchanged."""
+        ...
+
+    def progress(self) -> tuple[int, float] | None:
+        """Return updates done and steps per second as its folder states them, perhaps written by another process."""
+        ...
+
+    def run(self, on_update: OnUpdate, wait: bool) -> None:
+        """Do it, or what is left of it.
+
+        Args:
+            on_update: called after each update.
+            wait: whether to wait for another process that does it.
+
+        Raises:
+            BusyError: if another process does it and this one is not to wait.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class JobOutcome:
+    """Outcome of a job.
+
+    Attributes:
+        job: the job.
+        status: "done", now or before; "busy", another process does it; "failed".
+        attempts: how often it was tried.
+        error: type and message of the last error.
+        trace: its traceback.
+    """
+
+    job: Job
+    status: Literal["done", "busy", "failed"]
+    attempts: int = 1
+    error: str = ""
+    trace: str = ""
+
+
+def run_job(job: Job, wait: bool, on_update: OnUpdate = lambda update, speed: None) -> Literal["done", "busy"]:
+    """Run a job in this process."""
+    try:
+        job.run(on_update, wait)
+    except BusyError:
+        return "busy"
+    return "done"
+
+
+def run_in_worker(job: Job, wait: bool) -> Literal["done", "busy"]:
+    """Run a job in a process of its own, which has not used JAX before."""
+    request_determinism()
+    if job.xla_threads:
+        limit_xla_threads(job.xla_threads)
+    return run_job(job, wait)
+
+
+class FailureLog:
+    """One line per failed job that still has no result. Several processes may share the file.
+
+    On a full disk, changes are kept in memory until a later write succeeds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._waiting: dict[str, dict[str, Any] | None] = {}  # name -> its new line, or None to remove it
+
+    @property
+    def is_written(self) -> bool:
+        """Whether all changes have been written to the disk."""
+        return not self._waiting
+
+    def add(self, outcome: JobOutcome) -> None:
+        """Add a job's line, or replace the one of an earlier attempt."""
+        name, details = outcome.job.name, {"attempts": outcome.attempts, "error": outcome.error}
+        self._change({name: {"task_id": name, **details, "traceback": outcome.trace}})
+
+    def forget(self, names: Iterable[str]) -> None:
+        """Remove the lines of jobs that are finished."""
+        self._change(dict.fromkeys(names))
+
+    def _change(self, changes: dict[str, dict[str, Any] | None]) -> None:
+        self._waiting |= changes
+        try:
+            with process_lock(self.path.with_name(f".{self.path.name}.lock")):
+                found = [json.loads(x) for x in read_text(self.path).splitlines()] if self.path.exists() else []
+                before = {line["task_id"]: line for line in found}
+                after = {name: line for name, line in (before | self._waiting).items() if line}
+                if not after:
+                    self.path.unlink(missing_ok=True)
+                elif after != before:
+                    with atomic_write(self.path) as partial:
+                        partial.write_text("".join(json.dumps(x) + "\n" for x in after.values()), encoding="utf-8")
+            self._waiting.clear()
+        except OSError as error:
+            if error.errno not in NO_ROOM:
+                raise
+
+
+class JobBoard:
+    """Progress display that sums the reports of single jobs.
+
+    Args:
+        show: function of `progress_bars`.
+        updates: name of each job -> number of its updates.
+    """
+
+    def __init__(self, show: Callable[..., None], updates: Mapping[str, int]) -> None:
+        self._show_bar, self._updates = show, dict(updates)
+        self._ended: set[str] = set()
+        self._running: dict[str, tuple[int, float]] = {}
+        self._show()
+
+    def show_running(self, name: str, updates: int, steps_per_second: float) -> None:
+        """Show the number of updates that a running job has done."""
+        self._running[name] = updates, steps_per_second
+        self._show()
+
+    def show_ended(self, name: str) -> None:
+        """Show that a job is finished or has failed."""
+        self._running.pop(name, None)
+        self._ended.add(name)
+        self._show()
+
+    def _show(self) -> None:
+        updates = sum(self._updates[name] for name in self._ended) + sum(done for done, _ in self._running.values())
+        speed = sum(speed for _, speed in self._running.values())
+        note = f"{len(self._ended)}/{len(self._updates)} jobs" + (f", {speed:,.0f} steps/s" if speed else "")
+        self._show_bar("all jobs", updates, sum(self._updates.values()), note)

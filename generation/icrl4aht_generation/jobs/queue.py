@@ -1,0 +1,156 @@
+"""Jobs in this process, in several local ones or on Ray. Failures are logged, and the other jobs continue."""
+
+from __future__ import annotations
+
+import multiprocessing
+import traceback
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor
+from concurrent.futures import wait as wait_for
+from contextlib import closing
+from pathlib import Path
+
+from rich.console import Console
+
+from icrl4aht_data.utils.progress import progress_bars
+from icrl4aht_generation.jobs.job import (
+    FAILED,
+    FailedJobsError,
+    FailureLog,
+    Job,
+    JobBoard,
+    JobOutcome,
+    run_in_worker,
+    run_job,
+)
+from icrl4aht_generation.jobs.options import QueueOptions
+from icrl4aht_generation.jobs.ray_executor import run_on_ray
+
+_POLL_SECONDS = 1.0
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    out: Path,
+    console: Console,
+    options: QueueOptions,
+    describe: Callable[[Job], str] = lambda job: "finished",
+) -> None:
+    """Do every job that is unfinished.
+
+    Jobs that another process is doing are skipped, and awaited at the end.
+
+    Args:
+        jobs: the jobs.
+        out: folder of the log of failures.
+        console: where outcomes are printed.
+        options: how to run them.
+        describe: returns the text on a job that has just finished.
+
+    Raises:
+        FailedJobsError: if a job is unfinished at the end; out/failed.jsonl has the reasons.
+    """
+    labels = {job.name: f"{number}/{len(jobs)} {job.label}" for number, job in enumerate(jobs, start=1)}
+    todo = []
+    for job in jobs:
+        if job.is_finished():
+            console.print(f"{labels[job.name]}: finished before")
+        else:
+            todo.append(job)
+    missing = {job.name for job in todo}
+    updates = {job.name: job.updates for job in todo}
+    failures, last_error = FailureLog(out / FAILED), ""
+    with (
+        progress_bars(unit="updates") as show,
+        closing(_run_all(todo, JobBoard(show, updates), options)) as outcomes,
+    ):
+        for outcome in outcomes:
+            name = outcome.job.name
+            if outcome.status == "busy":
+                console.print(f"{labels[name]}: another process works on it")
+                continue
+            if outcome.status == "done":
+                console.print(f"{labels[name]}: {describe(outcome.job)}")
+                missing.remove(name)
+                failures.forget([name])
+                continue
+            times = "once" if outcome.attempts == 1 else f"{outcome.attempts} times"
+            console.print(f"{labels[name]}: failed {times}: {outcome.error}")
+            failures.add(outcome)
+            last_error = outcome.error
+            if options.fail_fast:
+                raise FailedJobsError(f"{failures.path}: the first failure: {outcome.error}")
+    failures.forget(labels.keys() - missing)
+    if missing:
+        reasons = f"{failures.path} has the reasons"
+        if not failures.is_written:
+            reasons = f"{failures.path} cannot be written, the disk is full; the last failure: {last_error}"
+        raise FailedJobsError(
+            f"{len(missing)} of {len(jobs)} jobs are unfinished: {', '.join(sorted(missing))}; {reasons}, and the same "
+            f"command tries them again"
+        )
+
+
+def _run_all(jobs: Sequence[Job], board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
+    """Run every job, then wait for those that another process was doing."""
+    execute = _run_here
+    if options.executor == "ray":
+        execute = run_on_ray
+    elif (options.workers or 1) > 1:
+        execute = _run_in_processes
+    for wait in (False, True):
+        busy: list[Job] = []
+        with closing(execute(jobs, wait, board, options)) as outcomes:
+            for outcome in outcomes:
+                if outcome.status == "busy":
+                    busy.append(outcome.job)
+                else:
+                    board.show_ended(outcome.job.name)
+                yield outcome
+        jobs = busy
+
+
+def _run_here(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
+    """Run one job after the other in this process."""
+    for job in jobs:
+
+        def on_update(updates: int, speed: float, name: str = job.name) -> None:
+            board.show_running(name, updates, speed)
+
+        for attempt in range(1, options.retries + 2):
+            try:
+                outcome = JobOutcome(job, run_job(job, wait, on_update), attempt)
+                break
+            except Exception as error:  # any error: the other jobs continue
+                outcome = _failed(job, attempt, error)
+        yield outcome  # type: ignore[possibly-undefined]
+
+
+def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
+    """Run several jobs at a time, each in a process of its own, so that its memory is released."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(options.workers, context, max_tasks_per_child=1) as pool:
+        attempts = dict.fromkeys((job.name for job in jobs), 1)
+        pending: dict[Future, Job] = {pool.submit(run_in_worker, job, wait): job for job in jobs}
+        try:
+            while pending:
+                ended, _ = wait_for(pending, _POLL_SECONDS, FIRST_COMPLETED)
+                for future in ended:
+                    job, error = pending.pop(future), future.exception()
+                    if error is None:
+                        yield JobOutcome(job, future.result(), attempts[job.name])
+                    elif attempts[job.name] <= options.retries:
+                        attempts[job.name] += 1
+                        pending[pool.submit(run_in_worker, job, wait)] = job
+                    else:
+                        yield _failed(job, attempts[job.name], error)
+                for job in (job for future, job in pending.items() if future.running()):
+                    if progress := job.progress():
+                        board.show_running(job.name, *progress)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _failed(job: Job, attempts: int, error: BaseException) -> JobOutcome:
+    text = f"{type(error).__name__}: {error}"
+    return JobOutcome(job, "failed", attempts, text, "".join(traceback.format_exception(error)))
