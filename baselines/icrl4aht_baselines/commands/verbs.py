@@ -2,8 +2,8 @@
 
 from icrl4aht_data.commands.verbs import Verb
 
-_CLI, _MODELS, _LAB = (
-    f"icrl4aht_baselines.commands.{name}" for name in ("train_commands", "model_commands", "experiment_commands")
+_CLI, _MODELS, _LAB, _ADAPT = (
+    f"icrl4aht_baselines.commands.{name}_commands" for name in ("train", "model", "experiment", "adaptation")
 )
 _TRAIN, _PAPER, _CHECKS = "Train and evaluate", "The paper's experiments", "Reference models and checks"
 
@@ -16,6 +16,13 @@ VERBS = (
     Verb("models", f"{_MODELS}:models_command", _TRAIN, "List the bundled models."),
     Verb("watch", f"{_CLI}:watch_command", _TRAIN, "Play an episode and draw it as a GIF."),
     Verb("collect", f"{_MODELS}:collect_command", _TRAIN, "Record histories of an agent with a release's teammates."),
+    Verb("best-response", f"{_ADAPT}:best_response_command", _TRAIN, "Train a best response to each teammate."),
+    Verb(
+        "adaptation-headroom",
+        f"{_ADAPT}:adaptation_headroom_command",
+        _TRAIN,
+        "Measure what memory across episodes can earn at most.",
+    ),
     Verb("control", f"{_LAB}:control_command", _TRAIN, "Check that the models adapt in context."),
     Verb("research tracks", f"{_LAB}:tracks_command", _PAPER, "Train and evaluate on both tracks."),
     Verb("research sweep", f"{_LAB}:sweep_command", _PAPER, "Train and evaluate over sizes, or context lengths."),

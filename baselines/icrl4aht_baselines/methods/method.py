@@ -39,6 +39,7 @@ class World(NamedTuple):
         view: function that returns the encoder's input for a batch.
         actions: number of actions.
         observations: function from the encoder's input (*B, ..) back to observations.
+        partners: number of teammates, if the ego is told in every step which one it plays with; otherwise 0.
     """
 
     encoder: Callable[[Any], nn.Module]
@@ -46,6 +47,7 @@ class World(NamedTuple):
     view: BatchView
     actions: int = len(ACTIONS)
     observations: Callable[[Any], Num[Array, "*B ..."]] = lambda seen: seen
+    partners: int = 0
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,8 @@ def make_transformer(options: ModelOptions) -> Transformer:
     return Transformer(options.layers, options.width, options.heads, options.dropout, options.positions, options.remat)
 
 
-def make_tokens(kind: type[TokensType], options: ModelOptions, world: World) -> TokensType:
-    """Return a tokenizer of the given class for a world."""
+def make_tokens(kind: type[TokensType], options: ModelOptions, world: World, **own: Any) -> TokensType:
+    """Return a tokenizer of the given class for a world, with further arguments of that class."""
     dtype = compute_dtype(options)
     return kind(
         encoder=world.encoder(dtype),
@@ -115,6 +117,7 @@ def make_tokens(kind: type[TokensType], options: ModelOptions, world: World) -> 
         dropout=options.dropout,
         dtype=dtype,
         reward_scale=options.reward_scale,
+        **own,
     )
 
 

@@ -77,6 +77,7 @@ def overcooked_world(
     encoder: EncoderKind = "paper",
     view: BatchView | None = None,
     canonical: bool = False,
+    partners: int = 0,
 ) -> World:
     """Return the world of OvercookedV2 on layouts with observations of one shape.
 
@@ -86,6 +87,7 @@ def overcooked_world(
         view: function that returns the observations of a batch; by default the batches hold state records, of which the
             encoder's compact input is made.
         canonical: whether observations have the canonical channels, which all layouts share, or the layouts' own.
+        partners: see `World`.
     """
     compact = CompactView(encoder, tuple(layouts), canonical=canonical)
 
@@ -93,4 +95,4 @@ def overcooked_world(
         return WindowEncoder(FEATURES, encoder, view=compact, dtype=dtype)
 
     obs_shape = observation_shape(layouts[0], canonical)
-    return World(make_encoder, obs_shape, view or compact, observations=compact.observations)
+    return World(make_encoder, obs_shape, view or compact, observations=compact.observations, partners=partners)

@@ -78,8 +78,11 @@ def _no_batches(params: Any, slow: Any, batch: Any, key: Any) -> tuple[Array, di
 def rl2(options: ModelOptions, world: World) -> Method:
     """Return the recurrent policy of RL^2."""
     trunk = RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
-    model = RL2Model(make_tokens(StepTokens, options, world), trunk, PolicyValueHead(options.width, world.actions))
-    example = (example_step(world), jnp.zeros((1, options.recurrent_layers * options.width)))
+    tokens = make_tokens(StepTokens, options, world, partners=world.partners)
+    model = RL2Model(tokens, trunk, PolicyValueHead(options.width, world.actions))
+    step = example_step(world)
+    step = step._replace(partner=step.prev_action if world.partners else None)
+    example = (step, jnp.zeros((1, options.recurrent_layers * options.width)))
     return Method(
         name="rl2",
         label="RL2",

@@ -34,12 +34,14 @@ class StepInput(NamedTuple):
         prev_action: int32 (*B,), the ego's action in the previous step.
         prev_reward: float32 (*B,), the team's reward in the previous step, unscaled.
         prev_teammate_action: int32 (*B,), the teammate's action in the previous step; None without +TA.
+        partner: int32 (*B,), number of the teammate, for egos that are told whom they play with; None for others.
     """
 
     obs: Any
     prev_action: Int[Array, "*B"]
     prev_reward: Float[Array, "*B"]
     prev_teammate_action: Int[Array, "*B"] | None
+    partner: Int[Array, "*B"] | None = None
 
 
 class Transition(NamedTuple):
@@ -105,7 +107,13 @@ class Tokens(nn.Module):
 
 
 class StepTokens(Tokens):
-    """Tokens of steps: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2)."""
+    """Tokens of steps: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2).
+
+    Args:
+        partners: number of teammates that the ego is told apart by `StepInput.partner`; 0 for none.
+    """
+
+    partners: int = 0
 
     @nn.compact
     def __call__(self, step: StepInput, deterministic: bool = True) -> Float[Array, "*B D"]:
@@ -113,6 +121,8 @@ class StepTokens(Tokens):
         parts = [nn.Embed(self.actions, FEATURES, name="action")(step.prev_action)]
         if self.teammate_actions:
             parts.append(nn.Embed(self.actions, FEATURES, name="teammate_action")(step.prev_teammate_action))
+        if self.partners:
+            parts.append(nn.Embed(self.partners, FEATURES, name="partner")(step.partner))
         parts += [self.reward_scale * step.prev_reward[..., None], self.encoder(step.obs)]
         token = nn.Dense(self.width, name="project")(jnp.concatenate(parts, -1, dtype=self.dtype))
         return nn.Dropout(self.dropout)(token, deterministic=deterministic)

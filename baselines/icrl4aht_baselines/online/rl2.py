@@ -54,11 +54,13 @@ class PlayerMemory(NamedTuple):
         change: changes of its view, see `ViewChange`.
         state: float32 (S,), its recurrent state.
         started: bool (), whether a step of the task was played; before it the outcome of the previous step is zero.
+        partner: int32 (), number of the teammate, for a model that is told; None for others.
     """
 
     change: ViewChange
     state: Float[Array, " S"]
     started: Bool[Array, ""]
+    partner: Int[Array, ""] | None = None
 
 
 class PlayState(NamedTuple):
@@ -87,6 +89,7 @@ class TaskGroup:
         teammates: policies that share their functions, one for each task.
         hidden: whether the model does not see recipe indicators.
         label: the layouts' name in the log.
+        partners: number of each task's teammate, for a model that is told; None for others.
     """
 
     layouts: Sequence[Layout]
@@ -94,6 +97,7 @@ class TaskGroup:
     teammates: Sequence[Policy]
     hidden: bool
     label: str
+    partners: Sequence[int] | None = None
 
     @property
     def name(self) -> str:
@@ -162,6 +166,8 @@ class _Player:
         teammates = [mate for group in groups for mate in group.teammates]
         self.tasks = len(teammates)
         self._hidden = np.repeat([group.hidden for group in groups], [len(group.teammates) for group in groups])
+        told = [group.partners for group in groups if group.partners is not None]
+        self._partners = jnp.asarray(np.concatenate(told), jnp.int32) if told else None
         # A model whose view never changes needs no code for it, which is a part of every step and of its compilation.
         self._changes = mirror or bool(self._hidden.any())
         played = [layout for group in groups for layout in group.task_layouts]
@@ -182,7 +188,7 @@ class _Player:
         """Return the state before the first episode of all tasks."""
         env_key, change_key = jax.random.split(key)
         state = self.rollout.start(jax.random.split(env_key, self.tasks))
-        return state._replace(ego=state.ego._replace(change=self._draw_change(change_key)))
+        return state._replace(ego=state.ego._replace(change=self._draw_change(change_key), partner=self._partners))
 
     def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
         change = no_change(self.tasks)._replace(hidden=jnp.asarray(self._hidden))
@@ -201,7 +207,7 @@ class _Player:
         sequences = self._sequences(params, state, after, played, ended)
         # Where a task ends, a new one begins with the same teammate: another view, an empty state, no previous step.
         begun = _select(ended, self._draw_change(change_key), after.ego.change)
-        memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended)
+        memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended, state.ego.partner)
         before = _select(ended, no_outcome(self.tasks), after.before)
         return RolloutState(after.env, memory, before), sequences, played.reward.sum(axis=-1)
 
@@ -219,6 +225,7 @@ class _Player:
             prev_action=jnp.concatenate([state.before.prev_action[None], taken]),
             prev_reward=jnp.concatenate([state.before.prev_reward[None], reward]),
             prev_teammate_action=jnp.concatenate([state.before.prev_teammate_action[None], theirs]),
+            partner=None if state.ego.partner is None else jnp.tile(state.ego.partner, (len(record) + 1, 1)),
         )
         if self._changes:
             # Only the first step of an episode can be a task's first one.
@@ -296,7 +303,7 @@ def _model_policy(method: Method, changes: bool) -> Policy:
         return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))
 
     def act(params: Any, memory: PlayerMemory, ego_input: Any, key: Array) -> tuple[Array, PlayerMemory]:
-        step = input_step(ego_input)
+        step = input_step(ego_input)._replace(partner=memory.partner)
         step = seen_steps(memory.change, step, memory.started) if changes else step
         logits, state = method.act(params, step, ego_input.prev_done, memory.state)
         action = jax.random.categorical(key, logits).astype(jnp.int32)
@@ -420,6 +427,25 @@ class PlayTrainer:
                 by_name[group.name].append(of_group)
         log |= {f"return {name}": jnp.concatenate(own).mean() for name, own in by_name.items()}
         return PlayState(params, optimizer, tasks, state.step + 1), log
+
+    def measure(self, params: Any, episodes: int, seed: int) -> list[np.ndarray]:
+        """Return the returns of drawn actions in new episodes, float64 (tasks, episodes), one array for each group.
+
+        Args:
+            params: parameters of the model.
+            episodes: episodes of each task.
+            seed: seed of the episodes.
+        """
+        found: list[np.ndarray] = []
+        for number, player in enumerate(self.players):
+            key = jax.random.fold_in(jax.random.key(seed), number)
+            state, returns = player.start(key), []
+            for step in range(episodes):
+                state, _, own = player.compiled(params, player.mates, state, jax.random.fold_in(key, step + 1))
+                returns.append(np.asarray(own, np.float64))
+            ends = np.cumsum([len(group.teammates) for group in player.groups])[:-1]
+            found += np.split(np.stack(returns, axis=-1), ends)
+        return found
 
     def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:
         """Compile the episodes of all groups at the same time, since each takes seconds and one core."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
+import sys
 import traceback
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import closing
 from pathlib import Path
+from threading import current_thread, main_thread
 
 from rich.console import Console
 
@@ -128,6 +131,11 @@ def _run_here(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOp
 
 def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
     """Run several jobs at a time, each in a process of its own, so that its memory is released."""
+    if not jobs:
+        return
+    if current_thread() is main_thread():
+        # By default SIGTERM would end this process without a word to its workers.
+        signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(options.workers, context, max_tasks_per_child=1) as pool:
         attempts = dict.fromkeys((job.name for job in jobs), 1)
@@ -139,6 +147,8 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                     job, error = pending.pop(future), future.exception()
                     if error is None:
                         yield JobOutcome(job, future.result(), attempts[job.name])
+                    elif not isinstance(error, Exception):  # the worker was told to stop
+                        raise error
                     elif attempts[job.name] <= options.retries:
                         attempts[job.name] += 1
                         pending[pool.submit(run_in_worker, job, wait)] = job
@@ -148,7 +158,10 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                     if progress := job.progress():
                         board.show_running(job.name, *progress)
         finally:
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)
+            if pending:
+                for process in multiprocessing.active_children():
+                    process.terminate()
 
 
 def _failed(job: Job, attempts: int, error: BaseException) -> JobOutcome:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, UInt8
 
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, SAME_BEHAVIOUR, TESTED_ON
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, LAYOUT_NAMES, SAME_BEHAVIOUR, TESTED_ON
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.format.provenance import NearestTest
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -58,12 +58,12 @@ class CommonStates(NamedTuple):
 
 
 def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest]:
-    """Return the nearest test instance of each policy that plays the teammate on a training layout.
+    """Return the nearest test instance of each policy that plays the teammate on a layout.
 
     Policies that share their functions share one compilation. Behaviours are numbered in the order of the policies.
 
     Raises:
-        UnknownNameError: if the layout is not a training layout.
+        UnknownNameError: if the layout is not one of the benchmark.
     """
     common = common_states(layout)
     actions = act_along(layout, policies, common.records)
@@ -77,15 +77,15 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
 
 @lru_cache(maxsize=2)
 def common_states(layout: Layout) -> CommonStates:
-    """Return the states of a training layout on which teammates are compared.
+    """Return the states of a layout on which teammates are compared.
 
     Raises:
-        UnknownNameError: if the layout is not a training layout.
+        UnknownNameError: if the layout is not one of the benchmark.
     """
-    if layout.name not in TESTED_ON:
-        raise unknown("training layout", layout.name, TESTED_ON)
+    if layout.name not in LAYOUT_NAMES:
+        raise unknown("layout", layout.name, LAYOUT_NAMES)
     env = Environment(layout, KEPT_STEPS)
-    tested = TESTED_ON[layout.name]
+    tested = TESTED_ON.get(layout.name, layout.name)
     tests = [
         [build_teammate(layout, {"family": family, "theta": theta}) for theta in published_thetas(tested, family)]
         for family in TESTED_FAMILIES

@@ -1,0 +1,197 @@
+"""Commands that measure what an ego can earn with a teammate, and what adaptation can earn at most."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import click
+from icrl4aht_generation.jobs.command_line import queue_options, read_queue_options
+
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.commands.dataclass_options import TopicCommand, topic
+from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, TRACK, Folder, Names, examples
+from icrl4aht_data.errors import EmptySelectionError
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.templates import card_file
+
+_tasks_topic = topic(
+    "Tasks",
+    click.option("--track", type=TRACK, multiple=True, help="Only tasks of this track; repeat.", show_default="all"),
+    click.option(
+        "--split",
+        "splits",
+        type=Names("split", lambda: ("test", "validation", "diverse")),
+        multiple=True,
+        default=("test",),
+        help="test, validation or diverse; repeat for several.",
+    ),
+    click.option("--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several."),
+    click.option("--family", "families", type=FAMILY, multiple=True, help="Only with this family; repeat."),
+    click.option(
+        "--manifest",
+        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        metavar="FILE",
+        help="Tasks of this file instead.",
+    ),
+)
+
+
+def _chosen_tasks(
+    track: tuple[str, ...],
+    splits: tuple[str, ...],
+    layouts: tuple[str, ...],
+    families: tuple[str, ...],
+    manifest: Path | None,
+) -> list[Task]:
+    from icrl4aht_baselines.evaluate.protocols import bundled_tasks
+
+    given = (
+        read_tasks(manifest)
+        if manifest
+        else [task for split in splits for name in track or TRACKS for task in bundled_tasks(name, split)]
+    )
+    names = {get_layout(name).name for name in layouts}
+    chosen = [
+        task
+        for task in given
+        if (not names or task.layout.name in names) and (not families or task.teammate_family in families)
+    ]
+    if not chosen:
+        raise EmptySelectionError("no task passes --track, --split, --layout and --family; leave one of them out")
+    return chosen
+
+
+@click.command(
+    "best-response",
+    cls=TopicCommand,
+    epilog=examples(
+        "icrl4aht-data best-response --layout demo_wide --family H3 --seeds 1 --steps 100000 --out runs/small",
+        "icrl4aht-data best-response --split test --split validation --workers 2 --bundle",
+    ),
+)
+@_tasks_topic
+@topic(
+    "Training",
+    click.option("--seeds", type=COUNT, default=3, help="Trainings with each behaviour."),
+    click.option("--steps", type=COUNT, default=3_000_000, help="Environment steps of a training."),
+    click.option("--tasks", type=COUNT, default=128, help="Episodes that are played at once."),
+    click.option(
+        "--init",
+        "inits",
+        type=Names("start", lambda: ("oracle", "rl2-reference")),
+        multiple=True,
+        default=("oracle",),
+        help="Start from random parameters and imitate the oracle at first (oracle), or from a bundled model as well; "
+        "repeat for both.",
+    ),
+)
+@topic("Machines", queue_options)
+@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/best-responses", help="Write trainings here.")
+@click.option("--bundle", is_flag=True, help="Also update best_responses.json of the package's cards.")
+def best_response_command(
+    track: tuple[str, ...],
+    splits: tuple[str, ...],
+    layouts: tuple[str, ...],
+    families: tuple[str, ...],
+    manifest: Path | None,
+    seeds: int,
+    steps: int,
+    tasks: int,
+    inits: tuple[str, ...],
+    queue: dict[str, Any],
+    out: Path,
+    bundle: bool,
+) -> None:
+    """Train a best response to each teammate.
+
+    An ego with the benchmark's own view learns with one teammate alone, by PPO that imitates the oracle in its first
+    half. Teammates that act alike share one. Tasks in which the oracle earns no more than `stay` are left out. The
+    best training is chosen on other episodes than those reported. Writes OUT/best_responses.json; finished trainings
+    are kept, stopped ones resume.
+    """
+    options = read_queue_options(queue)
+    from icrl4aht_generation.jobs.queue import run_jobs
+    from rich.console import Console
+
+    from icrl4aht_baselines.online.responses import (
+        ResponseJob,
+        ResponseOptions,
+        find_behaviours,
+        with_headroom,
+        write_responses,
+    )
+
+    chosen = with_headroom(_chosen_tasks(track, splits, layouts, families, manifest))
+    if not chosen:
+        raise EmptySelectionError("none of these tasks has headroom; choose others")
+    console, behaviours = Console(soft_wrap=True), find_behaviours(chosen)
+    console.print(f"{len(chosen)} tasks with headroom, {len(behaviours)} behaviours")
+    settings = [ResponseOptions(steps, tasks, init=None if init == "oracle" else init) for init in inits]
+    jobs = [ResponseJob(one, seed, own, out) for seed in range(seeds) for own in settings for one in behaviours]
+    try:
+        run_jobs(jobs, out, console, options, ResponseJob.finished_text)
+    finally:
+        for folder in (out, card_file("best_responses.json").parent)[: 1 + bundle]:
+            console.print(f"wrote {write_responses(jobs, folder)}")
+
+
+@click.command(
+    "adaptation-headroom",
+    cls=TopicCommand,
+    epilog=examples(
+        "icrl4aht-data adaptation-headroom --layout demo_wide --seeds 1 --steps 100000 --out runs/small",
+        "icrl4aht-data adaptation-headroom --track preference --workers 2 --bundle",
+    ),
+)
+@_tasks_topic
+@topic(
+    "Training",
+    click.option("--together", is_flag=True, help="One ego for all layouts instead of one for each."),
+    click.option("--seeds", type=COUNT, default=3, help="Trainings of each kind of ego."),
+    click.option("--steps", type=COUNT, default=8_000_000, help="Environment steps of a training."),
+    click.option("--tasks", type=COUNT, default=128, help="Episodes that are played at once."),
+)
+@topic("Machines", queue_options)
+@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/adaptation", help="Write trainings here.")
+@click.option("--bundle", is_flag=True, help="Also update adaptation.json of the package's cards.")
+def adaptation_headroom_command(
+    track: tuple[str, ...],
+    splits: tuple[str, ...],
+    layouts: tuple[str, ...],
+    families: tuple[str, ...],
+    manifest: Path | None,
+    together: bool,
+    seeds: int,
+    steps: int,
+    tasks: int,
+    queue: dict[str, Any],
+    out: Path,
+    bundle: bool,
+) -> None:
+    """Measure what memory across episodes can earn at most.
+
+    Trains two egos on the tasks of each layout: one that is told in every step which task it plays, and one that has to
+    find out in each episode. Prints the difference of their returns with an interval over the seeds. Writes
+    OUT/adaptation.json; finished trainings are kept, stopped ones resume.
+    """
+    options = read_queue_options(queue)
+    from icrl4aht_generation.jobs.queue import run_jobs
+    from rich.console import Console
+
+    from icrl4aht_baselines.online.adaptation import headroom_jobs, headroom_table, write_headroom
+    from icrl4aht_baselines.online.responses import ResponseOptions
+
+    chosen = _chosen_tasks(track, splits, layouts, families, manifest)
+    sets: dict[str, list[Task]] = defaultdict(list)
+    for task in chosen:
+        title = task.layout.name if task.recipes is None else f"{task.layout.name}-preference"
+        sets["all" if together else title].append(task)
+    console, settings = Console(soft_wrap=True), ResponseOptions(steps, tasks)
+    jobs = headroom_jobs(sets, seeds, settings, out)
+    run_jobs(jobs, out, console, options)
+    for folder in (out, card_file("best_responses.json").parent)[: 1 + bundle]:
+        console.print(f"wrote {write_headroom(jobs, folder)}")
+    click.echo(headroom_table(out))

@@ -1,0 +1,228 @@
+"""Adaptation headroom: what knowing the teammate from the start is worth to an ego.
+
+Two recurrent egos are trained on the same tasks with the same budget, both with their memory cleared before each
+episode: the *informed* one is told in every step which task it plays, the *episodic* one has to find out within the
+episode. The return of the first minus that of the second is the most that memory across episodes can earn.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from icrl4aht_generation.jobs.job import OnUpdate
+from icrl4aht_generation.learners.resume import TIMING, last_line, run_lock
+from icrl4aht_generation.teammates.registry import build_teammate
+from scipy import stats
+
+from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.online.responses import MODEL, PLAY, RESULT, ResponseOptions
+from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
+from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.templates import markdown_table
+
+Kind = Literal["informed", "episodic"]
+KINDS: tuple[Kind, ...] = ("informed", "episodic")
+
+MEASURED_EPISODES = 100
+"""Episodes of each running task over which the return of a trained ego is measured."""
+
+_MEASURE_SEED = 1_000
+
+
+@dataclass(frozen=True)
+class HeadroomJob:
+    """The training of an informed or episodic ego on a set of tasks, a job of a queue.
+
+    Attributes:
+        title: name of the set of tasks.
+        tasks: the tasks, at most as many as are played at once.
+        kind: "informed" or "episodic".
+        seed: seed of the training.
+        options: settings of the training.
+        out: folder of all trainings.
+        xla_threads: threads of XLA on a CPU.
+
+    Raises:
+        OptionError: if there are more tasks than are played at once.
+    """
+
+    title: str
+    tasks: tuple[Task, ...]
+    kind: Kind
+    seed: int
+    options: ResponseOptions
+    out: Path
+    xla_threads: int | None = 1
+
+    def __post_init__(self) -> None:
+        if len(self.tasks) > self.options.tasks:
+            raise OptionError(
+                f"tasks = {self.options.tasks}: {self.title} has {len(self.tasks)} tasks, and each is to be played; "
+                f"give --tasks {len(self.tasks)} or more"
+            )
+
+    @property
+    def name(self) -> str:
+        """Set of tasks, kind and seed."""
+        return f"{self.title}-{self.kind}-s{self.seed}"
+
+    @property
+    def label(self) -> str:
+        """Name for people."""
+        return f"{self.title}, {self.kind}, seed {self.seed}"
+
+    @property
+    def updates(self) -> int:
+        """Updates of the training."""
+        return self.options.updates
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the result depends on."""
+        return {
+            "tasks_hash": json_hash([task.task_id for task in self.tasks]),
+            "kind": self.kind,
+            "seed": self.seed,
+            "options": asdict(self.options),
+            "code_version": version("icrl4aht-data"),
+        }
+
+    def is_finished(self) -> bool:
+        """Return whether the result of these settings is there."""
+        path = self.out / self.name / RESULT
+        return path.is_file() and parse_json(read_text(path))["settings"] == self.settings
+
+    def progress(self) -> tuple[int, float] | None:
+        """Return training steps done, and environment steps per second."""
+        timing = last_line(self.out / self.name / "run" / TIMING)
+        return timing and (timing["step"], timing["steps_per_second"] * self.options.tasks * KEPT_STEPS)
+
+    def result(self) -> dict[str, float]:
+        """Return task id -> mean return, of a finished training."""
+        return parse_json(read_text(self.out / self.name / RESULT))["returns"]
+
+    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
+        """Train the ego and write result.json with its mean return in each task, of drawn actions in new episodes."""
+        folder = self.out / self.name
+        with run_lock(folder, wait=wait):
+            if self.is_finished():
+                return
+            groups, numbers = self._groups()
+            layouts = list(dict.fromkeys(task.layout for task in self.tasks))
+            told = len(self.tasks) if self.kind == "informed" else 0
+            method = get_method("rl2")(MODEL, overcooked_world(layouts, MODEL.encoder, canonical=True, partners=told))
+            options = self.options.training(self.seed)
+            trainer = PlayTrainer(method, options, PLAY, groups)
+            speed = self.options.tasks * KEPT_STEPS
+
+            def done(step: int, loss: float | None) -> None:
+                timing = last_line(folder / "run" / TIMING) or {}
+                on_update(step, timing.get("steps_per_second", 0.0) * speed)
+
+            data = TrainingData(None, {})
+            state = train(method, data, options, folder / "run", self.settings, trainer=trainer, done=done)
+            by_task: dict[int, list[float]] = defaultdict(list)
+            measured = trainer.measure(state.params, MEASURED_EPISODES, _MEASURE_SEED)
+            groups_played = [group for player in trainer.players for group in player.groups]
+            for group, returns in zip(groups_played, measured, strict=True):
+                for number, own in zip(numbers[group.name], returns.mean(axis=1), strict=True):
+                    by_task[number].append(float(own))
+            returns = {task.task_id: round(float(np.mean(by_task[k])), 3) for k, task in enumerate(self.tasks)}
+            with atomic_write(folder / RESULT) as partial:
+                write_json(partial, {"settings": self.settings, "returns": returns})
+
+    def _groups(self) -> tuple[list[TaskGroup], dict[str, list[int]]]:
+        """Return the groups of tasks that are played at once, and the number of the task of each, by group's name."""
+        numbers: dict[str, list[int]] = defaultdict(list)
+        for played in range(self.options.tasks):
+            number = played % len(self.tasks)
+            numbers[self.tasks[number].teammate_kind].append(number)
+        groups = []
+        for kind, own in numbers.items():
+            layouts = [self.tasks[number].layout for number in own]
+            several = len(set(layouts)) > 1
+            mates = [build_teammate(None if several else layouts[0], self.tasks[number].teammate) for number in own]
+            told = own if self.kind == "informed" else None
+            groups.append(TaskGroup(layouts if several else layouts[:1], kind, mates, False, self.title, told))
+        return groups, {group.name: own for group, own in zip(groups, numbers.values(), strict=True)}
+
+
+def headroom_jobs(
+    sets: Mapping[str, Sequence[Task]], seeds: int, options: ResponseOptions, out: Path
+) -> list[HeadroomJob]:
+    """Return the jobs that measure sets of tasks, by name, with all kinds of egos; first those of the first seed."""
+    return [
+        HeadroomJob(title, tuple(tasks), kind, seed, options, out)
+        for seed in range(seeds)
+        for title, tasks in sets.items()
+        for kind in KINDS
+    ]
+
+
+def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any]:
+    """Return the entry of a set of tasks in cards/adaptation.json: mean returns of each kind of ego by seed."""
+    own = [job for job in jobs if job.title == title and job.is_finished()]
+    returns = {
+        kind: {str(job.seed): round(float(np.mean(list(job.result().values()))), 3) for job in own if job.kind == kind}
+        for kind in KINDS
+    }
+    by_task = {
+        kind: {
+            task.task_id: round(float(np.mean([job.result()[task.task_id] for job in own if job.kind == kind])), 2)
+            for task in own[0].tasks
+        }
+        for kind in KINDS
+    }
+    steps = own[0].options.updates * own[0].options.tasks * KEPT_STEPS
+    return {"tasks": title, "steps": steps, "returns": returns, "by_task": by_task}
+
+
+ADAPTATION = "adaptation.json"
+"""Name of the file of measured sets of tasks, in a folder of trainings and among the package's cards."""
+
+
+def write_headroom(jobs: Sequence[HeadroomJob], folder: Path) -> Path:
+    """Add the measurements of finished jobs to a folder's `ADAPTATION`; those of the same sets are replaced."""
+    path = folder / ADAPTATION
+    known = {entry["tasks"]: entry for entry in read_headroom(folder)}
+    known |= {title: headroom_entry(title, jobs) for title in dict.fromkeys(job.title for job in jobs)}
+    with atomic_write(path) as partial:
+        write_json(partial, list(known.values()))
+    return path
+
+
+def read_headroom(folder: Path) -> list[dict[str, Any]]:
+    """Return the measured sets of tasks of a folder; none if there is no such file."""
+    path = folder / ADAPTATION
+    return parse_json(read_text(path)) if path.is_file() else []
+
+
+def headroom_table(folder: Path) -> str:
+    """Return a Markdown table of the measured sets: returns of both egos, and their difference with its 95 % interval.
+
+    The interval is Student's over the seeds, which trained both egos; without a second seed there is none.
+    """
+    rows = []
+    for entry in read_headroom(folder):
+        returns = [entry["returns"][kind] for kind in KINDS]
+        seeds = sorted(returns[0].keys() & returns[1].keys())
+        differences = np.array([returns[0][seed] - returns[1][seed] for seed in seeds])
+        half = 0.0
+        if len(seeds) > 1:
+            error = differences.std(ddof=1) / np.sqrt(len(seeds))
+            half = float(stats.t.ppf(0.975, len(seeds) - 1) * error)
+        mean = float(differences.mean())
+        interval = f" ({mean - half:+.1f} to {mean + half:+.1f})" if half else ""
+        means = [f"{np.mean([of[seed] for seed in seeds]):.1f}" for of in returns]
+        rows.append([entry["tasks"], *means, f"{mean:+.1f}{interval}", str(len(seeds)), f"{entry['steps']:,}"])
+    return markdown_table(["tasks", *KINDS, "difference", "seeds", "steps of each"], rows, right=5)

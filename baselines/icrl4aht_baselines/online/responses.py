@@ -1,0 +1,327 @@
+"""Best responses: egos with the benchmark's view, each trained with one teammate alone.
+
+The mean return B of a best response is what an ego could earn with this teammate if it knew it from the start. It is an
+estimate from below: a longer training or another learner may earn more. Practice elsewhere: jax-aht trains PPO egos for
+10^7 steps with one teammate, ZSC-Eval for 10^7 steps with 50 episodes of evaluation.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from icrl4aht_generation.jobs.job import OnUpdate
+from icrl4aht_generation.learners.resume import METRICS, TIMING, last_line, run_lock
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.teammates.distances import act_along, common_states, group_behaviours
+from icrl4aht_generation.teammates.draws import find_draw
+from icrl4aht_generation.teammates.registry import build_teammate
+
+from icrl4aht_baselines.agents.bundled import bundled_models
+from icrl4aht_baselines.agents.egos import PlayMode, learned, with_view
+from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.methods.method import Method
+from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
+from icrl4aht_baselines.methods.registry import get_method, overcooked_world
+from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
+from icrl4aht_baselines.training.histories import read_trained
+from icrl4aht_baselines.training.options import PlayOptions, TrainOptions
+from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, track_of
+from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import unknown
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.utils.options import Count, Option, Positive, check_options
+
+PROTOCOL = "seeded"
+"""Protocol under which best responses are chosen and measured."""
+
+CHOICE_SEEDS, REPORT_SEEDS = (1000,), (0, 1, 2)
+"""Seeds of the episodes by which the best one of several trainings is chosen, and of those that are reported."""
+
+RESULT = "result.json"
+"""Name of the file with the result of a training, in its folder."""
+
+ABOUT = (
+    "Best responses: recurrent PPO with the benchmark's 5 x 5 view, trained with one teammate alone, memory cleared "
+    "before each episode; the oracle is imitated in the first half. The best training is chosen on episodes of seed "
+    f"{CHOICE_SEEDS[0]}; returns are means over the tasks and the seeds {', '.join(map(str, REPORT_SEEDS))}."
+)
+
+
+@dataclass(frozen=True)
+class ResponseOptions:
+    """Settings of the training of a best response.
+
+    Attributes:
+        init: name of a bundled model of method rl2 to start from; by default random parameters.
+    """
+
+    steps: Annotated[Count, Option("Environment steps of a training.")] = 3_000_000
+    tasks: Annotated[Count, Option("Episodes that are played at once.")] = 128
+    learning_rate: Annotated[Positive, Option("Highest learning rate.")] = 1e-3
+    init: str | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    @property
+    def updates(self) -> int:
+        """Updates of the parameters' state; each plays one episode of every task."""
+        return max(1, self.steps // (self.tasks * KEPT_STEPS))
+
+    def training(self, seed: int) -> TrainOptions:
+        """Return the options of a training."""
+        settings = {**RL2_SETTINGS["train"], "steps": self.updates, "batch_size": self.tasks, "seed": seed}
+        return replace(TrainOptions(**settings), learning_rate=self.learning_rate, save_every=self.updates)
+
+
+MODEL = ModelOptions(**RL2_SETTINGS["model"])
+"""Architecture of best responses, that of the bundled rl2 models."""
+
+PLAY = PlayOptions(task_end=1.0)
+"""Options of playing: each episode is a task of its own, since nothing is to be found out."""
+
+
+class Behaviour(NamedTuple):
+    """Tasks on one layout with teammates that act alike, and so have one best response.
+
+    Attributes:
+        tasks: the tasks; the first one's teammate is trained with.
+    """
+
+    tasks: tuple[Task, ...]
+
+    @property
+    def layout(self) -> Layout:
+        """The layout, with the recipes of the tasks."""
+        return self.tasks[0].layout
+
+
+def find_behaviours(tasks: Iterable[Task]) -> list[Behaviour]:
+    """Group tasks with heuristic teammates that act alike: those of one layout, recipes and family below the distance
+    `SAME_BEHAVIOUR`.
+
+    Raises:
+        UnknownNameError: if no distances are measured on a layout.
+    """
+    groups: dict[Any, list[Task]] = defaultdict(list)
+    for task in tasks:
+        groups[task.layout.name, task.recipes, task.teammate_kind].append(task)
+    found = []
+    for (name, _, _), own in groups.items():
+        plain = replace(own[0], recipes=None).layout
+        actions = act_along(plain, [build_teammate(plain, task.teammate) for task in own], common_states(plain).records)
+        numbers = np.array(group_behaviours(actions))
+        for number in dict.fromkeys(numbers.tolist()):
+            found.append(Behaviour(tuple(own[k] for k in np.flatnonzero(numbers == number))))
+    return found
+
+
+def with_headroom(tasks: Iterable[Task]) -> list[Task]:
+    """Return the tasks in which the scripted oracle earns more than `stay`, as measured for test cells and draws."""
+    cells = read_headroom(PROTOCOL)
+    kept = []
+    for task in tasks:
+        cell = cells.get((task.layout.name, task.teammate_family))
+        draw = None if task.split == "test" else find_draw(task.layout.name, task.teammate)
+        matters = has_headroom(cell) if cell and task.split == "test" else draw is None or draw.headroom
+        kept += [task] if matters else []
+    return kept
+
+
+def response_method(layout: Layout, partners: int = 0) -> Method:
+    """Return the method rl2 on a layout's canonical channels; `partners` as in `World`."""
+    return get_method("rl2")(MODEL, overcooked_world([layout], MODEL.encoder, canonical=True, partners=partners))
+
+
+def play_policy(method: Method, params: Any, greedy: bool) -> Policy:
+    """Return the policy of a trained ego whose memory is cleared before each episode, as it was in training."""
+    return with_view(learned(method, params, KEPT_STEPS, PlayMode(greedy=greedy, forget=True)), "canonical")
+
+
+@dataclass(frozen=True)
+class ResponseJob:
+    """The training and evaluation of one best response, a job of a queue, see `icrl4aht_generation.jobs.job.Job`.
+
+    Attributes:
+        behaviour: whom it plays with.
+        seed: seed of the training.
+        options: settings of the training.
+        out: folder of all best responses.
+        xla_threads: threads of XLA on a CPU.
+    """
+
+    behaviour: Behaviour
+    seed: int
+    options: ResponseOptions
+    out: Path
+    xla_threads: int | None = 1
+
+    @property
+    def name(self) -> str:
+        """Task and seed, and the model that it starts from."""
+        start = f"-{self.options.init}" if self.options.init else ""
+        return f"{self.behaviour.tasks[0].task_id}{start}-s{self.seed}"
+
+    @property
+    def label(self) -> str:
+        """Layout, teammate and seed."""
+        task, others = self.behaviour.tasks[0], len(self.behaviour.tasks) - 1
+        alike = f" and {others} alike" if others else ""
+        return f"{task.layout.name} {task.teammate_family}/t{task.teammate['theta_id']}{alike}, seed {self.seed}"
+
+    @property
+    def updates(self) -> int:
+        """Updates of the training."""
+        return self.options.updates
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the result depends on."""
+        return {
+            "tasks": [task.task_id for task in self.behaviour.tasks],
+            "seed": self.seed,
+            "options": asdict(self.options),
+            "code_version": version("icrl4aht-data"),
+        }
+
+    def is_finished(self) -> bool:
+        """Return whether the result of these settings is there."""
+        path = self.out / self.name / RESULT
+        return path.is_file() and parse_json(read_text(path))["settings"] == self.settings
+
+    def finished_text(self) -> str:
+        """Return the text on the finished training."""
+        modes = self.result()["modes"]
+        return "return " + ", ".join(f"{mode} {found['return']:.1f}" for mode, found in modes.items())
+
+    def result(self) -> dict[str, Any]:
+        """Return the result, see `run`."""
+        return parse_json(read_text(self.out / self.name / RESULT))
+
+    def progress(self) -> tuple[int, float] | None:
+        """Return training steps done, and environment steps per second."""
+        timing = last_line(self.out / self.name / "run" / TIMING)
+        if timing is None or "steps_per_second" not in timing:
+            return None
+        return timing["step"], timing["steps_per_second"] * self.options.tasks * KEPT_STEPS
+
+    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
+        """Train the ego, play the tasks, and write result.json: returns on the episodes to choose by and to report.
+
+        The returns are means over the behaviour's tasks, of the most probable actions ("greedy") and of drawn ones
+        ("sampled"). "slope" is the rise of the training's return from the third to the last quarter of its steps.
+        """
+        folder = self.out / self.name
+        with run_lock(folder, wait=wait):
+            if self.is_finished():
+                return
+            method, state = self._train(folder / "run", on_update)
+            modes = {}
+            for mode, greedy in (("greedy", True), ("sampled", False)):
+                policy = play_policy(method, state.params, greedy)
+                choice, report = (self._mean_return(policy, seeds) for seeds in (CHOICE_SEEDS, REPORT_SEEDS))
+                modes[mode] = {"choice": choice, "return": report}
+            returns = _logged_returns(folder / "run" / METRICS)
+            last, before = returns[len(returns) * 3 // 4 :], returns[len(returns) // 2 : len(returns) * 3 // 4]
+            slope = float(np.mean(last) - np.mean(before)) if len(before) else 0.0
+            with atomic_write(folder / RESULT) as partial:
+                write_json(partial, {"settings": self.settings, "modes": modes, "slope": round(slope, 3)})
+
+    def _train(self, folder: Path, on_update: OnUpdate) -> tuple[Method, Any]:
+        task, options = self.behaviour.tasks[0], self.options.training(self.seed)
+        method = response_method(task.layout)
+        mates = [build_teammate(task.layout, task.teammate)] * self.options.tasks
+        group = TaskGroup([task.layout], task.teammate_kind, mates, False, task.layout.name)
+        params = None
+        if self.options.init:
+            params = read_trained(_bundled_run(self.options.init, task.layout)).params
+        speed = self.options.tasks * KEPT_STEPS
+
+        def done(step: int, loss: float | None) -> None:
+            timing = last_line(folder / TIMING) or {}
+            on_update(step, timing.get("steps_per_second", 0.0) * speed)
+
+        trainer = PlayTrainer(method, options, PLAY, [group])
+        state = train(
+            method, TrainingData(None, {}), options, folder, self.settings, trainer=trainer, params=params, done=done
+        )
+        return method, state
+
+    def _mean_return(self, policy: Policy, seeds: Sequence[int]) -> float:
+        played: dict[str, Any] = {"seeds": seeds, "done": lambda count: None}
+        tasks = list(self.behaviour.tasks)
+        results = evaluate("best response", lambda layout: policy, tasks, get_protocol(PROTOCOL), **played)
+        return round(float(np.mean([result.returns for result in results])), 3)
+
+
+def _logged_returns(path: Path) -> list[float]:
+    lines = [parse_json(line) for line in read_text(path).splitlines()]
+    return [value for line in lines for name, value in line.items() if name.startswith("return ")]
+
+
+@lru_cache
+def _bundled_run(name: str, layout: Layout) -> Path:
+    models = bundled_models()
+    if name not in models:
+        raise unknown("bundled model", name, models)
+    return models[name].runs[track_of(layout.name)]
+
+
+def best_of(jobs: Sequence[ResponseJob]) -> dict[str, Any]:
+    """Return the entry of a behaviour in cards/best_responses.json from its finished trainings.
+
+    The best one is that with the highest return on the episodes to choose by; B is its return on the others.
+    """
+    task, seeds = jobs[0].behaviour.tasks[0], []
+    for job in jobs:
+        result = job.result()
+        mode = max(result["modes"], key=lambda name: result["modes"][name]["choice"])
+        start = {"init": job.options.init} if job.options.init else {}
+        seeds.append(
+            {"seed": job.seed, "steps": job.options.updates * job.options.tasks * KEPT_STEPS, **start, "acting": mode}
+            | result["modes"][mode]
+            | {"slope": result["slope"]}
+        )
+    best = max(seeds, key=lambda one: one["choice"])
+    return {
+        "layout": task.layout.name,
+        "family": task.teammate_family,
+        "split": task.split,
+        "tasks": [one.task_id for one in jobs[0].behaviour.tasks],
+        "seeds": seeds,
+        "best": best["return"],
+        "agent": f"best response, seed {best['seed']}" + (f" from {best['init']}" if "init" in best else ""),
+    }
+
+
+RESPONSES = "best_responses.json"
+"""Name of the file of best responses, in a folder of trainings and among the package's cards."""
+
+
+def write_responses(jobs: Sequence[ResponseJob], folder: Path) -> Path:
+    """Add the best responses of finished trainings to a folder's `RESPONSES`; those of the same tasks are replaced.
+
+    Trainings that another command made of the same behaviour are kept beside the new ones.
+    """
+    path, finished = folder / RESPONSES, defaultdict(list)
+    for job in jobs:
+        if job.is_finished():
+            finished[job.behaviour.tasks[0].task_id].append(job)
+    card = parse_json(read_text(path)) if path.is_file() else {}
+    known = {entry["tasks"][0]: entry for entry in card.get("behaviours", [])}
+    known |= {task: best_of(own) for task, own in finished.items()}
+    content = {"version": "1", "protocol": PROTOCOL, "about": ABOUT, "behaviours": list(known.values())}
+    with atomic_write(path) as partial:
+        write_json(partial, content)
+    return path
