@@ -226,8 +226,9 @@ def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLI
         if mode.forget:
             # An episode is played as a task's first one: an empty memory, and zeros for the step before.
             memory = jax.tree.map(lambda new, old: jnp.where(done, new, old), start(), memory)
-            before = {name: jnp.where(done, 0, value) for name, value in step._asdict().items() if name != "obs"}
-            step, done = step._replace(**before), jnp.bool_(False)
+            before = step._replace(obs=None)
+            before = jax.tree.map(lambda value: jnp.where(done, 0, value), before)
+            step, done = before._replace(obs=step.obs), jnp.bool_(False)
         logits, memory = method.act(params, step, done, memory)
         action = logits.argmax() if mode.greedy else jax.random.categorical(key, logits)
         return action.astype(jnp.int32), memory

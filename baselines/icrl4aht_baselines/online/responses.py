@@ -118,7 +118,7 @@ def find_behaviours(tasks: Iterable[Task]) -> list[Behaviour]:
     for task in tasks:
         groups[task.layout.name, task.recipes, task.teammate_kind].append(task)
     found = []
-    for (name, _, _), own in groups.items():
+    for own in groups.values():
         plain = replace(own[0], recipes=None).layout
         actions = act_along(plain, [build_teammate(plain, task.teammate) for task in own], common_states(plain).records)
         numbers = np.array(group_behaviours(actions))
