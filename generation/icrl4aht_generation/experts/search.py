@@ -1,0 +1,106 @@
+"""Scripted ego that finds out which dish its teammate wants: it tries dishes, and repeats the one that was paid.
+
+It plays like the oracle, but acts on a belief in place of the current recipe. It remembers over the episodes of a task
+which dishes were refused and which one was paid. Until one was paid it believes in the dish that best fits what the
+teammate has put into pots, in random order among equals, and changes its mind only when nothing is being cooked.
+It is meant for tasks that want one dish throughout, see `Task.recipes`.
+
+Shapes: `D` dishes that can be made of the layout's ingredients, `S` bytes of a state record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
+
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.cells import COOKED, GOAL, PLATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.state import columns, ingredient_count, possible_recipes, unpack
+from icrl4aht_generation.experts.oracle import SITUATION_ORACLE, OracleMemory, oracle_params
+from icrl4aht_generation.policy import Policy, Situation
+
+_FLAGS = np.uint8(PLATE | COOKED)
+_NO_DISH = 0
+
+
+class SearchMemory(NamedTuple):
+    """Memory of the ego, which is kept from one episode to the next.
+
+    Attributes:
+        oracle: memory of the oracle; its record has the believed recipe.
+        order: float32 (D,), random numbers below 1 that decide among dishes which fit equally well.
+        refused: bool (D,), dishes that were delivered and not paid.
+        paid: bool (D,), the dish that was paid.
+        seen: int32 (3,), pieces of each ingredient that the teammate put into pots.
+        belief: int32 (), number of the dish that it cooks.
+    """
+
+    oracle: OracleMemory
+    order: Float[Array, " D"]
+    refused: Bool[Array, " D"]
+    paid: Bool[Array, " D"]
+    seen: Int[Array, " 3"]
+    belief: Int[Array, ""]
+
+
+def search(layouts: Layout | Sequence[Layout]) -> Policy:
+    """Return the scripted ego for one layout or several, in the order of their numbers in the environment."""
+    known = [layouts] if isinstance(layouts, Layout) else list(layouts)
+    dishes = [possible_recipes(layout) for layout in known]
+    most = max(map(len, dishes))
+    padded = np.array([[*own, *[_NO_DISH] * (most - len(own))] for own in dishes], np.uint8)
+    return Policy({"oracle": oracle_params(known), "dishes": padded}, _begin, _act, "situation")
+
+
+def _begin(params: Any, key: Key[Array, ""]) -> SearchMemory:
+    dishes = params["dishes"].shape[-1]
+    no = jnp.zeros(dishes, bool)
+    order = jax.random.uniform(jax.random.fold_in(key, 1), (dishes,))
+    seen = jnp.zeros(3, jnp.int32)
+    return SearchMemory(SITUATION_ORACLE.init(params["oracle"], key), order, no, no, seen, order.argmax())
+
+
+def _act(params: Any, memory: SearchMemory, view: Situation, key: Key[Array, ""]) -> tuple[Int[Array, ""], Any]:
+    dishes = jnp.asarray(params["dishes"])[view.layout]
+    memory = _learn(memory, view, dishes)
+    believed = dishes[memory.belief]
+    facts, blank = params["oracle"]
+    facts = facts._replace(recipes=jnp.full_like(jnp.asarray(facts.recipes), believed))
+    record = view.record.at[columns(view.tables).recipe].set(believed)
+    action, oracle = SITUATION_ORACLE.act((facts, blank), memory.oracle, view._replace(record=record), key)
+    return action, memory._replace(oracle=oracle)
+
+
+def _learn(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"]) -> SearchMemory:
+    """Return the memory updated by what happened in the previous step."""
+    new, old = unpack(view.tables, view.record), unpack(view.tables, memory.oracle.record)
+    # A new episode empties hands, too, but seldom leaves an agent in the same pose in front of the goal.
+    ahead = jnp.asarray(view.tables.ahead)[old.positions.astype(jnp.int32), old.facings.astype(jnp.int32)]
+    at_goal = jnp.asarray(view.tables.kinds)[ahead.astype(jnp.int32)] == GOAL
+    same_pose = (new.positions == old.positions) & (new.facings == old.facings)
+    gave = (old.hands & COOKED > 0) & (new.hands == 0) & at_goal & same_pose
+    is_dish = (old.hands[:, None] == dishes | _FLAGS) & gave[:, None]  # (2, D)
+    paid = memory.paid | (is_dish.any(axis=0) & (new.delivered > 0))
+    refused = memory.refused | (is_dish[EGO] & (new.delivered == 0))
+    # The teammate may know which dish it wants, so what it cooks is a hint, although it may err.
+    had = old.hands[TEAMMATE]
+    into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
+    put = (had >> 2 > 0) & (had & PLATE == 0) & (new.hands[TEAMMATE] == 0) & into_pot
+    seen = memory.seen + jnp.where(put, _pieces(had), 0)
+    fits = (_pieces(dishes) @ seen) / jnp.maximum(seen.sum(), 1)
+    score = jnp.where(paid, 100.0, fits + 0.1 * memory.order) - 1000.0 * (refused | (dishes == _NO_DISH))
+    idle = jnp.all(new.pot_items == 0) & (new.hands[EGO] == 0)
+    change = idle | refused[memory.belief] | paid.any()
+    belief = jnp.where(change, score.argmax(), memory.belief)
+    return memory._replace(paid=paid, refused=refused, seen=seen, belief=belief)
+
+
+def _pieces(items: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
+    """Return the number of pieces of each ingredient in items."""
+    return (items[..., None] >> np.array([2, 4, 6], np.uint8) & 3).astype(jnp.int32)
