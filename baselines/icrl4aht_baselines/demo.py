@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from icrl4aht_baselines.agents.egos import AGENTS, find_agent
+from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
@@ -26,6 +26,7 @@ from icrl4aht_baselines.training.run_folder import RUN_CURVES
 from icrl4aht_baselines.training.seen import overlap_legend
 from icrl4aht_baselines.training.trainer import format_loss, train
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
@@ -138,7 +139,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     tasks = settings.tasks
     if tasks is None:
         tasks = tuple(task for task in bundled_by_id("validation").values() if task.layout.name == DEMO_LAYOUT)
-    others = [*AGENTS, *([settings.reference] if settings.reference else [])]
+    others = [*REFERENCES, *([settings.reference] if settings.reference else [])]
     say(5, f"evaluating it and {', '.join(others)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
     runs = [_evaluate(name, out, tasks, settings) for name in (*others, str(out / "ad"))]
     own, cells = runs[-1], [*runs[0].cells]
@@ -151,7 +152,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     write(pd.DataFrame(means).T.to_string())
 
     say(6, "drawing the curves and the report")
-    models, egos = ([run for run in runs if (run.agent in AGENTS) == is_ego] for is_ego in (False, True))
+    models, egos = ([run for run in runs if (run.agent in REFERENCES) == is_ego] for is_ego in (False, True))
     levels = {cell.title: {run.agent: float(run.cells[cell].mean()) for run in egos} for cell in cells}
     plot_return_curves({cell.title: {run.agent: run.cells[cell] for run in models} for cell in cells}, picture, levels)
     write_page_with_episodes(runs, page)

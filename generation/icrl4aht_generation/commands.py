@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.console import Console
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, TESTED_ON, TRACKS
+from icrl4aht_data.benchmark.facts import ALGORITHMS, PREFERENCE, TESTED_ON, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import (
@@ -287,12 +287,14 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
 )
 @overwrite_option
 def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
-    """Write the manifests of test, validation and diverse tasks.
+    """Write the manifests of test, validation, diverse and preference tasks.
 
     Makes TRACK_test.jsonl from the published parameter sets, and TRACK_validation.jsonl, TRACK_diverse_train.jsonl and
-    TRACK_diverse_validation.jsonl from the drawn teammates that `draws` measured. Files that have these tasks are kept.
+    TRACK_diverse_validation.jsonl from the drawn teammates that `draws` measured, and those of the track preference.
+    Files that have these tasks are kept.
     """
     from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
+    from icrl4aht_generation.teammates.preference import preference_tasks
 
     made = [(manifest_path(track, "test"), published_tasks(track)) for track in TRACKS]
     made += [(manifest_path(track, "validation"), validation_tasks(track)) for track in TRACKS]
@@ -301,6 +303,7 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
         for track in TRACKS
         for split in ("train", "validation")
     ]
+    made += [(manifest_path(PREFERENCE, split), preference_tasks(split)) for split in ("train", "validation", "test")]
     for path, tasks in made:
         path = out / path.name if out else path
         if check or path.is_file():

@@ -32,6 +32,20 @@ TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """Short layout names of each track and split: track -> split -> layouts (paper, App. A)."""
 
+PREFERENCE = "preference"
+"""A track of this project, not of the paper: each task wants one dish, which no observation shows (see
+docs/preference.md)."""
+
+PREFERENCE_LAYOUTS: dict[str, tuple[str, ...]] = {
+    "train": (),
+    "test": (),
+}
+"""Layouts of the track `PREFERENCE`: those of training, validation and of half of the test tasks, and those of the
+other half of the test tasks."""
+
+ALL_TRACKS = (*TRACKS, PREFERENCE)
+"""The benchmark's tracks and the project's own."""
+
 TESTED_ON = {
     **{layout: layout for layout in _TEAMMATE_LAYOUTS},
     "asymm_both": "asymm_right",
@@ -121,6 +135,8 @@ def kind_family(kind: str) -> str | None:
 
 def track_layouts(track: str, split: str) -> tuple[str, ...]:
     """Return the short names of a track's layouts in a split; further ones are in every split of `layout`."""
+    if track == PREFERENCE:
+        return PREFERENCE_LAYOUTS["train"] + (PREFERENCE_LAYOUTS["test"] if split == "test" else ())
     return (*TRACKS[track][split], *(further_layout_names() if track == "layout" else ()))
 
 
@@ -170,7 +186,7 @@ def check_membership(track: Any, split: Any, layout: Any) -> None:
     Raises:
         UnknownNameError: lists the valid names and the nearest.
     """
-    check_choice("track", track, TRACKS)
+    check_choice("track", track, ALL_TRACKS)
     check_choice("split", split, SPLITS)
-    if layout not in TRACKS[track][split] and layout not in (names := track_layouts(track, split)):
+    if layout not in (names := track_layouts(track, split)):
         raise unknown(f"layout of the {split} split of track {track}", layout, names)

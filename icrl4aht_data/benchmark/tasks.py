@@ -21,10 +21,10 @@ from msgspec import Meta
 
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
+    ALL_TRACKS,
     HEURISTIC_KINDS,
     SPLITS,
     TEAMMATE_PLUGINS,
-    TRACKS,
     check_family,
     check_membership,
     kind_family,
@@ -47,7 +47,7 @@ class Task:
 
     Args:
         task_id: name of the task, made from the other fields by `task_id`.
-        track: "teammate" or "layout".
+        track: "teammate", "layout" or "preference".
         split: "train", "validation", "test" or "heldout".
         layout_name: the layout's environment name, as in the published manifests.
         seed: seed of the ego's training.
@@ -187,7 +187,7 @@ def manifest_path(track: str, split: str, teammates: Literal["", "diverse"] = ""
     Raises:
         UnknownNameError: for an unknown track or split.
     """
-    check_choice("track", track, TRACKS)
+    check_choice("track", track, ALL_TRACKS)
     check_choice("split", split, SPLITS)
     return Path(__file__).parent.parent / "manifests" / f"{'_'.join(filter(None, (track, teammates, split)))}.jsonl"
 

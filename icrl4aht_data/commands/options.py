@@ -11,7 +11,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from icrl4aht_data.benchmark.facts import SPLITS, TRACKS, all_families
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, SPLITS, all_families
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.fetch import is_address
 from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout_names
@@ -42,7 +42,7 @@ class Names(click.ParamType):
 
 
 LAYOUT = Names("layout", all_layout_names, offered=lambda: [*LAYOUTS, *LAYOUT_PLUGINS.names])
-TRACK, SPLIT = Names("track", lambda: TRACKS), Names("split", lambda: SPLITS)
+TRACK, SPLIT = Names("track", lambda: ALL_TRACKS), Names("split", lambda: SPLITS)
 FAMILY = Names("family", all_families)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import SOURCES, SPLITS, TRACKS, all_families
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, SOURCES, SPLITS, all_families
 from icrl4aht_data.errors import (
     EmptySelectionError,
     IndexFormatError,
@@ -34,7 +34,7 @@ LAYOUT_FAMILY = "layout_family"
 
 _KNOWN_VALUES: dict[str, Callable[[], Sequence[str]]] = {
     "split": lambda: SPLITS,
-    "track": lambda: tuple(TRACKS),
+    "track": lambda: ALL_TRACKS,
     "teammate_family": all_families,
     "source": lambda: SOURCES,
 }

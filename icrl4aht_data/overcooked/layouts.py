@@ -7,9 +7,11 @@ a digit = ingredient pile, a space = floor. Source: paper, App. A.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
+from pathlib import Path
 from string import digits
 
 import numpy as np
@@ -304,7 +306,7 @@ def get_layout(name: str) -> Layout:
         UnknownNameError: lists the valid names and the nearest.
         PluginError: if a registered layout cannot be used.
     """
-    layout = LAYOUTS.get(name) or _BY_ALIAS.get(name) or _OF_RELEASES.get(name)
+    layout = LAYOUTS.get(name) or _BY_ALIAS.get(name) or _OF_RELEASES.get(name) or _of_manifests().get(name)
     if layout is not None:
         return layout
     if name not in LAYOUT_PLUGINS.names:
@@ -315,6 +317,17 @@ def get_layout(name: str) -> Layout:
             name, f"expected name and alias {name!r}, found name {layout.name!r} and alias {layout.alias!r}"
         )
     return layout
+
+
+@cache
+def _of_manifests() -> dict[str, Layout]:
+    """Return the layouts of this package's own tasks that are not published: name -> layout."""
+    path = Path(__file__).parent.parent / "manifests" / "layouts.jsonl"
+    lines = map(json.loads, path.read_text(encoding="utf-8").splitlines())
+    return {
+        line["name"]: Layout(line["name"], line["name"], tuple(line["map"]), tuple(map(tuple, line["recipes"])))  # type: ignore[arg-type]
+        for line in lines
+    }
 
 
 @lru_cache(maxsize=1024)

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.experts.search import search
 from icrl4aht_generation.policy import Policy
 
 from icrl4aht_baselines.agents.bundled import bundled_models
@@ -104,8 +105,11 @@ def random(layout: Layout) -> Policy:
     return Policy((), _no_memory, _act_randomly, "situation")
 
 
-AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle}
+AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle, "search": search}
 """Reference egos: name -> function from a layout to the policy."""
+
+SCRIPTED: tuple[Callable[..., Policy], ...] = (oracle, search)
+"""Reference egos whose parameters are facts of the layouts; their functions also take several layouts."""
 
 
 def ego_on(make: Callable[[Layout], Policy], layouts: Sequence[Layout]) -> Policy:
@@ -118,8 +122,8 @@ def ego_on(make: Callable[[Layout], Policy], layouts: Sequence[Layout]) -> Polic
     Raises:
         OptionError: if the ego has different policies on these layouts, or sees their own channels or state records.
     """
-    if make is oracle:
-        return oracle(layouts)
+    if make in SCRIPTED:
+        return make(layouts)  # type: ignore[arg-type]
     egos = [make(layout) for layout in layouts]
     same = len({(one.init, one.act, id(one.params)) for one in egos}) == 1
     if not same or egos[0].sees not in ("situation", "canonical_input"):

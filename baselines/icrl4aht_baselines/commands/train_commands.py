@@ -38,7 +38,7 @@ from icrl4aht_data.utils.text import counted_noun
     "--agent",
     type=shared.EGO_NAME,
     required=True,
-    help="stay, random, oracle, a bundled model such as ad-reference, or a folder that `train` made.",
+    help="stay, random, oracle, search, a bundled model such as ad-reference, or a folder that `train` made.",
 )
 @shared.acting_option
 @shared.greedy_option
@@ -167,7 +167,7 @@ def report_command(
     "--ego",
     type=shared.EGO_NAME,
     default="random",
-    help="stay, random, oracle, a model such as ad-reference, or a run.",
+    help="stay, random, oracle, search, a model such as ad-reference, or a run.",
 )
 @shared.protocol_option
 @click.option("--seed", type=SEED, default=0, help="Seed of the episode.")

@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from icrl4aht_generation.experts.oracle import oracle
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.registry import build_teammate, check_theta
 
+from icrl4aht_baselines.agents.egos import SCRIPTED
 from icrl4aht_baselines.agents.host import HostPolicy
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.evaluate.results import Result, find_results, write_result
@@ -131,7 +131,9 @@ def _evaluate_groups(
     groups = _by_program(make_ego, egos, tasks)
 
     def run(group: list[Task]) -> list[Result]:
-        prepared = prepare_rollout(oracle if make_ego is oracle else egos.__getitem__, group, protocol, seeds, suite)
+        prepared = prepare_rollout(
+            make_ego if make_ego in SCRIPTED else egos.__getitem__, group, protocol, seeds, suite
+        )
         return _evaluate_group(group, prepared, len(seeds), settings, stopped, played)
 
     # Groups run at the same time: one compiles while another plays, and one alone does not use all cores. An ego
@@ -165,8 +167,8 @@ def _by_program(
 def _program(task: Task, ego: Policy | HostPolicy, make_ego: MakeEgo) -> tuple[Any, ...]:
     """Return what tasks share that one compiled program plays: all that it is made of but tables and parameters."""
     kind, heuristic = task.teammate_kind, task.teammate["kind"] == "heuristic"
-    if make_ego is oracle and heuristic:
-        return kind, oracle
+    if make_ego in SCRIPTED and heuristic:
+        return kind, make_ego
     if isinstance(ego, HostPolicy) or ego.sees in ("state", "observation") or not heuristic:
         return kind, task.layout
     # A model of own channels takes the observations of layouts whose channels have equal names.
@@ -247,7 +249,7 @@ def prepare_rollout(
         for _ in seeds
     ]
     numbers = np.array([layouts.index(task.layout) for task in tasks for _ in seeds]) if several else None
-    ego = oracle(layouts) if several and make_ego is oracle else make_ego(layouts[0])
+    ego = make_ego(layouts) if several and make_ego in SCRIPTED else make_ego(layouts[0])
     rollout = EvaluationRollout(layouts if several else layouts[0], ego, mates, protocol, numbers)
     keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
     outside = isinstance(rollout.ego, HostPolicy)

@@ -107,7 +107,7 @@ class TestBadRuns:
         assert message in str(result.exception)
 
     def test_folders_without_a_run(self, runs, tmp_path):
-        with pytest.raises(UnknownNameError, match="unknown agent 'no/where'; valid: stay, random, oracle"):
+        with pytest.raises(UnknownNameError, match="unknown agent 'no/where'; valid: stay, random, oracle, search"):
             find_agent("no/where")
         with pytest.raises(UnknownNameError, match=r"not a run: config\.json is missing; `icrl4aht-data train` makes"):
             find_agent(tmp_path)

@@ -1,0 +1,86 @@
+"""Tasks of the track `preference`: the teammate wants one dish throughout, and no observation shows which.
+
+The current recipe of a task is its dish in every episode, and only this dish is paid. The scripted teammates know it,
+as they know the recipe elsewhere; one of them only watches. The layouts have no recipe indicator, so an ego learns the
+dish from what is paid, or from what its teammate cooks. Partners with hidden preferences are the field's own question:
+Yu et al. 2023 (HSP), and the biased partners of ZSC-Eval (Wang et al. 2024).
+
+Test tasks have published test teammates. Half of them are on layouts of training; the others are on layouts with rooms
+that no training layout has. Of ten dishes three are in test tasks only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations_with_replacement
+from typing import Any
+
+from icrl4aht_data.benchmark.facts import PREFERENCE, PREFERENCE_LAYOUTS
+from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
+from icrl4aht_generation.teammates.heuristics.territory import LAZY, TERRITORY
+from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_thetas
+from icrl4aht_generation.teammates.registry import sample_teammate
+
+WATCHER: dict[str, Any] = {
+    "kind": "heuristic",
+    "family": TERRITORY.kind,
+    "theta_id": INSTANCES,
+    "base_seed": 0,
+    "theta": TERRITORY.defaults | {"behavior_mode": LAZY, "action_probability": 0.0},
+}
+"""A teammate that never acts."""
+
+_DRAWS = {"train": 2, "validation": 3}
+"""Split -> seed of the diverse draws of its teammates, as in `teammates.draws`."""
+
+_TEST_TASKS = {"train": 5, "test": 10}
+"""Which layouts -> test tasks on each of them."""
+
+
+def all_dishes(layout: Layout) -> list[Dish]:
+    """Return the dishes of a layout's ingredients: 4 of two ingredients, 10 of three."""
+    return list(combinations_with_replacement(layout.ingredients, 3))  # type: ignore[arg-type]
+
+
+def training_dishes(layout: Layout) -> list[Dish]:
+    """Return the dishes of training and validation tasks: all 4, or 7 of 10."""
+    dishes = all_dishes(layout)
+    return [dish for number, dish in enumerate(dishes) if len(dishes) < 10 or number % 3 != 2]
+
+
+def preference_tasks(split: str) -> list[Task]:
+    """Return the tasks of the track `preference` of a split: "train", "validation" or "test"."""
+    tasks = []
+    for part in PREFERENCE_LAYOUTS if split == "test" else ("train",):
+        for number, name in enumerate(PREFERENCE_LAYOUTS[part]):
+            for dish, mate in _pairs(get_layout(name), split, number, part):
+                tasks.append(make_task(PREFERENCE, split, name, mate, 0, [dish]))
+    return tasks
+
+
+def _pairs(layout: Layout, split: str, number: int, part: str) -> Iterator[tuple[Dish, dict[str, Any]]]:
+    """Yield dish and teammate of each task on a layout; `number` shifts them, so that layouts have other pairs."""
+    dishes = all_dishes(layout) if split == "test" else training_dishes(layout)
+    mates = _teammates(layout, split)
+    if split == "train":
+        yield from ((dish, mates[(3 * k + number) % len(mates)]) for k, dish in enumerate(dishes * 4))
+        return
+    for k in range(_TEST_TASKS[part] if split == "test" else len(TESTED_FAMILIES)):
+        yield dishes[(k + number) % len(dishes)], mates[(6 * k + number) % len(mates)]
+
+
+def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
+    """Return the teammates of a split on a layout, families in turn, the one that only watches after each round."""
+    found = []
+    for instance in range(INSTANCES):
+        for family in TESTED_FAMILIES:
+            if split == "test":
+                published = layout.name.removesuffix("_plain")
+                theta = published_thetas(published if published in LAYOUTS else "demo_wide", family)[instance]
+                entry = {"kind": "heuristic", "family": family, "theta_id": instance, "base_seed": 0, "theta": theta}
+            else:
+                entry = sample_teammate(family, instance, "diverse", _DRAWS[split])
+            found.append(entry)
+        found.append(WATCHER)
+    return found
