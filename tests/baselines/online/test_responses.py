@@ -1,0 +1,107 @@
+"""Best responses and adaptation headroom: groups of tasks, choice of trainings, tables, and a tiny training."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks, test_tasks
+from icrl4aht_baselines.online.adaptation import HeadroomJob, headroom_jobs, headroom_table, write_headroom
+from icrl4aht_baselines.online.responses import (
+    ResponseJob,
+    ResponseOptions,
+    best_of,
+    find_behaviours,
+    with_headroom,
+    write_responses,
+)
+
+from icrl4aht_data.errors import OptionError
+
+TINY = ResponseOptions(steps=400, tasks=4)
+DEMO = test_tasks("teammate", "demo_wide")
+
+
+def test_tasks_with_headroom():
+    """Test cells count as measured, validation tasks as their draws were."""
+    flat = {task.layout.name for task in test_tasks("teammate")} - {
+        task.layout.name for task in with_headroom(test_tasks("teammate"))
+    }
+    assert flat == {"coord_simple", "test_simple"}
+    validation = bundled_tasks("teammate", "validation")
+    assert 0 < len(with_headroom(validation)) < len(validation)
+
+
+def test_teammates_that_act_alike_share_a_best_response():
+    """H4's instances are one behaviour on demo_wide, H3's are five."""
+    sizes = {
+        family: [len(one.tasks) for one in find_behaviours(test_tasks("teammate", "demo_wide", family))]
+        for family in ("H3", "H4")
+    }
+    assert sizes == {"H3": [1] * 5, "H4": [5]}
+
+
+def finished(job, choice: float, earned: float, slope: float = 0.0) -> None:
+    folder = job.out / job.name
+    folder.mkdir(parents=True)
+    modes = {"greedy": {"choice": choice, "return": earned}, "sampled": {"choice": choice - 1, "return": 99.0}}
+    result = {"settings": job.settings, "modes": modes, "slope": slope}
+    (folder / "result.json").write_text(json.dumps(result))
+
+
+def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
+    (behaviour,) = find_behaviours(DEMO[:1])
+    jobs = [ResponseJob(behaviour, seed, TINY, tmp_path) for seed in range(3)]
+    assert not any(job.is_finished() for job in jobs)
+    finished(jobs[0], choice=10.0, earned=9.0)
+    finished(jobs[1], choice=8.0, earned=20.0)
+    entry = best_of(jobs[:2])
+    assert (entry["best"], entry["agent"]) == (9.0, "best response, seed 0")
+    assert [one["acting"] for one in entry["seeds"]] == ["greedy"] * 2
+    path = write_responses(jobs, tmp_path)
+    card = json.loads(path.read_text())
+    assert [(one["tasks"], len(one["seeds"])) for one in card["behaviours"]] == [([DEMO[0].task_id], 2)]
+    other = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
+    assert not other.is_finished()  # a result of other settings
+
+
+def test_table_of_the_adaptation_headroom(tmp_path):
+    """Differences of two seeds 4 and 6: mean 5, and Student's interval with one degree of freedom, 5 +- 12.7."""
+    jobs = headroom_jobs({"demo_wide": DEMO[:2]}, 2, TINY, tmp_path)
+    returns = {("informed", 0): 10.0, ("informed", 1): 11.0, ("episodic", 0): 6.0, ("episodic", 1): 5.0}
+    for job in jobs:
+        (tmp_path / job.name).mkdir()
+        of_task = {task.task_id: returns[job.kind, job.seed] for task in job.tasks}
+        result = {"settings": job.settings, "returns": of_task}
+        (tmp_path / job.name / "result.json").write_text(json.dumps(result))
+        assert job.is_finished()
+    write_headroom(jobs, tmp_path)
+    assert headroom_table(tmp_path).splitlines()[-1] == "| demo_wide | 10.5 | 5.5 | +5.0 (-7.7 to +17.7) | 2 | 400 |"
+
+
+def test_every_task_must_be_played(tmp_path):
+    with pytest.raises(OptionError, match=r"tasks = 4: demo_wide has 20 tasks, .* give --tasks 20 or more"):
+        HeadroomJob("demo_wide", tuple(DEMO), "informed", 0, TINY, tmp_path)
+
+
+@pytest.mark.slow
+def test_tiny_trainings(tmp_path):
+    """A best response on one task, and both egos on two layouts and families; a second call does nothing."""
+    (behaviour,) = find_behaviours(DEMO[:1])
+    job = ResponseJob(behaviour, 0, TINY, tmp_path)
+    calls = []
+    job.run(lambda updates, speed: calls.append(updates))
+    assert calls == [1]
+    assert job.is_finished()
+    modes = job.result()["modes"]
+    assert all(np.isfinite(list(found.values())).all() for found in modes.values())
+    before = (tmp_path / job.name / "result.json").read_bytes()
+    job.run(lambda updates, speed: pytest.fail("trained again"))
+    assert (tmp_path / job.name / "result.json").read_bytes() == before
+    tasks = {"all": [DEMO[0], DEMO[5], *test_tasks("teammate", "test_wide", "H1")[:1]]}
+    for other in headroom_jobs(tasks, 1, TINY, tmp_path):
+        other.run()
+        assert set(other.result()) == {task.task_id for task in tasks["all"]}
+    assert "| all |" in headroom_table(write_headroom(headroom_jobs(tasks, 1, TINY, tmp_path), tmp_path).parent)

@@ -1,0 +1,86 @@
+"""The queue: local processes, failures, further attempts, jobs of other processes."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from icrl4aht_generation.collection.job import CollectionJob
+from icrl4aht_generation.jobs.job import FailedJobsError, OnUpdate
+from icrl4aht_generation.jobs.options import QueueOptions
+from icrl4aht_generation.jobs.queue import run_jobs
+from icrl4aht_generation.learners.resume import BusyError
+from icrl4aht_generation.populations.build import population_runs
+from icrl4aht_generation.populations.train import PopulationJob
+from icrl4aht_generation.profiles import load_profile
+from rich.console import Console
+
+
+@dataclass(frozen=True)
+class FileJob:
+    """Writes the number of its process into a file; fails in its first `failures` attempts."""
+
+    out: Path
+    name: str
+    failures: int = 0
+    busy: bool = False
+    updates: int = 1
+    xla_threads: int | None = 1
+
+    @property
+    def label(self) -> str:
+        return self.name
+
+    def is_finished(self) -> bool:
+        return (self.out / self.name).is_file()
+
+    def progress(self) -> tuple[int, float] | None:
+        return None
+
+    def run(self, on_update: OnUpdate, wait: bool) -> None:
+        if self.busy and not wait:
+            raise BusyError("busy")
+        tries = self.out / f"{self.name}.tries"
+        tries.write_text(tries.read_text() + "x" if tries.exists() else "x")
+        if len(tries.read_text()) <= self.failures:
+            raise ValueError(f"attempt {len(tries.read_text())}")
+        (self.out / self.name).write_text(str(os.getpid()))
+
+
+def run(jobs, out: Path, **options) -> str:
+    console = Console(file=StringIO(), width=200)
+    run_jobs(jobs, out, console, QueueOptions(**options))
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_local_processes(tmp_path):
+    """Two workers: every job has a process of its own, one that fails once is tried again, one always fails."""
+    jobs = [FileJob(tmp_path, "good"), FileJob(tmp_path, "busy", busy=True), FileJob(tmp_path, "bad", failures=9)]
+    jobs.append(FileJob(tmp_path, "later", failures=1))
+    with pytest.raises(FailedJobsError, match=r"1 of 4 jobs are unfinished: bad; .*failed\.jsonl has the reasons"):
+        run(jobs, tmp_path, workers=2, retries=1)
+    pids = {(tmp_path / name).read_text() for name in ("good", "busy", "later")}
+    assert len(pids) == 3
+    assert str(os.getpid()) not in pids
+    (line,) = map(json.loads, (tmp_path / "failed.jsonl").read_text().splitlines())
+    assert (line["task_id"], line["attempts"], line["error"]) == ("bad", 2, "ValueError: attempt 2")
+    assert "test_queue.py" in line["traceback"]
+    (tmp_path / "bad.tries").write_text("x" * 9)
+    printed = run(jobs, tmp_path)
+    assert printed.count("finished before") == 3
+    assert not (tmp_path / "failed.jsonl").exists()
+    assert (tmp_path / "bad").read_text() == str(os.getpid())
+
+
+def test_jobs_of_a_rebuild_have_names_and_updates(tmp_path):
+    profile = load_profile("smoke")
+    populations = population_runs(profile, {"demo_wide": ["fcp"]}, 0)
+    jobs = [CollectionJob(work, profile, tmp_path) for work in profile.works()]
+    jobs += [PopulationJob(run, tmp_path, profile.xla_threads) for run in populations]  # type: ignore[arg-type]
+    assert len({job.name for job in jobs}) == len(jobs)
+    assert jobs[-1].name == "demo_wide/fcp"
+    assert all(job.updates > 0 and not job.is_finished() and job.progress() is None for job in jobs)

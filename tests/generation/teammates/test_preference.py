@@ -1,0 +1,56 @@
+"""Tasks of the track preference."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from icrl4aht_generation.layouts.families import find_generated, split_of
+from icrl4aht_generation.layouts.grids import canonical_map
+from icrl4aht_generation.teammates.preference import all_dishes, preference_tasks, training_dishes
+
+from icrl4aht_data.benchmark.facts import PREFERENCE, PREFERENCE_LAYOUTS
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
+from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
+
+SPLITS = {split: preference_tasks(split) for split in ("train", "validation", "test")}
+
+
+def test_manifests_have_these_tasks():
+    for split, tasks in SPLITS.items():
+        assert read_tasks(manifest_path(PREFERENCE, split)) == tasks
+
+
+def test_splits_are_disjoint():
+    """Test teammates but the watcher, layouts of half of the tests and three of ten dishes are in no training."""
+    layouts = {split: {task.layout_name for task in tasks} for split, tasks in SPLITS.items()}
+    assert layouts["train"] == layouts["validation"] == set(PREFERENCE_LAYOUTS["train"])
+    halves = Counter(task.layout_name in layouts["train"] for task in SPLITS["test"])
+    assert halves == {True: 60, False: 60}
+    mates = {split: {teammate_id(task.teammate) for task in tasks} for split, tasks in SPLITS.items()}
+    assert len(mates["train"] & mates["test"]) == len(mates["validation"] & mates["test"]) == 1  # the watcher
+    dishes = {split: {(t.layout_name, t.recipes) for t in tasks} for split, tasks in SPLITS.items()}
+    for name in PREFERENCE_LAYOUTS["train"]:
+        layout = get_layout(name)
+        new = len(all_dishes(layout)) - len(training_dishes(layout))
+        assert new == {4: 0, 10: 3}[len(all_dishes(layout))]
+    assert any(pair not in dishes["train"] for pair in dishes["test"] if pair[0] in layouts["train"])
+    families = {split: {task.teammate_family for task in tasks} for split, tasks in SPLITS.items()}
+    assert families["train"] == families["test"] == {"H1", "H2", "H3", "H4"}
+
+
+def test_layouts_hide_the_dish_and_are_what_their_names_say():
+    maps = Counter()
+    for split, names in PREFERENCE_LAYOUTS.items():
+        for name in names:
+            layout = get_layout(name)
+            assert not {"R", "L"} & set("".join(layout.rows))
+            assert not layout.indicates_delivery
+            maps[canonical_map(layout)] += 1
+            if name.endswith("_plain"):
+                published = LAYOUTS[name.removesuffix("_plain")]
+                expected = tuple(row.replace("R", "W").replace("L", "W") for row in published.rows)
+                assert layout.rows == expected
+            else:
+                assert layout.rows == find_generated(name).rows
+                assert (split_of(layout) == "train") == (split == "train")
+    assert max(maps.values()) == 1
