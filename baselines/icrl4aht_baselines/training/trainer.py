@@ -304,7 +304,8 @@ def _with_params(state: Any, params: Any) -> Any:
     if found != expected:
         raise OptionError("initial parameters: of a model of other options; give those of the run that they come from")
     placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), params, state.params)
-    return state._replace(params=placed, slow=None if state.slow is None else jax.tree.map(jnp.copy, placed))
+    has_copy = getattr(state, "slow", None) is not None
+    return state._replace(params=placed, **({"slow": jax.tree.map(jnp.copy, placed)} if has_copy else {}))
 
 
 def agree_on_stop(save: bool, received: int) -> tuple[bool, int]:

@@ -88,9 +88,10 @@ def test_every_task_must_be_played(tmp_path):
 
 @pytest.mark.slow
 def test_tiny_trainings(tmp_path):
-    """A best response on one task, and both egos on two layouts and families; a second call does nothing."""
+    """A best response on one task from a bundled model, and both egos on two layouts and families; a second call does
+    nothing."""
     (behaviour,) = find_behaviours(DEMO[:1])
-    job = ResponseJob(behaviour, 0, TINY, tmp_path)
+    job = ResponseJob(behaviour, 0, replace(TINY, init="rl2-reference"), tmp_path)
     calls = []
     job.run(lambda updates, speed: calls.append(updates))
     assert calls == [1]
