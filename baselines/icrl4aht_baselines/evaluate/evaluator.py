@@ -106,9 +106,8 @@ def evaluate(
     partners = {plan.task.task_id: plan.partners for plan in planned}
     results = {} if out is None else find_results(out, tasks, settings, partners)
     missing = [plan for plan in planned if plan.task.task_id not in results]
-    evaluation = _Evaluation(
-        make_ego, rules, control, seeds, suite, settings, Programs() if programs is None else programs
-    )
+    programs = Programs() if programs is None else programs
+    evaluation = _Evaluation(make_ego, rules, control, seeds, suite, settings, programs)
     with ExitStack() as stack:
         if played is None and done is None:
             show = stack.enter_context(progress_bars(unit="episodes"))

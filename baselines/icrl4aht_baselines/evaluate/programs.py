@@ -48,7 +48,8 @@ class Programs:
         policies = [(policy.init, policy.act, policy.sees) for policy in (rollout.ego, rollout.teammates[0])]
         layouts = rollout.layout if isinstance(rollout.layout, Layout) else tuple(rollout.layout)
         shapes = tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
-        key = layouts, rollout.protocol, *policies, structure, shapes
+        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # others are in states and policies
+        key = layouts, rules, *policies, structure, shapes
         with self._lock:
             found = self._found.get(key)
             mine = found is None
