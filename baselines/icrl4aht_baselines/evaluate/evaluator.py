@@ -292,7 +292,8 @@ def _first_state(rollout: EvaluationRollout, tasks: Sequence[Task], seeds: Seque
 
 def _next_state(rollout: EvaluationRollout, earlier: PreparedRollout) -> RolloutState:
     before = earlier.rollout
-    if rollout.layout == before.layout and np.array_equal(rollout.numbers, before.numbers):
+    numbers = [None if one.numbers is None else one.numbers.tolist() for one in (rollout, before)]
+    if rollout.layout == before.layout and numbers[0] == numbers[1]:
         return earlier.state
     return jax.jit(rollout.enter)(earlier.state)
 

@@ -19,6 +19,7 @@ from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
 from icrl4aht_baselines.evaluate.segments import plan_tasks, segment_lengths
 from icrl4aht_baselines.report.controls import control_lines
+from icrl4aht_baselines.report.results import read_run
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task, published_tasks
 from icrl4aht_generation.teammates.registry import build_teammate
@@ -103,8 +104,8 @@ def test_controls_of_an_ego_without_memory_earn_the_same(alone, programs):
     found = evaluate_controls("random", ego(RANDOM), TASKS, FOUR, programs=programs)
     np.testing.assert_array_equal([result.returns[0] for result in found.plain], alone[1])
     assert not found.memory.any() and not found.partner.any()
-    first = [[result.returns[0][:2] for result in results] for results in (found.plain, found.swapped)]
-    assert not np.array_equal(*first)
+    first, swapped = ([result.returns[0][:2] for result in results] for results in (found.plain, found.swapped))
+    assert first != swapped
 
 
 def test_swap_changes_teammates_at_25_50_and_75(programs):
@@ -259,22 +260,23 @@ def test_controls_command(programs, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "icrl4aht_baselines.commands.train_commands.find_ego", lambda option, name, **mode: NamedEgo(name, ego(PAID))
     )
-    monkeypatch.setattr("icrl4aht_baselines.evaluate.controls.Programs", lambda: programs)
+    for module in ("controls", "evaluator"):
+        monkeypatch.setattr(f"icrl4aht_baselines.evaluate.{module}.Programs", lambda: programs)
     write_tasks(tmp_path / "two.jsonl", TASKS)
-    command = [
-        "evaluate",
-        "--agent",
-        "mine",
-        "--manifest",
-        str(tmp_path / "two.jsonl"),
-        "--episodes",
-        "4",
-        "--controls",
-    ]
-    result = CliRunner().invoke(cli, [*command, "--out", str(tmp_path / "run")])
+
+    def run(folder, *options):
+        command = ["evaluate", "--agent", "mine", "--manifest", str(tmp_path / "two.jsonl"), *options]
+        return CliRunner().invoke(cli, [*command, "--out", str(tmp_path / folder)])
+
+    result = run("run", "--episodes", "4", "--controls")
     assert result.exit_code == 0, result.output
     assert "track teammate, memory M: " in result.output and "track teammate, partner P: " in result.output
     for folder in ("run", "run/forgets", "run/swapped"):
         assert len(list((tmp_path / folder / "tasks").glob("*.json"))) == 2
-    result = CliRunner().invoke(cli, [*command, "--forget", "--out", str(tmp_path / "run")])
+    result = run("run", "--controls", "--forget")
     assert result.exit_code == 2 and "--controls: not with --forget" in result.output
+    result = run("swap", "--protocol", "swap", "--episodes", "50")
+    assert result.exit_code == 0 and "(swap), 2 test cells" in result.output, result.output
+    result = run("forgets", "--episodes", "4", "--forget")
+    assert result.exit_code == 0, result.output
+    assert read_run(tmp_path / "forgets").table.equals(read_run(tmp_path / "run/forgets").table)
