@@ -29,7 +29,7 @@ from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS
-from icrl4aht_baselines.agents.egos import FORGETS, find_agent
+from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
@@ -298,15 +298,16 @@ class _Steps:
         kinds += [("test-seeded-forgets", "seeded", 1, True)] if recipe.forgets else []
         for kind, protocol, seeds, forgets in kinds:
             tasks, folder = self._tasks(kind), self.out / "results" / f"{name}-{self.track}" / kind
-            agent, played = find_agent(run, greedy=recipe.greedy, forget=forgets), get_protocol(protocol)
+            agent, played = find_agent(run, greedy=recipe.greedy), get_protocol(protocol)
             was_done = len(list((folder / "tasks").glob("*.json"))) >= len(tasks)
             with self.timed(f"results/{name}-{self.track}/{kind}", was_done=was_done):
                 evaluate(
-                    name + FORGETS * forgets,
+                    name,
                     agent.make,
                     tasks,
                     played,
                     seeds=range(seeds),
+                    control="forgets" if forgets else None,
                     out=folder,
                     details=agent.details,
                     played=counted(self.show, f"{name}-{self.track}, {kind}", len(tasks) * seeds * played.episodes),

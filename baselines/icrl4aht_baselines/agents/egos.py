@@ -34,9 +34,6 @@ and values of each step. When the window of AD, Hybrid-AD or AMAGO-Offline is fu
 rest is computed again: the window has between 4/5 K and K steps. The context of DPT changes only when an episode ends,
 so both compute it once for each episode."""
 
-FORGETS = " (forgets)"
-"""End of the name of an agent whose memory is cleared at the start of each episode."""
-
 
 class PlayMode(NamedTuple):
     """Way in which a trained model plays.
@@ -44,23 +41,20 @@ class PlayMode(NamedTuple):
     Attributes:
         acting: how it remembers, see `ACTING`.
         greedy: whether it takes its most probable action, as published, or draws one.
-        forget: whether its memory is cleared at the start of each episode, which limits its context to the episode.
     """
 
     acting: Acting = "cached"
     greedy: bool = True
-    forget: bool = False
 
     @classmethod
     def from_details(cls, details: Mapping[str, Any]) -> PlayMode:
         """Return the mode that the details of results state."""
-        return cls(details.get("acting", "cached"), not details.get("sampled"), bool(details.get("forget")))
+        return cls(details.get("acting", "cached"), not details.get("sampled"))
 
     @property
     def details(self) -> dict[str, Any]:
         """Settings that results depend on."""
-        changed = {"sampled": not self.greedy, "forget": self.forget}
-        return {"acting": self.acting} | {name: True for name, value in changed.items() if value}
+        return {"acting": self.acting} | ({} if self.greedy else {"sampled": True})
 
 
 AS_PUBLISHED = PlayMode()
@@ -134,9 +128,7 @@ def ego_on(make: Callable[[Layout], Policy], layouts: Sequence[Layout]) -> Polic
     return egos[0]
 
 
-def find_agent(
-    name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None, forget: bool = False
-) -> NamedEgo:
+def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None) -> NamedEgo:
     """Return a reference ego, a bundled model, or the trained model in a run folder of `icrl4aht-data train`.
 
     A bundled model plays each layout by its model of the layout's track.
@@ -146,7 +138,6 @@ def find_agent(
         acting: how a trained model remembers, see `ACTING`; "cached" by default.
         greedy: whether a trained model takes its most probable action or draws one; by default as its published
             results were made.
-        forget: whether a trained model's memory is cleared at the start of each episode.
 
     Raises:
         UnknownNameError: if the name is none of these, or the way of acting is unknown.
@@ -162,9 +153,8 @@ def find_agent(
     if model is None and not (Path(name) / CONFIG).is_file():
         raise UnknownNameError(f"{name}: not a run: {CONFIG} is missing; `icrl4aht-data train` makes runs")
     own_greedy = model is None or not model.sampled
-    mode = PlayMode(acting or "cached", own_greedy if greedy is None else greedy, forget)
-    drawn = "" if mode.greedy == own_greedy else " (greedy)" if mode.greedy else " (sampled)"
-    suffix = drawn + FORGETS * forget
+    mode = PlayMode(acting or "cached", own_greedy if greedy is None else greedy)
+    suffix = "" if mode.greedy == own_greedy else " (greedy)" if mode.greedy else " (sampled)"
     if model is None:
         run = read_trained(Path(name))
         details = {"run": run.hash, "step": run.step, "context": run.context, "encoder": run.encoder, **mode.details}
@@ -208,7 +198,7 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
 
 
 def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLISHED) -> Policy:
-    """Return the ego of a trained model. Its memory lasts for the complete task, unless it is to forget.
+    """Return the ego of a trained model. Its memory lasts for the complete task.
 
     Args:
         method: the method with which the model was trained.
@@ -226,14 +216,7 @@ def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLI
         return method.start(context, mode.acting == "cached")
 
     def act(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
-        step, done = input_step(ego_input), ego_input.prev_done
-        if mode.forget:
-            # An episode is played as a task's first one: an empty memory, and zeros for the step before.
-            memory = jax.tree.map(lambda new, old: jnp.where(done, new, old), start(), memory)
-            before = step._replace(obs=None)
-            before = jax.tree.map(lambda value: jnp.where(done, 0, value), before)
-            step, done = before._replace(obs=step.obs), jnp.bool_(False)
-        logits, memory = method.act(params, step, done, memory)
+        logits, memory = method.act(params, input_step(ego_input), ego_input.prev_done, memory)
         action = logits.argmax() if mode.greedy else jax.random.categorical(key, logits)
         return action.astype(jnp.int32), memory
 

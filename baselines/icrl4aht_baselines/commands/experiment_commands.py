@@ -116,8 +116,7 @@ def control_command(out: Path) -> None:
     "--protocol",
     type=shared.PROTOCOL_NAME,
     multiple=True,
-    default=lambda: tuple(shared.PROTOCOL_NAME.valid()),
-    show_default="all",
+    default=("published", "seeded"),
     help="published or seeded; repeat for several.",
 )
 @click.option("--bundle", is_flag=True, help="Also replace headroom.json and headroom.md of the package's cards.")

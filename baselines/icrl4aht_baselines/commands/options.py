@@ -84,13 +84,18 @@ protocol_option = click.option(
     "--protocol",
     type=PROTOCOL_NAME,
     default="seeded",
-    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers.",
+    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers. swap: seeded, with "
+    "another teammate every 25 episodes.",
 )
 _ACTING = Names("acting", lazy_attribute("icrl4aht_baselines.agents.egos", "ACTING"))
 _ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster."
 acting_option = click.option("--acting", type=_ACTING, default="cached", help=_ACTING_HELP)
-forget_option = click.option(
-    "--forget", is_flag=True, help="Clear the memory of a trained model at the start of each episode."
+forget_option = click.option("--forget", is_flag=True, help="Clear the agent's memory before each episode.")
+controls_option = click.option(
+    "--controls",
+    is_flag=True,
+    help="Also play with the memory cleared before each episode, into OUT/forgets, and with another task's teammate in "
+    "all but the last 20 episodes, into OUT/swapped. Prints what memory (M) and the right partner (P) are worth.",
 )
 greedy_option = click.option(
     "--greedy/--sampled",

@@ -30,6 +30,7 @@ from icrl4aht_data.utils.text import counted_noun
     epilog=examples(
         "icrl4aht-data evaluate --agent random --out runs/random",
         "icrl4aht-data evaluate --agent runs/ad --layout demo_wide --out runs/ad-results",
+        "icrl4aht-data evaluate --agent ad-reference --layout demo_wide --controls --out runs/ad-controls",
         "icrl4aht-data evaluate --agent runs/ad --split validation --layout demo_wide --out runs/ad-validation",
         "icrl4aht-data evaluate --agent oracle --layout demo_wide --tasks 1 --episodes 5 --out runs/oracle",
     ),
@@ -43,6 +44,7 @@ from icrl4aht_data.utils.text import counted_noun
 @shared.acting_option
 @shared.greedy_option
 @shared.forget_option
+@shared.controls_option
 @shared.protocol_option
 @click.option(
     "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
@@ -66,6 +68,7 @@ def evaluate_command(
     acting: Any,
     greedy: bool | None,
     forget: bool,
+    controls: bool,
     protocol: str,
     track: tuple[str, ...],
     split: str | None,
@@ -85,8 +88,11 @@ def evaluate_command(
     training nor test. Split diverse has validation tasks with more kinds of teammates than the published training
     ranges.
     """
+    from icrl4aht_baselines.evaluate.controls import evaluate_controls
     from icrl4aht_baselines.evaluate.evaluator import count_programs, evaluate
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
+    from icrl4aht_baselines.evaluate.segments import CONTROLS
+    from icrl4aht_baselines.report.controls import control_lines
     from icrl4aht_baselines.report.page import summary_lines
     from icrl4aht_baselines.report.results import note_results, read_run
 
@@ -94,7 +100,9 @@ def evaluate_command(
         raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
     split = split or "test"
     given = read_tasks(manifest) if manifest else [task for name in track for task in bundled_tasks(name, split)]
-    ego = find_ego("--agent", agent, acting=acting, greedy=greedy, forget=forget)
+    if forget and controls:
+        raise click.UsageError("--controls: not with --forget, which is one of the controls; leave one of them out")
+    ego = find_ego("--agent", agent, acting=acting, greedy=greedy)
     names = {get_layout(name).name for name in layout}
     chosen = limit_tasks([task for task in given if not names or task.layout.name in names], tasks)
     if not chosen:
@@ -105,9 +113,16 @@ def evaluate_command(
     if chosen_seeds:
         shared.check_alone("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
-    evaluate(ego.name, ego.make, chosen, rules, seeds=seeds_of_tasks, suite=suite, out=out, details=ego.details)
+    options: Any = {"seeds": seeds_of_tasks, "suite": suite, "out": out, "details": ego.details}
+    lines = []
+    if controls:
+        lines = control_lines(evaluate_controls(ego.name, ego.make, chosen, rules, **options), chosen)
+        for control in CONTROLS:
+            note_results(out / control, ego.run, chosen)
+    else:
+        evaluate(ego.name, ego.make, chosen, rules, control="forgets" if forget else None, **options)
     note_results(out, ego.run, chosen)
-    for line in summary_lines([read_run(out)]):
+    for line in [*summary_lines([read_run(out)]), *lines]:
         click.echo(line)
     programs = counted_noun(count_programs(ego.make, chosen), "compiled program")
     click.echo(f"{counted_noun(len(chosen), 'result')} of {programs} in {out}; `icrl4aht-data report {out}` shows them")

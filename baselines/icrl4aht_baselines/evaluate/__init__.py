@@ -3,10 +3,20 @@
 import sys
 
 from icrl4aht_baselines import CallablePackage
+from icrl4aht_baselines.evaluate.controls import ControlledResults, evaluate_controls
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, Protocol, get_protocol, test_tasks
 from icrl4aht_baselines.evaluate.results import Result
 
-__all__ = ["PROTOCOLS", "Protocol", "Result", "evaluate", "get_protocol", "test_tasks"]
+__all__ = [
+    "PROTOCOLS",
+    "ControlledResults",
+    "Protocol",
+    "Result",
+    "evaluate",
+    "evaluate_controls",
+    "get_protocol",
+    "test_tasks",
+]
 
 sys.modules[__name__].__class__ = CallablePackage

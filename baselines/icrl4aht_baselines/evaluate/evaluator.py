@@ -8,10 +8,10 @@ evaluated in the same batch or process.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from threading import Event
@@ -25,11 +25,13 @@ from icrl4aht_generation.teammates.registry import build_teammate, check_theta
 
 from icrl4aht_baselines.agents.egos import SCRIPTED
 from icrl4aht_baselines.agents.host import HostPolicy
+from icrl4aht_baselines.evaluate.programs import Episode, Programs
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.evaluate.results import Result, find_results, write_result
 from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutState, task_key
+from icrl4aht_baselines.evaluate.segments import CONTROLS, Control, PlannedTask, plan_tasks, segment_lengths
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, check_choice
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.channels import channel_names
 from icrl4aht_data.overcooked.layouts import Layout
@@ -40,6 +42,8 @@ from icrl4aht_data.utils.system import usable_cores
 MakeEgo = Callable[[Layout], Policy | HostPolicy]
 """Function from a layout to the ego that plays on it."""
 
+_CONTROL_DETAILS: dict[Control, str] = {"forgets": "forget", "swapped": "swapped"}  # their marks in results
+
 
 def evaluate(
     agent: str,
@@ -49,10 +53,12 @@ def evaluate(
     *,
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
+    control: Control | None = None,
     out: Path | None = None,
     details: dict[str, Any] | None = None,
     done: Callable[[int], None] | None = None,
     played: Callable[[int], None] | None = None,
+    programs: Programs | None = None,
 ) -> list[Result]:
     """Evaluate an ego and return one result per task, in the order of `tasks`.
 
@@ -62,20 +68,23 @@ def evaluate(
         agent: name of the ego in results and reports.
         make_ego: layout -> ego, such as `icrl4aht_baselines.from_host(my_agent)`.
         tasks: the tasks, such as `icrl4aht_baselines.test_tasks("teammate")`.
-        protocol: rules of the evaluation, "seeded" or "published", or with fewer episodes those of `get_protocol`.
+        protocol: rules of the evaluation, one of `PROTOCOLS`, or with fewer episodes those of `get_protocol`.
         seeds: seeds of the episodes, such as (0, 1, 2); the ego plays every task once with each of them.
         suite: folder with the checkpoints of learned teammates, if tasks have any.
+        control: plays a control of the ego, one of `CONTROLS`. Its results have a name of their own, such as
+            "mine (forgets)". `evaluate_controls` plays the ego and all controls.
         out: folder for one JSON file per task. Results found there under the same settings are not computed again.
         details: further settings that the results depend on, as JSON; stored and compared with the results.
             `trained_on` among them states the training data, which reports compare with the tasks: see
             `icrl4aht_baselines.training.seen.read_trained_on`.
         done: called with the number of tasks finished since the last call, for progress.
         played: called with the number of episodes played since the last call, or found in `out`; by several threads.
+        programs: compiled programs of earlier evaluations of the ego, to which new ones are added.
 
     Raises:
         OptionError: if `out` has results of other settings or other files, seeds are not different integers from 0,
-            or the ego's actions are not integers in 0..5.
-        UnknownNameError: if there is no such protocol.
+            the ego's actions are not integers in 0..5, or a task has no partner for the control or the protocol.
+        UnknownNameError: if there is no such protocol or control.
         TaskFormatError: if a teammate's parameters are impossible; names the task.
     """
     rules = protocol if isinstance(protocol, Protocol) else get_protocol(protocol)
@@ -84,14 +93,21 @@ def evaluate(
         raise OptionError(f"make_ego = {make_ego!r}: expected a function layout -> ego, such as from_host(my_agent)")
     for task in tasks:
         _check_teammate(task, suite)
+    if control is not None:
+        check_choice("control", control, CONTROLS)
+        agent, details = f"{agent} ({control})", (details or {}) | {_CONTROL_DETAILS[control]: True}
     settings = {
         "agent": agent,
         "seeds": seeds,
-        "protocol": asdict(rules),
+        "protocol": rules.settings,
         "code_version": version("icrl4aht-data"),
     } | ({"details": details} if details else {})
-    results = {} if out is None else find_results(out, tasks, settings)
-    missing = [task for task in tasks if task.task_id not in results]
+    planned = plan_tasks(tasks, rules, control)
+    partners = {plan.task.task_id: plan.partners for plan in planned}
+    results = {} if out is None else find_results(out, tasks, settings, partners)
+    missing = [plan for plan in planned if plan.task.task_id not in results]
+    programs = Programs() if programs is None else programs
+    evaluation = _Evaluation(make_ego, rules, control, seeds, suite, settings, programs)
     with ExitStack() as stack:
         if played is None and done is None:
             show = stack.enter_context(progress_bars(unit="episodes"))
@@ -99,7 +115,7 @@ def evaluate(
         count_tasks, count_episodes = (count or (lambda number: None) for count in (done, played))
         count_tasks(len(results))
         count_episodes(len(results) * len(seeds) * rules.episodes)
-        for found in _evaluate_groups(make_ego, missing, rules, seeds, suite, settings, count_episodes):
+        for found in evaluation.play(missing, count_episodes):
             for result in found:
                 results[result.task_id] = result
                 if out is not None:
@@ -117,51 +133,79 @@ def _checked_seeds(seeds: Sequence[int]) -> list[int]:
     return found
 
 
-def _evaluate_groups(
-    make_ego: MakeEgo,
-    tasks: Sequence[Task],
-    protocol: Protocol,
-    seeds: Sequence[int],
-    suite: Path | None,
-    settings: dict[str, Any],
-    played: Callable[[int], None],
-) -> Iterator[list[Result]]:
-    """Yield the results of groups of tasks that share a compiled program, in the order in which they finish."""
-    egos = {layout: make_ego(layout) for layout in dict.fromkeys(task.layout for task in tasks)}
-    groups = _by_program(make_ego, egos, tasks)
+@dataclass(frozen=True)
+class _Evaluation:
+    """What all groups of tasks of an evaluation share."""
 
-    def run(group: list[Task]) -> list[Result]:
-        prepared = prepare_rollout(
-            make_ego if make_ego in SCRIPTED else egos.__getitem__, group, protocol, seeds, suite
-        )
-        return _evaluate_group(group, prepared, len(seeds), settings, stopped, played)
+    make_ego: MakeEgo
+    protocol: Protocol
+    control: Control | None
+    seeds: Sequence[int]
+    suite: Path | None
+    settings: dict[str, Any]
+    programs: Programs
 
-    # Groups run at the same time: one compiles while another plays, and one alone does not use all cores. An ego
-    # outside JAX gets a single thread, since its `reset` must come right before its episodes.
-    outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
-    stopped = Event()
-    with ThreadPoolExecutor(1 if outside else min(4, usable_cores())) as pool:
-        try:
-            for future in as_completed([pool.submit(run, group) for group in groups]):
-                yield future.result()
-        finally:
-            stopped.set()
-            pool.shutdown(cancel_futures=True)
+    def play(self, planned: Sequence[PlannedTask], played: Callable[[int], None]) -> Iterator[list[Result]]:
+        """Yield the results of groups of tasks that share compiled programs, in the order in which they finish."""
+        layouts = dict.fromkeys(task.layout for plan in planned for task in plan.played)
+        egos = {layout: self.make_ego(layout) for layout in layouts}
+        groups: dict[Any, list[PlannedTask]] = defaultdict(list)
+        for plan in planned:
+            groups[tuple(_program(task, egos[task.layout], self.make_ego) for task in plan.played)].append(plan)
+        stopped = Event()
+
+        def run(group: list[PlannedTask]) -> list[Result]:
+            make = self.make_ego if self.make_ego in SCRIPTED else egos.__getitem__
+            return self._play_group(group, make, stopped, played)
+
+        # Groups run at the same time: one compiles while another plays, and one alone does not use all cores. An ego
+        # outside JAX gets a single thread, since its `reset` must come right before its episodes.
+        outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
+        with ThreadPoolExecutor(1 if outside else min(4, usable_cores())) as pool:
+            try:
+                for future in as_completed([pool.submit(run, group) for group in groups.values()]):
+                    yield future.result()
+            finally:
+                stopped.set()
+                pool.shutdown(cancel_futures=True)
+
+    def _play_group(
+        self, group: list[PlannedTask], make_ego: MakeEgo, stopped: Event, played: Callable[[int], None]
+    ) -> list[Result]:
+        """Return the results of tasks that share compiled programs; none if it was stopped."""
+        returns, count = [], len(group) * len(self.seeds)
+        for episode in self._episodes(group, make_ego):
+            if stopped.is_set():
+                return []
+            ego = episode.actions[..., EGO]
+            low, high = int(ego.min()), int(ego.max())
+            if low < 0 or high >= len(ACTIONS):
+                name = group[0].task.layout.name
+                raise OptionError(f"the ego returned actions {low}..{high} on {name}, expected 0..5")
+            returns.append(np.asarray(episode.reward, np.float64).sum(axis=-1))
+            played(count)
+        per_task = np.stack(returns, axis=-1).reshape(len(group), len(self.seeds), -1)
+        return [
+            Result(plan.task.task_id, self.settings, rows.tolist(), list(plan.partners))
+            for plan, rows in zip(group, per_task, strict=True)
+        ]
+
+    def _episodes(self, group: list[PlannedTask], make_ego: MakeEgo) -> Iterator[EpisodeBatch]:
+        """Play all segments of tasks that share compiled programs; the egos keep their memory."""
+        lengths, prepared = segment_lengths(self.protocol, self.control), None
+        for number, episodes in enumerate(lengths):
+            tasks = [plan.played[number] for plan in group]
+            prepared = prepare_rollout(
+                make_ego, tasks, self.protocol, self.seeds, self.suite, programs=self.programs, earlier=prepared
+            )
+            state = yield from play_episodes(prepared, episodes, forget=self.control == "forgets")
+            prepared = prepared._replace(state=state)
 
 
 def count_programs(make_ego: MakeEgo, tasks: Sequence[Task]) -> int:
     """Return the number of programs that an evaluation of these tasks compiles, see `evaluate`."""
-    return len(_by_program(make_ego, {task.layout: make_ego(task.layout) for task in tasks}, tasks))
-
-
-def _by_program(
-    make_ego: MakeEgo, egos: Mapping[Layout, Policy | HostPolicy], tasks: Sequence[Task]
-) -> list[list[Task]]:
-    """Return the groups of tasks that one compiled program plays."""
-    groups: dict[Any, list[Task]] = defaultdict(list)
-    for task in tasks:
-        groups[_program(task, egos[task.layout], make_ego)].append(task)
-    return list(groups.values())
+    egos = {layout: make_ego(layout) for layout in dict.fromkeys(task.layout for task in tasks)}
+    return len({_program(task, egos[task.layout], make_ego) for task in tasks})
 
 
 def _program(task: Task, ego: Policy | HostPolicy, make_ego: MakeEgo) -> tuple[Any, ...]:
@@ -189,29 +233,6 @@ def _check_teammate(task: Task, suite: Path | None) -> None:
         raise
 
 
-def _evaluate_group(
-    tasks: list[Task],
-    prepared: PreparedRollout,
-    seeds: int,
-    settings: dict[str, Any],
-    stopped: Event,
-    done: Callable[[int], None],
-) -> list[Result]:
-    """Return the results of tasks that share a compiled program; none if it was stopped."""
-    returns = []
-    for episode in play_episodes(prepared):
-        if stopped.is_set():
-            return []
-        ego = episode.actions[..., EGO]
-        low, high = int(ego.min()), int(ego.max())
-        if low < 0 or high >= len(ACTIONS):
-            raise OptionError(f"the ego returned actions {low}..{high} on {tasks[0].layout.name}, expected 0..5")
-        returns.append(np.asarray(episode.reward, np.float64).sum(axis=-1))
-        done(len(tasks) * seeds)
-    per_task = np.stack(returns, axis=-1).reshape(len(tasks), seeds, -1)
-    return [Result(task.task_id, settings, rows.tolist()) for task, rows in zip(tasks, per_task, strict=True)]
-
-
 class PreparedRollout(NamedTuple):
     """Tasks that share a compiled program, ready to play.
 
@@ -223,7 +244,7 @@ class PreparedRollout(NamedTuple):
 
     rollout: EvaluationRollout
     state: RolloutState
-    episode: Callable[..., tuple[RolloutState, EpisodeBatch]]
+    episode: Episode
 
 
 def prepare_rollout(
@@ -232,11 +253,20 @@ def prepare_rollout(
     protocol: Protocol,
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
+    *,
+    programs: Programs | None = None,
+    earlier: PreparedRollout | None = None,
 ) -> PreparedRollout:
     """Compile the episodes of tasks that share a teammate family.
 
     Tasks on several layouts need an ego whose functions and parameters are the same on all of them, see
     `EvaluationRollout`.
+
+    Args:
+        make_ego, tasks, protocol, seeds, suite: see `evaluate`.
+        programs: compiled programs, to use and to add to.
+        earlier: the same tasks with the teammates of earlier episodes, from whose state they continue; by default they
+            start.
 
     Raises:
         OptionError: if the ego's action is not one integer for each observation.
@@ -251,26 +281,22 @@ def prepare_rollout(
     numbers = np.array([layouts.index(task.layout) for task in tasks for _ in seeds]) if several else None
     ego = make_ego(layouts) if several and make_ego in SCRIPTED else make_ego(layouts[0])
     rollout = EvaluationRollout(layouts if several else layouts[0], ego, mates, protocol, numbers)
+    state = _first_state(rollout, tasks, seeds) if earlier is None else _next_state(rollout, earlier)
+    programs = Programs() if programs is None else programs
+    return PreparedRollout(rollout, state, programs.episode(rollout, state))
+
+
+def _first_state(rollout: EvaluationRollout, tasks: Sequence[Task], seeds: Sequence[int]) -> RolloutState:
     keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
-    outside = isinstance(rollout.ego, HostPolicy)
-    state = rollout.start(keys) if outside else jax.jit(rollout.start)(keys)
-    _check_actions(rollout, state)
-    episode = jax.jit(rollout.episode)
-    if outside:
-        return PreparedRollout(rollout, state, episode)
-    compiled = episode.lower(rollout.ego.params, rollout.teammate_params, state).compile()
-    return PreparedRollout(rollout, state, compiled)
+    return rollout.start(keys) if isinstance(rollout.ego, HostPolicy) else jax.jit(rollout.start)(keys)
 
 
-def _check_actions(rollout: EvaluationRollout, state: RolloutState) -> None:
-    """Trace one step of the egos, which yields shape and dtype of their actions without computing any."""
-    keys = state.env.key
-    actions, _ = jax.eval_shape(rollout.ego_actions, rollout.ego.params, state, keys)
-    if actions.shape != keys.shape or not jnp.issubdtype(actions.dtype, jnp.integer):
-        raise OptionError(
-            f"the ego's actions are {actions.dtype} of shape {actions.shape} for {keys.shape[0]} observations, "
-            f"expected one integer 0..5 for each"
-        )
+def _next_state(rollout: EvaluationRollout, earlier: PreparedRollout) -> RolloutState:
+    before = earlier.rollout
+    numbers = [None if one.numbers is None else one.numbers.tolist() for one in (rollout, before)]
+    if rollout.layout == before.layout and numbers[0] == numbers[1]:
+        return earlier.state
+    return jax.jit(rollout.enter)(earlier.state)
 
 
 def play_tasks(
@@ -279,29 +305,55 @@ def play_tasks(
     protocol: Protocol,
     seeds: Sequence[int] = (0,),
     suite: Path | None = None,
+    forget: bool = False,
 ) -> Iterator[EpisodeBatch]:
     """Play tasks that share a teammate family, see `prepare_rollout`.
 
+    Args:
+        make_ego, tasks, protocol, seeds, suite: see `evaluate`.
+        forget: whether the egos' memory is cleared before each episode.
+
     Yields:
         One `EpisodeBatch` after another with B = tasks x seeds; seeds vary fastest.
+
+    Raises:
+        OptionError: if the protocol changes teammates in these episodes, which `evaluate` alone can play.
     """
-    yield from play_episodes(prepare_rollout(make_ego, tasks, protocol, seeds, suite))
+    if len(segment_lengths(protocol)) > 1:
+        raise OptionError(
+            f"protocol {protocol.name}: the teammate changes every {protocol.swap_every} episodes; expected at most as "
+            f"many here, found {protocol.episodes}"
+        )
+    yield from play_episodes(prepare_rollout(make_ego, tasks, protocol, seeds, suite), forget=forget)
 
 
-def play_episodes(prepared: PreparedRollout) -> Iterator[EpisodeBatch]:
-    """Play all episodes of prepared tasks.
+def play_episodes(
+    prepared: PreparedRollout, episodes: int | None = None, *, forget: bool = False
+) -> Generator[EpisodeBatch, None, RolloutState]:
+    """Play episodes of prepared tasks.
+
+    Args:
+        prepared: the tasks.
+        episodes: number of episodes; by default those of the protocol.
+        forget: whether the egos' memory is cleared before each episode.
 
     Yields:
         One `EpisodeBatch` after another.
+
+    Returns:
+        The state after the last episode.
 
     Raises:
         OptionError: if an ego outside JAX fails.
     """
     rollout, state, episode = prepared
-    params = rollout.teammate_params
-    for _ in range(rollout.protocol.episodes):
+    clear = rollout.clear_memory if isinstance(rollout.ego, HostPolicy) else jax.jit(rollout.clear_memory)
+    for _ in range(rollout.protocol.episodes if episodes is None else episodes):
+        if forget and state.env.episode.any():  # before a task's first episode there is nothing to clear
+            state = clear(state)
         try:
-            state, played = jax.block_until_ready(episode(rollout.ego.params, params, state))
+            state, played = jax.block_until_ready(episode(rollout.ego.params, rollout.teammate_params, state))
         except jax.errors.JaxRuntimeError as error:  # an exception of an agent outside JAX arrives wrapped
             raise OptionError(f"the ego failed on {rollout.layout}: {error}") from error
         yield played
+    return state

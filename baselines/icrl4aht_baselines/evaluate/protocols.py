@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 from icrl4aht_generation.policy import Noise
 
@@ -19,13 +20,14 @@ class Protocol:
     """Rules of an evaluation.
 
     Attributes:
-        name: name of the protocol, "published" or "seeded".
+        name: name of the protocol, one of `PROTOCOLS`.
         noise: source of the randomness of heuristic teammates, "fixed" or "seeded", see
             `icrl4aht_generation.policy.Noise`.
         four_recipes: whether the layouts of the layout track draw from four recipes, as for the published numbers, and
             not from their own two.
         episodes: number of episodes of each task.
         steps: number of steps of each episode.
+        swap_every: number of episodes after which another teammate plays; None if a task keeps its teammate.
     """
 
     name: str
@@ -33,6 +35,22 @@ class Protocol:
     four_recipes: bool
     episodes: int = 100
     steps: int = KEPT_STEPS
+    swap_every: int | None = None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings that results store; they name `swap_every` only if teammates change."""
+        fields = asdict(self)
+        return fields if self.swap_every else {name: fields[name] for name in fields if name != "swap_every"}
+
+    @property
+    def last_episodes(self) -> int:
+        """Number of episodes at the end of a task that show what the ego has learned in it: half if they are few."""
+        return max(1, min(LAST_EPISODES, self.episodes // 2))
+
+
+LAST_EPISODES = 20
+"""Most episodes that count as the last ones of a task (paper, App. F)."""
 
 
 EVALUATION_SPLITS = ("test", "validation", "diverse")
@@ -83,8 +101,10 @@ def bundled_tasks(track: str, split: str) -> list[Task]:
 PROTOCOLS = {
     "published": Protocol("published", noise="fixed", four_recipes=True),
     "seeded": Protocol("seeded", noise="seeded", four_recipes=False),
+    "swap": Protocol("swap", noise="seeded", four_recipes=False, swap_every=25),
 }
-"""Protocols by name: `published`, to compare with the paper's numbers, and `seeded`, the default, to report."""
+"""Protocols by name: `published`, to compare with the paper's numbers; `seeded`, the default, to report; `swap`, the
+same with another teammate every 25 episodes, without a sign."""
 
 
 def get_protocol(name: str, episodes: int | None = None) -> Protocol:

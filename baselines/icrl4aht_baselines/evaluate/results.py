@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from icrl4aht_generation.learners.resume import differing_settings
@@ -23,15 +24,19 @@ class Result:
         task_id: id of the task.
         settings: agent, seeds, protocol, version and details that the result depends on.
         returns: return of the team in each episode: one list per seed with one number per episode.
+        partners: ids of the tasks whose teammates played, one per segment, see `icrl4aht_baselines.evaluate.segments`;
+            empty if the task's own teammate played all episodes.
     """
 
     task_id: str
     settings: dict[str, Any]
     returns: list[list[float]]
+    partners: list[str] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the result's JSON file."""
-        return {"settings_hash": json_hash(self.settings), **asdict(self)}
+        """Return the content of the result's JSON file; `partners` only if there are some."""
+        content = {"settings_hash": json_hash(self.settings), **asdict(self)}
+        return content if self.partners else {name: content[name] for name in content if name != "partners"}
 
 
 RESULTS = "tasks"
@@ -43,23 +48,39 @@ def result_path(out: Path, task_id: str) -> Path:
     return out / RESULTS / f"{task_id}.json"
 
 
-def find_results(out: Path, tasks: Iterable[Task], settings: dict[str, Any]) -> dict[str, Result]:
+def find_results(
+    out: Path,
+    tasks: Iterable[Task],
+    settings: dict[str, Any],
+    partners: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> dict[str, Result]:
     """Return the results of tasks that a folder of results has, by task id.
 
+    Args:
+        out: the folder.
+        tasks: the tasks.
+        settings: the settings of the results.
+        partners: task id -> `Result.partners`; none by default.
+
     Raises:
-        OptionError: if a result was made under other settings or its file is damaged, or if the folder is no folder of
-            results and has other files.
+        OptionError: if a result was made under other settings or with other partners, or its file is damaged, or if the
+            folder is no folder of results and has other files.
     """
     if not (out / RESULTS).is_dir():
         check_own_folder(out, (), "results of `evaluate`")
     paths = [result_path(out, task.task_id) for task in tasks]
     found = {result.task_id: result for result in map(read_result, filter(Path.exists, paths))}
     for result in found.values():
+        path, expected = result_path(out, result.task_id), list(partners.get(result.task_id, ()))
         different = differing_settings(result.settings, settings)
         if different:
             listed = "; ".join(f"{name}: it has {one!r}, expected {two!r}" for name, (one, two) in different.items())
-            path = result_path(out, result.task_id)
             raise OptionError(f"{path}: holds a result of other settings ({listed}); give another --out")
+        if result.partners != expected:
+            raise OptionError(
+                f"{path}: holds a result with the teammates of {', '.join(result.partners)}, expected those of "
+                f"{', '.join(expected)}, which follow from the tasks: give the same tasks again, or another --out"
+            )
     return found
 
 

@@ -85,20 +85,37 @@ class EvaluationRollout:
             return Environment(_played(self.layout, self.protocol), self.protocol.steps)
         return Environment([_played(one, self.protocol) for one in self.layout], self.protocol.steps)
 
-    @property
+    @cached_property
     def teammate_params(self) -> Any:
         """Parameters of all teammates, with a leading axis (B,)."""
         return stacked(mate.params for mate in self.teammates)
 
     def start(self, keys: jax.Array) -> RolloutState:
         """Return the state before the first episode from task keys (B,)."""
+        return RolloutState(self.env.init(keys, self._layout_numbers()), self._begin(keys), no_outcome(keys.shape[0]))
+
+    def clear_memory(self, state: RolloutState) -> RolloutState:
+        """Return a state between two episodes with the egos' memory as before a task's first episode."""
+        return state._replace(ego=self._begin(state.env.key), before=no_outcome(state.env.key.shape[0]))
+
+    def enter(self, state: RolloutState) -> RolloutState:
+        """Return a state between two episodes of another rollout of the same tasks, to continue on this one's layouts.
+
+        Keys and the number of the episode remain, and so do the egos' memories.
+        """
+        numbers = self._layout_numbers()
+        record = self.env.first_record(state.env.key, state.env.episode, numbers)
+        return state._replace(env=state.env._replace(record=record, layout=numbers))
+
+    def _begin(self, keys: jax.Array) -> Any:
+        """Return the egos' memories before the first episode."""
         ego_keys = _fold_all(keys, EGO)
         if isinstance(self.ego, HostPolicy):
-            egos = self.ego.init(self.ego.params, ego_keys)
-        else:
-            egos = jax.vmap(self.ego.init, in_axes=(None, 0))(self.ego.params, ego_keys)
-        numbers = None if self.numbers is None else jnp.asarray(self.numbers, jnp.int32)
-        return RolloutState(self.env.init(keys, numbers), egos, no_outcome(keys.shape[0]))
+            return self.ego.init(self.ego.params, ego_keys)
+        return jax.vmap(self.ego.init, in_axes=(None, 0))(self.ego.params, ego_keys)
+
+    def _layout_numbers(self) -> jax.Array | None:
+        return None if self.numbers is None else jnp.asarray(self.numbers, jnp.int32)
 
     def ego_actions(self, params: Any, state: RolloutState, keys: jax.Array) -> tuple[Int[Array, " B"], Any]:
         """Return the egos' actions in the next step, and their memories after it."""

@@ -145,8 +145,8 @@ def response_method(layout: Layout, partners: int = 0) -> Method:
 
 
 def play_policy(method: Method, params: Any, greedy: bool) -> Policy:
-    """Return the policy of a trained ego whose memory is cleared before each episode, as it was in training."""
-    return with_view(learned(method, params, KEPT_STEPS, PlayMode(greedy=greedy, forget=True)), "canonical")
+    """Return the policy of a trained ego."""
+    return with_view(learned(method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical")
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,8 @@ class ResponseJob:
         return method, state
 
     def _mean_return(self, policy: Policy, seeds: Sequence[int]) -> float:
-        played: dict[str, Any] = {"seeds": seeds, "done": lambda count: None}
+        # The memory is cleared before each episode, as it was in training.
+        played: dict[str, Any] = {"seeds": seeds, "control": "forgets", "done": lambda count: None}
         tasks = list(self.behaviour.tasks)
         results = evaluate("best response", lambda layout: policy, tasks, get_protocol(PROTOCOL), **played)
         return round(float(np.mean([result.returns for result in results])), 3)

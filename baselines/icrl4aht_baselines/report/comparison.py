@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from icrl4aht_baselines.agents.egos import FORGETS
+from icrl4aht_baselines.evaluate.segments import FORGETS
 from icrl4aht_baselines.report.results import (
     AGENT_COLUMNS,
     CELL_COLUMNS,

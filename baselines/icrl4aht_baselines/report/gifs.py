@@ -14,6 +14,7 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent
 from icrl4aht_baselines.evaluate.evaluator import play_tasks
 from icrl4aht_baselines.evaluate.protocols import Protocol
+from icrl4aht_baselines.evaluate.segments import FORGETS
 from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, ResultSource
 from icrl4aht_baselines.report.scores import open_cells
 from icrl4aht_baselines.training.seen import describe_overlap
@@ -67,16 +68,18 @@ def save_episodes(
     seed: int = 0,
     cell: int = 32,
     suite: Path | None = None,
+    forget: bool = False,
 ) -> tuple[ShownEpisode, ...]:
     """Play a task, and write some of its episodes as GIFs. Return them; they earn what `evaluate` stores.
 
     Args:
         paths: number of an episode, from 1 -> path of its GIF. Later episodes than these are not played.
-        task, make_ego, protocol, seed, suite: see `evaluator.play_tasks`.
+        task, make_ego, protocol, seed, suite, forget: see `evaluator.play_tasks`.
         cell: pixels per map cell.
     """
     shown = []
-    played = play_tasks(make_ego, [task], dataclasses.replace(protocol, episodes=max(paths)), [seed], suite)
+    shortened = dataclasses.replace(protocol, episodes=max(paths))
+    played = play_tasks(make_ego, [task], shortened, [seed], suite, forget)
     for number, episode in enumerate(played, start=1):
         if number in paths:
             record, reward = np.asarray(episode.record[0]), np.asarray(episode.reward[0])
@@ -129,7 +132,10 @@ def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path
     origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {describe_overlap(run.overlaps([cell]))}"
     try:
         paths = {number: prefix.with_name(f"{prefix.name}-{number}.gif") for number in (1, protocol.episodes)}
-        shown = save_episodes(paths, task, restore_ego(source), protocol, seed=seed, cell=24, suite=suite)
+        if source.detail("swapped"):
+            raise OptionError("another teammate played the earlier episodes")
+        ego, forget = restore_ego(source), bool(source.detail("forget"))
+        shown = save_episodes(paths, task, ego, protocol, seed=seed, cell=24, suite=suite, forget=forget)
         return EpisodePair(cell, title, origin, shown)
     except Icrl4ahtError as error:
         return EpisodePair(cell, title, f"No picture: {error}. {origin}")
@@ -142,6 +148,7 @@ def restore_ego(source: ResultSource) -> JaxEgoMaker:
         OptionError: if the ego is neither a reference ego nor trained, or its run folder is missing or has changed.
     """
     name, details = source.settings["agent"], dict(source.settings.get("details", {}))
+    name = name.removesuffix(FORGETS) if details.pop("forget", None) else name
     if name in AGENTS:
         return AGENTS[name]
     folder = details.get("model") or (source.trained or {}).get("run")

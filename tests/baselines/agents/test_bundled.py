@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.agents import EgoInput, bundled
+from icrl4aht_baselines.agents import bundled
 from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
 from icrl4aht_baselines.agents.egos import PlayMode, find_agent
 from icrl4aht_baselines.commands.options import find_ego
@@ -28,7 +28,6 @@ from PIL import Image
 
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
-from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
 from icrl4aht_data.overcooked.layouts import get_layout
 
 MODEL = ModelOptions(layers=1, width=8, heads=2, encoder="mlp")
@@ -81,7 +80,6 @@ def test_a_bundled_model_keeps_its_play_mode(run, tmp_path, monkeypatch):
     by_default, greedy = find_agent("ad-drawn"), find_agent("ad-drawn", greedy=True)
     assert by_default.name == "ad-drawn" and by_default.details and by_default.details["sampled"] is True
     assert greedy.name == "ad-drawn (greedy)" and greedy.details and "sampled" not in greedy.details
-    assert find_agent("ad-drawn", forget=True).name == "ad-drawn (forgets)"
     assert find_ego("--agent", "ad-drawn", acting="exact", greedy=None).name == "ad-drawn"
     assert find_ego("--agent", "ad-drawn", greedy=True).name == "ad-drawn (greedy)"
     assert find_ego("--agent", str(run), greedy=False).name == "AD+mlp (sampled)"
@@ -163,39 +161,11 @@ def test_models_command(models):
 
 class TestPlayMode:
     def test_play_modes_change_the_agents_name(self, run):
-        assert find_agent(run, greedy=False, forget=True).name == "AD+mlp (sampled) (forgets)"
+        assert find_agent(run, greedy=False).name == "AD+mlp (sampled)"
         with pytest.raises(UnknownNameError, match=r"unknown acting 'exat'.*Did you mean 'exact'"):
             find_agent(run, acting="exat")  # type: ignore[arg-type]
 
     def test_details_and_back(self):
-        for mode in (PlayMode(), PlayMode("exact", False), PlayMode(forget=True)):
+        for mode in (PlayMode(), PlayMode("exact", False)):
             assert PlayMode.from_details(mode.details) == mode
         assert PlayMode().details == {"acting": "cached"}
-
-    @pytest.mark.slow
-    def test_cleared_memory_makes_episodes_independent(self, run):
-        """A model whose memory is cleared ignores earlier episodes."""
-        agent = find_agent(run, greedy=False, forget=True)
-        policy = agent.make(get_layout("demo_wide"))
-        rng = np.random.default_rng(0)
-        ego_inputs = [_ego_input(rng, done=False) for _ in range(3)]
-        begin = _ego_input(rng, done=True)
-
-        def after(history: list) -> np.ndarray:
-            memory, found = policy.init(policy.params, jax.random.key(0)), []
-            for ego_input in [*history, begin, *ego_inputs]:
-                logits_key = jax.random.key(len(found))
-                action, memory = policy.act(policy.params, memory, ego_input, logits_key)
-                found.append(int(action))
-            return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(memory)])
-
-        np.testing.assert_array_equal(after([]), after([_ego_input(rng, done=False) for _ in range(2)]))
-        keeps = find_agent(run, greedy=False).make(get_layout("demo_wide"))
-        policy = keeps
-        assert not np.array_equal(after([]), after([_ego_input(rng, done=False) for _ in range(2)]))
-
-
-def _ego_input(rng: np.random.Generator, done: bool) -> EgoInput:
-    obs = rng.integers(0, 2, (5, 5, len(CANONICAL_CHANNELS)), dtype=np.uint8)
-    numbers = np.int32(rng.integers(6)), np.float32(rng.choice([0, 20])), np.int32(rng.integers(6))
-    return EgoInput(obs, *numbers, np.bool_(done))

@@ -1,0 +1,101 @@
+"""Segments of an evaluation: episodes in a row in which no task changes its teammate.
+
+An ego keeps its memory from one segment to the next and gets no sign of the change. Keys of episodes are those of the
+task whoever plays, so that the last episodes of a control differ from those of the plain evaluation in nothing but the
+ego's memory.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+from icrl4aht_baselines.evaluate.protocols import Protocol
+from icrl4aht_data.benchmark.tasks import Task, teammate_id
+from icrl4aht_data.errors import OptionError
+
+Control = Literal["forgets", "swapped"]
+CONTROLS: tuple[Control, ...] = ("forgets", "swapped")
+"""Controls of an evaluation. `forgets`: the ego's memory is cleared before each episode. `swapped`: the teammate of
+another task plays all episodes but the last ones, see `Protocol.last_episodes`."""
+
+FORGETS = " (forgets)"
+"""End of the name of an agent whose memory is cleared before each episode."""
+
+
+class PlannedTask(NamedTuple):
+    """A task with what is played in each segment.
+
+    Attributes:
+        task: the task.
+        played: one task per segment: with the id of `task`, and the teammate and the recipes of a partner.
+        partners: ids of the partners, one per segment; empty if there is one segment.
+    """
+
+    task: Task
+    played: tuple[Task, ...]
+    partners: tuple[str, ...] = ()
+
+
+def segment_lengths(protocol: Protocol, control: Control | None = None) -> tuple[int, ...]:
+    """Return the number of episodes of each segment.
+
+    Raises:
+        OptionError: if teammates are to be swapped in a task of one episode, or under a protocol that swaps them, too.
+    """
+    if control == "swapped":
+        if protocol.swap_every or protocol.episodes < 2:
+            raise OptionError(
+                f"the control `swapped` with protocol {protocol.name} and episodes = {protocol.episodes}: expected a "
+                f"protocol that keeps the teammate, such as seeded, and at least 2 episodes"
+            )
+        return protocol.episodes - protocol.last_episodes, protocol.last_episodes
+    every = protocol.swap_every or protocol.episodes
+    return tuple(min(every, protocol.episodes - first) for first in range(0, protocol.episodes, every))
+
+
+def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | None = None) -> list[PlannedTask]:
+    """Return what tasks play in each segment.
+
+    A task's partner is the next task of its layout, in the order of `tasks` and in turn, with a teammate of another
+    family; if all are of one family, with another teammate. Under the control `swapped` the partner's teammate plays
+    first. Under a protocol that swaps teammates, the task's own is followed by that of its partner, of the partner's
+    partner, and so on.
+
+    Raises:
+        OptionError: if a task has no partner; names the task. See also `segment_lengths`.
+    """
+    segments = len(segment_lengths(protocol, control))
+    if segments == 1:
+        return [PlannedTask(task, (task,)) for task in tasks]
+    by_layout: dict[str, list[Task]] = defaultdict(list)
+    for task in tasks:
+        by_layout[task.layout.name].append(task)
+    partner = {task.task_id: _partner(task, by_layout[task.layout.name]) for task in tasks}
+    planned = []
+    for task in tasks:
+        chain = [task]
+        for _ in range(segments - 1):
+            chain.append(partner[chain[-1].task_id])
+        chain = chain[::-1] if control == "swapped" else chain
+        played = tuple(replace(task, teammate=one.teammate, recipes=one.recipes) for one in chain)
+        planned.append(PlannedTask(task, played, tuple(one.task_id for one in chain)))
+    return planned
+
+
+def _partner(task: Task, on_layout: Sequence[Task]) -> Task:
+    number = [other.task_id for other in on_layout].index(task.task_id)
+    following = [*on_layout[number + 1 :], *on_layout[:number]]
+    # A task with recipes of its own hides them from the ego, so that its partner has to want others, too.
+    other_dish = [other for other in following if task.recipes is None or other.recipes != task.recipes]
+    other_family = [other for other in other_dish if other.teammate_family != task.teammate_family]
+    behaviour = teammate_id(task.teammate), task.recipes
+    other_teammate = [other for other in following if (teammate_id(other.teammate), other.recipes) != behaviour]
+    for found in (*other_family, *other_teammate):
+        return found
+    raise OptionError(
+        f"task {task.task_id}: needs a task on {task.layout.name} with another teammate to swap with, found none among "
+        f"the {len(on_layout)} given ones on it: give more tasks, of several families if possible"
+    )

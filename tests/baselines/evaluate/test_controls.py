@@ -1,0 +1,282 @@
+"""Controls of memory and partner, and the protocol `swap`, with an ego whose returns follow from its memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from icrl4aht_baselines.agents.egos import NamedEgo, stay
+from icrl4aht_baselines.agents.host import from_host
+from icrl4aht_baselines.evaluate import evaluate_controls
+from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
+from icrl4aht_baselines.evaluate.programs import Programs
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
+from icrl4aht_baselines.evaluate.segments import plan_tasks, segment_lengths
+from icrl4aht_baselines.report.controls import control_lines
+from icrl4aht_baselines.report.results import read_run
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.teammates.instances import published_task, published_tasks
+from icrl4aht_generation.teammates.registry import build_teammate
+
+from icrl4aht_data.benchmark.tasks import make_task, write_tasks
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.overcooked.actions import STAY
+
+H1, H2, H4 = (published_task("coord_simple", f"{family}/t0") for family in ("H1", "H2", "H4"))
+TASKS = [H1, H4]
+"""Two tasks of which H4 delivers alone, and H1 never does: egos that stay earn 40 and 0 in an episode."""
+FOUR = dataclasses.replace(PROTOCOLS["seeded"], episodes=4)
+STAYS, RANDOM, PAID = 0, 1, 2
+
+
+class Remembered(NamedTuple):
+    """Number of finished episodes, reward in the first one, and whether the ego acts randomly in this one."""
+
+    episodes: jax.Array
+    paid: jax.Array
+    wanders: jax.Array
+
+
+def _begin(mode, key):
+    return Remembered(jnp.int32(0), jnp.float32(0), mode == RANDOM)
+
+
+def _act(mode, memory, ego_input, key):
+    paid = memory.paid + jnp.where(memory.episodes == 0, ego_input.prev_reward, 0)
+    wanders = jnp.where(ego_input.prev_done & (mode == PAID), paid <= 0, memory.wanders)
+    memory = Remembered(memory.episodes + ego_input.prev_done, paid, wanders)
+    return jnp.where(wanders, jax.random.randint(key, (), 0, 6), STAY), memory
+
+
+def ego(mode):
+    """Stays or acts randomly; in mode PAID stays in the first episode, and later if the first one was paid."""
+    policy = Policy(jnp.int32(mode), _begin, _act, "ego_input")
+    return lambda layout: policy
+
+
+@pytest.fixture(scope="module")
+def programs():
+    """Compiled programs that all tests of this module share."""
+    return Programs()
+
+
+@pytest.fixture(scope="module")
+def alone(programs):
+    """Returns (tasks, episodes) of the egos that stay and that act randomly."""
+
+    def play(mode):
+        results = evaluate("fixed", ego(mode), TASKS, FOUR, programs=programs)
+        return np.array([result.returns[0] for result in results])
+
+    return play(STAYS), play(RANDOM)
+
+
+def test_memory_and_partner_are_exact(alone, programs, tmp_path):
+    stays, wanders = alone
+    assert stays.tolist() == [[0] * 4, [40] * 4]
+    assert (wanders < stays)[:, 1:].any(axis=1).all()
+    found = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, programs=programs)
+    assert len(programs) == 2  # one for each family of teammates
+    plain = np.array([[stays[0, 0], *wanders[0, 1:]], stays[1]])
+    np.testing.assert_array_equal([result.returns[0] for result in found.plain], plain)
+    np.testing.assert_array_equal([result.returns[0] for result in found.forgets], stays)
+    # After H4, which pays, the ego stays with H1; after H1, which does not, it acts randomly with H4.
+    swapped = np.array([result.returns[0] for result in found.swapped])
+    np.testing.assert_array_equal(swapped[:, 2:], [stays[0, 2:], wanders[1, 2:]])
+    np.testing.assert_array_equal(found.memory[:, 0], (plain - stays).mean(axis=1))
+    np.testing.assert_array_equal(found.partner[:, 0], (plain - swapped)[:, 2:].mean(axis=1))
+    assert found.memory[0, 0] < 0 and found.memory[1, 0] == 0
+    assert found.partner[0, 0] < 0 < found.partner[1, 0]
+    memory, partner = control_lines(found, TASKS)
+    assert f"track teammate, memory M: {found.memory.mean():+.1f}, " in memory
+    assert f"track teammate, partner P: {found.partner.mean():+.1f}, return in the 2 last episodes" in partner
+
+
+def test_controls_of_an_ego_without_memory_earn_the_same(alone, programs):
+    """The last episodes have the same keys whoever played before."""
+    found = evaluate_controls("random", ego(RANDOM), TASKS, FOUR, programs=programs)
+    np.testing.assert_array_equal([result.returns[0] for result in found.plain], alone[1])
+    assert not found.memory.any() and not found.partner.any()
+    first, swapped = ([result.returns[0][:2] for result in results] for results in (found.plain, found.swapped))
+    assert first != swapped
+
+
+def test_swap_changes_teammates_at_25_50_and_75(programs):
+    swapped = [result.returns[0] for result in evaluate("fixed", ego(STAYS), TASKS, "swap", programs=programs)]
+    assert swapped == [([0.0] * 25 + [40.0] * 25) * 2, ([40.0] * 25 + [0.0] * 25) * 2]
+
+
+def test_swap_keeps_the_memory_and_the_keys(alone, programs):
+    rules = dataclasses.replace(PROTOCOLS["swap"], episodes=4, swap_every=2)
+    first, second = evaluate("mine", ego(PAID), TASKS, rules, programs=programs)
+    stays, wanders = alone
+    assert first.returns[0][:2] == [stays[0, 0], wanders[0, 1]]
+    assert second.returns[0] == [40, 40, 0, 0]  # H4 paid
+    other = dataclasses.replace(H1, teammate=H4.teammate)
+    (expected,) = evaluate("fixed", ego(RANDOM), [other], FOUR)
+    assert first.returns[0][2:] == expected.returns[0][2:]
+    assert (first.partners, second.partners) == ([H1.task_id, H4.task_id], [H4.task_id, H1.task_id])
+
+
+def test_results_are_found_again(programs, tmp_path):
+    """A control's folder is resumed with the same partners only; plain results keep the settings of old ones."""
+    first = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, details={"of": 1}, programs=programs)
+
+    def never(layout):
+        raise AssertionError("plays again")
+
+    assert evaluate_controls("mine", never, TASKS, FOUR, out=tmp_path, details={"of": 1}) == first
+    plain, forgets, swapped = (results[0].settings for results in first[:3])
+    assert plain["protocol"] == {
+        "name": "seeded",
+        "noise": "seeded",
+        "four_recipes": False,
+        "episodes": 4,
+        "steps": 100,
+    }
+    assert (plain["agent"], plain["details"]) == ("mine", {"of": 1})
+    assert (forgets["agent"], forgets["details"]) == ("mine (forgets)", {"of": 1, "forget": True})
+    assert (swapped["agent"], swapped["details"]) == ("mine (swapped)", {"of": 1, "swapped": True})
+    assert "partners" not in first.plain[0].to_json()
+    message = f"holds a result with the teammates of {H1.task_id}, {H4.task_id}, expected those of {H2.task_id}, "
+    with pytest.raises(OptionError, match=message):
+        evaluate("mine", never, [H4, H2, H1], FOUR, control="swapped", out=tmp_path / "swapped", details={"of": 1})
+
+
+class Recorder:
+    """A host agent that stays, counts its resets, and records what it sees in the first step of each episode."""
+
+    def __init__(self):
+        self.log: list[list] = []
+
+    def reset(self, batch):
+        self.log.append([])
+        self.step = 0
+
+    def act(self, ego_input):
+        if self.step % 5 == 0:
+            self.log[-1].append(ego_input)
+        self.step += 1
+        return np.full(len(ego_input.obs), STAY)
+
+
+def test_host_agents_are_reset_before_each_episode(tmp_path):
+    agent, short = Recorder(), dataclasses.replace(FOUR, steps=5)
+    evaluate_controls("host", from_host(agent), TASKS, short)
+    # Two teammate families: both play plainly, then with 4 resets each, then swapped.
+    assert [len(episodes) for episodes in agent.log] == [4, 4] + [1] * 8 + [4, 4]
+    plain, forgets, swapped = agent.log[0], [episodes[0] for episodes in agent.log[2:6]], agent.log[10]
+    assert [bool(one.prev_done) for one in plain] == [False, True, True, True]
+    assert not any(one.prev_done or one.prev_action for one in forgets)
+    assert [bool(one.prev_done) for one in swapped] == [False, True, True, True]
+    for one, other, third in zip(plain, forgets, swapped, strict=True):  # the same starts
+        np.testing.assert_array_equal(one.obs, other.obs)
+        np.testing.assert_array_equal(one.obs, third.obs)
+
+
+class TestPlan:
+    def test_partners_are_the_next_of_another_family(self):
+        tasks = [task for task in published_tasks("teammate") if task.layout.name in ("coord_simple", "demo_wide")]
+        by_id = {task.task_id: task for task in tasks}
+        after = {"H1": "H2", "H2": "H3", "H3": "H4", "H4": "H1"}
+        for task, played, partners in plan_tasks(tasks, PROTOCOLS["seeded"], "swapped"):
+            partner = by_id[partners[0]]
+            assert (partner.layout, partner.teammate_family) == (task.layout, after[task.teammate_family])
+            assert partner.teammate["theta_id"] == 0
+            assert [one.teammate for one in played] == [partner.teammate, task.teammate]
+            assert {one.task_id for one in played} == {task.task_id}
+        families = [by_id[partner].teammate_family for partner in plan_tasks(tasks, PROTOCOLS["swap"])[0].partners]
+        assert families == ["H1", "H2", "H3", "H4"]
+
+    def test_of_one_family_another_teammate_plays(self):
+        first, second = (published_task("coord_simple", f"H4/t{number}") for number in range(2))
+        again = dataclasses.replace(first, task_id="again")
+        partners = {task.task_id: ids[0] for task, _, ids in plan_tasks([first, again, second], FOUR, "swapped")}
+        assert partners == {first.task_id: second.task_id, "again": second.task_id, second.task_id: first.task_id}
+
+    def test_tasks_with_recipes_want_another_dish_before(self):
+        dishes = [[(0, 0, 0)], [(0, 0, 0)], [(1, 1, 1)]]
+        tasks = [
+            make_task("teammate", "test", "coord_simple", one.teammate, 0, dish)
+            for one, dish in zip((H4, H1, H2), dishes, strict=True)
+        ]
+        plan = plan_tasks(tasks, FOUR, "swapped")[0]
+        assert plan.partners[0] == tasks[2].task_id
+        assert [one.recipes for one in plan.played] == [((1, 1, 1),), ((0, 0, 0),)]
+
+    def test_segments(self):
+        assert segment_lengths(PROTOCOLS["seeded"]) == (100,)
+        assert segment_lengths(PROTOCOLS["swap"]) == (25, 25, 25, 25)
+        assert segment_lengths(get_protocol("swap", 30)) == (25, 5)
+        assert segment_lengths(PROTOCOLS["seeded"], "swapped") == (80, 20)
+        assert segment_lengths(get_protocol("seeded", 39), "swapped") == (20, 19)
+        assert segment_lengths(get_protocol("seeded", 3), "swapped") == (2, 1)
+
+    def test_a_task_without_partner_is_named(self):
+        message = rf"task {H1.task_id}: needs a task on coord_simple with another teammate to swap with, found none"
+        with pytest.raises(OptionError, match=message):
+            plan_tasks([H1, published_task("demo_wide", "H2/t0")], FOUR, "swapped")
+        with pytest.raises(OptionError, match=message):
+            evaluate("stay", stay, [H1], "swap")
+        assert plan_tasks([H1], get_protocol("swap", 25))[0].partners == ()
+
+    def test_refusals(self):
+        for rules in (PROTOCOLS["swap"], get_protocol("seeded", 1)):
+            with pytest.raises(OptionError, match=f"protocol {rules.name} and episodes = {rules.episodes}: expected"):
+                evaluate_controls("stay", stay, TASKS, rules)
+        with pytest.raises(UnknownNameError, match=r"unknown control 'swaped'.*Did you mean 'swapped'"):
+            evaluate("stay", stay, TASKS, FOUR, control="swaped")  # type: ignore[arg-type]
+        with pytest.raises(OptionError, match=r"protocol swap: the teammate changes every 25 episodes.* found 100"):
+            next(play_tasks(stay, [H4], PROTOCOLS["swap"]))
+
+
+def test_the_next_segment_starts_on_its_own_layouts():
+    """A teammate's dish takes effect at its first episode, whose state was drawn with the dish of the one before."""
+    first, second = (
+        [make_task("teammate", "test", "coord_simple", H4.teammate, seed, [dish]) for seed in range(2)]
+        for dish in ((0, 0, 0), (1, 1, 1))
+    )
+    keys = jnp.stack([task_key(0, task.task_id) for task in first])
+
+    def rollout(layouts, numbers):
+        return EvaluationRollout(layouts, stay(H4.layout), [build_teammate(None, H4.teammate)], FOUR, numbers)
+
+    one, other = rollout(first[0].layout, None), rollout([second[0].layout, first[0].layout], np.array([0, 1]))
+    state = other.enter(one.start(keys))
+    expected = other.start(keys)
+    np.testing.assert_array_equal(state.env.record, expected.env.record)
+    np.testing.assert_array_equal(state.env.layout, [0, 1])
+    assert not np.array_equal(state.env.record[0], one.start(keys).env.record[0])
+
+
+def test_controls_command(programs, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "icrl4aht_baselines.commands.train_commands.find_ego", lambda option, name, **mode: NamedEgo(name, ego(PAID))
+    )
+    for module in ("controls", "evaluator"):
+        monkeypatch.setattr(f"icrl4aht_baselines.evaluate.{module}.Programs", lambda: programs)
+    write_tasks(tmp_path / "two.jsonl", TASKS)
+
+    def run(folder, *options):
+        command = ["evaluate", "--agent", "mine", "--manifest", str(tmp_path / "two.jsonl"), *options]
+        return CliRunner().invoke(cli, [*command, "--out", str(tmp_path / folder)])
+
+    result = run("run", "--episodes", "4", "--controls")
+    assert result.exit_code == 0, result.output
+    assert "track teammate, memory M: " in result.output and "track teammate, partner P: " in result.output
+    for folder in ("run", "run/forgets", "run/swapped"):
+        assert len(list((tmp_path / folder / "tasks").glob("*.json"))) == 2
+    result = run("run", "--controls", "--forget")
+    assert result.exit_code == 2 and "--controls: not with --forget" in result.output
+    result = run("swap", "--protocol", "swap", "--episodes", "50")
+    assert result.exit_code == 0 and "(swap), 2 test cells" in result.output, result.output
+    result = run("forgets", "--episodes", "4", "--forget")
+    assert result.exit_code == 0, result.output
+    assert read_run(tmp_path / "forgets").table.equals(read_run(tmp_path / "run/forgets").table)
