@@ -24,6 +24,7 @@ from icrl4aht_generation.layouts.families import LAYOUT_SPLITS
 from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
 from icrl4aht_generation.learners.checkpoint import POLICY_CHECKPOINTS
 from icrl4aht_generation.profiles import load_profile
+from icrl4aht_generation.teammates.distances import common_states, group_behaviours
 from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED, Draw, find_draw, read_draws
 from icrl4aht_generation.teammates.heuristics.territory import TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES
@@ -47,6 +48,7 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, record_size
 from tests.helpers.paths import ROOT
+from tests.packaging.test_docs import rows
 
 TINY_SIZE = SIZES["tiny"]
 SEEDED = get_protocol("seeded")
@@ -294,3 +296,27 @@ def test_stated_numbers_are_those_of_code_and_data(page, claim, compute):
         decimals = len(text.partition(".")[2]) if text not in WORDS else 3
         number = WORDS[text] if text in WORDS else float(text.replace(",", ""))
         assert number == pytest.approx(round(value, decimals)), f"{page}.md: {claim!r}: {text}, computed {value}"
+
+
+def behaviours_of_tests() -> dict[str, dict[str, int]]:
+    """Return family -> test layout -> number of behaviours, as docs/protocol.md states them."""
+    layouts = [name for splits in TRACKS.values() for name in splits["test"]]
+    return {
+        family: dict(zip(layouts, map(int, counts), strict=True)) for family, *counts in rows("protocol", "behaviours")
+    }
+
+
+def test_behaviours_of_the_test_tasks_are_added_up():
+    counts = behaviours_of_tests()
+    total = sum(sum(row.values()) for row in counts.values())
+    assert stated_numbers("docs/protocol", "{} behaviours of {} tasks") == [str(total), str(len(tasks("test")))]
+    assert list(counts) == list(HEURISTICS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["test_wide", "demo_wide"])
+def test_behaviours_of_the_test_tasks(name):
+    states = common_states(LAYOUTS[name])
+    for number, family in enumerate(HEURISTICS):
+        own = states.actions[number * INSTANCES : (number + 1) * INSTANCES]
+        assert len(set(group_behaviours(own))) == behaviours_of_tests()[family][name]
