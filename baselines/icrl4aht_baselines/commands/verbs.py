@@ -16,7 +16,7 @@ VERBS = (
     Verb("models", f"{_MODELS}:models_command", _TRAIN, "List the bundled models."),
     Verb("watch", f"{_CLI}:watch_command", _TRAIN, "Play an episode and draw it as a GIF."),
     Verb("collect", f"{_MODELS}:collect_command", _TRAIN, "Record histories of an agent with a release's teammates."),
-    Verb("control", f"{_LAB}:control_command", _TRAIN, "Check that the models adapt in context."),
+    Verb("control", f"{_LAB}:control_command", _TRAIN, "Check that AD and DPT adapt in context."),
     Verb("research tracks", f"{_LAB}:tracks_command", _PAPER, "Train and evaluate on both tracks."),
     Verb("research sweep", f"{_LAB}:sweep_command", _PAPER, "Train and evaluate over sizes, or context lengths."),
     Verb("research ablate", f"{_LAB}:ablate_command", _PAPER, "Train and evaluate with and without parts."),
