@@ -40,7 +40,7 @@ teammates: install ## train the suite of learned teammates: PROFILE=smoke|small|
 verify: install ## verify every byte and the physics of a release: ROOT=folder (default: the bundled mini release)
 	$(BIN)/icrl4aht-data verify --deep $(ROOT)
 
-control: install ## show that the models adapt in context in worlds built for it (about 10 minutes)
+control: install ## show that AD and DPT adapt in context in worlds built for it (about 10 minutes)
 	$(BIN)/icrl4aht-data control
 
 test: check ## lint, types and the default tests (5.5 minutes on 2 cores): WORKERS=2 (2 GB each)

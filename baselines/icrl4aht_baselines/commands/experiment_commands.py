@@ -91,7 +91,7 @@ heldout_rl_command = _experiment_command(
 @click.command("control")
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/control", help="Write the runs here.")
 def control_command(out: Path) -> None:
-    """Check that the models adapt in context.
+    """Check that AD and DPT adapt in context.
 
     Trains them on bandits and Dark Room (about 10 minutes), and prints the checks: they adapt there, and do not with
     their context cut off. Exits with 1 if a check fails.

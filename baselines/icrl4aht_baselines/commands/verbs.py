@@ -23,7 +23,7 @@ VERBS = (
         _TRAIN,
         "Measure what memory across episodes can earn at most.",
     ),
-    Verb("control", f"{_LAB}:control_command", _TRAIN, "Check that the models adapt in context."),
+    Verb("control", f"{_LAB}:control_command", _TRAIN, "Check that AD and DPT adapt in context."),
     Verb("research tracks", f"{_LAB}:tracks_command", _PAPER, "Train and evaluate on both tracks."),
     Verb("research sweep", f"{_LAB}:sweep_command", _PAPER, "Train and evaluate over sizes, or context lengths."),
     Verb("research ablate", f"{_LAB}:ablate_command", _PAPER, "Train and evaluate with and without parts."),

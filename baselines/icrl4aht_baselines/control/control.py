@@ -1,4 +1,4 @@
-"""The positive control: in two small worlds where adaptation in context is possible, these models adapt.
+"""The positive control: AD and DPT adapt in two small worlds where adaptation in context is possible.
 
 Methods, tokens, trainer and acting are those of the benchmark. DPT is compared with Thompson sampling and AD with the
 algorithm that it distils on Bernoulli bandits; AD also plays Dark Room with goals that it was not trained on. Each

@@ -31,6 +31,7 @@ from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
+from icrl4aht_data.fetch import is_address
 from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.templates import fill_template, markdown_table
 
@@ -68,8 +69,8 @@ def model_card(
             models[source.trained["run_hash"]].append(source)
             settings[_settings(source.trained["config"])] += source.layouts
     configs: list[dict[str, Any]] = [(sources[0].trained or {})["config"] for sources in models.values()]
-    config, root = configs[0], configs[0]["histories"]["root"]
-    dataset = on_hub[1] if (on_hub := _HUB.match(root)) else "icrl4aht"
+    config, roots = configs[0], [one["histories"]["root"] for one in configs]
+    on_hub = dict.fromkeys(found[1] for root in roots if (found := _HUB.match(root)))
     seeds = ", ".join(dict.fromkeys(str(config["train"]["seed"]) for config in configs))
     overlaps = {name for one in (run, *validation) for name in one.overlaps(one.cells)}
     limits = [
@@ -82,7 +83,7 @@ def model_card(
     method = config["method"] if title else name
     properties = {
         "method": method,
-        "data": f"{dataset}, data version {config['histories']['data_version']}",
+        "data": "; ".join(dict.fromkeys(_release(one["histories"]) for one in configs)),
         "created with": f"icrl4aht-data {config['package_version']}",
         "made by": command and f"`{command}`",
     }
@@ -96,7 +97,8 @@ def model_card(
         "baseline.md",
         title=name,
         method=method,
-        dataset=dataset,
+        datasets="datasets:\n" * bool(on_hub) + "".join(f"- {dataset}\n" for dataset in on_hub),
+        training=" ".join(dict.fromkeys(map(training_sentence, configs))),
         properties="\n".join(f"| {name} | {value} |" for name, value in properties.items() if value),
         models="\n".join(_model_row(run, sources) for sources in models.values()),
         settings="\n\n".join(listed),
@@ -105,6 +107,34 @@ def model_card(
         curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
         limits="\n".join(f"* {limit}" for limit in limits),
     )
+
+
+def _release(histories: Mapping[str, Any]) -> str:
+    """Return the name and the data version of the release that a model was trained with."""
+    root = histories["root"]
+    on_hub = _HUB.match(root)
+    name = on_hub[1] if on_hub else root if is_address(root) else f"the local release `{Path(root).name}`"
+    return f"{name}, data version {histories['data_version']}"
+
+
+def training_sentence(config: Mapping[str, Any]) -> str:
+    """Return a sentence on what a model was trained on.
+
+    Args:
+        config: config.json of its run.
+    """
+    if "groups" in config["histories"]:
+        sentence, play = "It was trained by playing with teammates, not on learning histories.", config.get("play", {})
+        if not play.get("imitation"):
+            return sentence
+        part = f"In the first {play['imitation_end']:.0%} of its steps it also imitated the scripted oracle"
+        return f"{sentence} {part}, which sees the full state."
+    cells = config.get(TRAINED_ON, ())
+    sources = sorted({cell["source"] for cell in cells if cell.get("source")})
+    labels = sorted({cell["labels"] for cell in cells if cell.get("labels")})
+    named = f" of source {' and '.join(f'`{source}`' for source in sources)}" if sources else ""
+    targets = f", with {' and '.join(f'`{label}`' for label in labels)} labels" if labels else ""
+    return f"It was trained on learning histories{named}{targets}."
 
 
 def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:

@@ -12,15 +12,17 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines import report
+from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.report import gifs, merge, write_report
-from icrl4aht_baselines.report.cards import model_card, write_headroom_cards, write_model_cards
+from icrl4aht_baselines.report.cards import model_card, training_sentence, write_headroom_cards, write_model_cards
 from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
 from icrl4aht_baselines.report.page import markdown, report_files, write_page, write_page_with_episodes
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultCell
 from icrl4aht_baselines.report.scores import cell_headroom
 
+from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
@@ -161,13 +163,36 @@ def test_trained_models_have_cards(tmp_path):
     assert card.count("* † the agent was trained with other teammates of this family") == 2, "at the table, in limits"
     own = [make_task("teammate", "validation", "demo_wide", TEST_TASKS[0].teammate, number) for number in (1, 2)]
     card = model_card(first, "dpt-reference", "python -m x", [evaluated_run("AD", tasks=own)], {"a/b.png": "A curve"})
-    parts = ["\n# dpt-reference, trained on", "| method | dpt |\n", "| made by | `python -m x` |"]
+    parts = [
+        "\n# dpt-reference, a model for the ICRL4AHT benchmark\n",
+        "| method | dpt |\n",
+        "| made by | `python -m x` |",
+    ]
     assert [part for part in parts if part not in card] == []
     assert "### Validation tasks, seeded\n" in card and "## Curves\n\nA curve:\n\n![b](a/b.png)\n" in card
     (both,) = merge([first, trained(evaluated_run("AD", ("asymm_right",), trained_on=None, acting="cached"), layers=2)])
     card = model_card(both)
     assert "Each model is one run" in card and "| asymm_right | 14 of asymm_right; " in card
     assert "Tested on demo_wide:\n\n* layers: 4" in card and "Tested on asymm_right:\n\n* layers: 2" in card
+
+
+def test_cards_say_what_a_model_was_trained_on():
+    """Cards of the bundled models, and of models trained on a release of the Hub and on a local one."""
+    for name in ("ad-reference", "ad-rising", "dpt-reference", "rl2-reference"):
+        configs = [json.loads((MODELS / name / track / "config.json").read_text()) for track in TRACKS]
+        card = (MODELS / name / "README.md").read_text(encoding="utf-8")
+        assert all(training_sentence(config) in card for config in configs)
+        assert "datasets:" not in card
+    assert "playing with teammates, not on learning histories. In the first 50% of its steps it also imitated" in card
+    greedy = {"layout": "demo_wide", "family": "H4", "source": "student", "labels": "expert"}
+    run = trained(evaluated_run("AD", trained_on=[greedy], acting="cached"))
+    assert "datasets:\n- you/icrl4aht\n---\n" in model_card(run)
+    config = (run.sources[0].trained or {})["config"] | {"trained_on": [greedy]}
+    assert training_sentence(config) == (
+        "It was trained on learning histories of source `student`, with `expert` labels."
+    )
+    config["histories"]["root"] = "/data/mine"
+    assert "| data | the local release `mine`, data version 1.0.0 |" in model_card(run)
 
 
 def test_headroom_cards_name_cells_without_headroom(tmp_path):
