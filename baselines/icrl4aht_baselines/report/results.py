@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks
-from icrl4aht_baselines.evaluate.results import Result, read_result
+from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import OVERLAPS, TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, TRACKS, family_order, layout_order, track_of
@@ -330,17 +330,27 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
             write_tasks(partial, (known | own).values())
 
 
+def read_results(folder: Path) -> tuple[list[Result], dict[str, Any] | None]:
+    """Return the results in a folder that `icrl4aht-data evaluate` made, and the content of its run.json or None.
+
+    Raises:
+        OptionError: if there are none.
+    """
+    results = [read_result(path) for path in sorted((folder / RESULTS).glob("*.json"))]
+    if not results:
+        raise OptionError(f"{folder}: no results in {folder / RESULTS}; run `icrl4aht-data evaluate --out {folder}`")
+    path = folder / TRAINED_RUN
+    return results, parse_json(read_text(path)) if path.exists() else None
+
+
 def read_run(folder: Path) -> EvaluationRun:
-    """Return the results in a folder that `icrl4aht-data evaluate` made.
+    """Return the results in a folder as a run.
 
     Raises:
         OptionError: if there are none, if they mix settings, or if the task of one is unknown.
     """
-    results = [read_result(path) for path in sorted((folder / "tasks").glob("*.json"))]
-    if not results:
-        raise OptionError(f"{folder}: no results in {folder / 'tasks'}; run `icrl4aht-data evaluate --out {folder}`")
+    results, trained = read_results(folder)
     own = read_tasks(folder / OWN_TASKS) if (folder / OWN_TASKS).exists() else []
-    trained = parse_json(read_text(folder / TRAINED_RUN)) if (folder / TRAINED_RUN).exists() else None
     return as_run(results, str(folder), own, trained)
 
 
