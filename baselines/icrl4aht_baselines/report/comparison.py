@@ -38,7 +38,7 @@ from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, read_headroom
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import legend_below, new_figure, save_figure
+from icrl4aht_data.plotting import legend_below, new_figure, return_limits, save_figure
 from icrl4aht_data.reading.arrow_tables import import_pyarrow
 from icrl4aht_data.utils.files import atomic_write, write_json
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
@@ -329,6 +329,7 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
         axes.axhline(np.mean([headroom[cell[:2]]["stay"] for cell in cells]), color="gray", linestyle=":", label="stay")
         if all(cell in scales for cell in cells):
             axes.axhline(np.mean([scales[cell].best for cell in cells]), color="black", label="best response")
+        axes.set_ylim(*return_limits(value for line in axes.lines for value in np.ravel(line.get_ydata())))
         axes.set_xscale("log")
         axes.set_xlim(0.9, 110)
         axes.set_xticks([1, 2, 5, 10, 20, 50, 100], ["1", "2", "5", "10", "20", "50", "100"])
