@@ -141,13 +141,13 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
     """Return the returns of one agent and control under one protocol, cells in the paper's order."""
     found = {}
     for key, rows in table.groupby(CELL_COLUMNS, sort=False):
-        names = ("training", "task", "seed")
-        axes = [tuple(dict.fromkeys(rows[name])) for name in names]
-        wide = rows.pivot(index=list(names), columns="block", values="return")
-        wide = wide.reindex(pd.MultiIndex.from_product(axes, names=names))
-        blocks = {name: wide[name].to_numpy().reshape([len(axis) for axis in axes]) for name in wide}
-        overlaps = tuple(rows["overlap"].iloc[0].split())
-        found[ResultCell._make(map(str, key))] = CellReturns(axes[1], axes[2], blocks, overlaps)
+        codes, axes = zip(*(pd.factorize(rows[name]) for name in ("training", "task", "seed", "block")), strict=True)
+        values = np.full([len(axis) for axis in axes], np.nan)
+        values[codes] = rows["return"]
+        blocks = {str(name): values[..., number] for number, name in enumerate(axes[3])}
+        marked = " ".join(rows["overlap"].unique()).split()
+        overlaps = tuple(name for name in OVERLAPS if name in marked)
+        found[ResultCell._make(map(str, key))] = CellReturns(tuple(axes[1]), tuple(map(int, axes[2])), blocks, overlaps)
     return {cell: found[cell] for cell in in_order(found)}
 
 

@@ -142,7 +142,10 @@ def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R
 def interquartile_mean(values: Float[np.ndarray, " U"]) -> MeanInterval:
     """Return the mean of the middle half of some values, with its BCa bootstrap interval (Agarwal et al. 2021)."""
     mean = float(trim_mean(values, 0.25)) if len(values) else float("nan")
-    if len(values) <= _LEAST_FREEDOM or np.ptp(values) < 1e-9:
+    if len(values) <= _LEAST_FREEDOM:
+        return MeanInterval(mean)
+    jackknife = [trim_mean(np.delete(values, number), 0.25) for number in range(len(values))]
+    if np.ptp(jackknife) < 1e-9:  # most values are equal: BCa divides by the variance of these means
         return MeanInterval(mean)
     options = {"n_resamples": _RESAMPLES, "method": "BCa", "vectorized": True, "rng": np.random.default_rng(0)}
     found = bootstrap((values,), lambda x, axis: trim_mean(x, 0.25, axis=axis), **options)
