@@ -12,6 +12,7 @@ from icrl4aht_baselines.report import comparison
 from icrl4aht_baselines.report.comparison import (
     RESULTS_FILES,
     StoredResults,
+    add_scales,
     add_submission,
     agents_table,
     controls_table,
@@ -125,13 +126,12 @@ def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monke
     assert "| `high` | noise | oracle | 10 updates | 2 | – |" in text and "| `low`" not in text
     assert "Models of earlier code are there as well: `low`." in text and "None measured (best responses of" in text
     assert paths[1].stat().st_size > 10_000 and len(figure_layouts({})) == 6
+    assert len(pd.read_parquet(paths[3])) == len(stored.table)
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")
-    write_comparison(some, tmp_path / "page")
-    table = pd.read_parquet(paths[3])
-    assert len(table) == len(stored.table) and set(
-        (table["best"] - table["stay"])[table["layout"] == "cramped_down"]
-    ) == {20}
-    assert "20 of 32 cells" in paths[0].read_text(encoding="utf-8")
+    table = add_scales(stored.table)
+    down = table[table["layout"] == "cramped_down"]
+    assert len(table) == len(stored.table) and set(down["best"] - down["stay"]) == {20}
+    assert "20 of 32 cells" in render_comparison(some)
     with pytest.raises(OptionError, match="no stored results: give files that"):
         write_comparison(StoredResults(), tmp_path / "empty")
 
