@@ -122,9 +122,10 @@ def control_command(out: Path) -> None:
 )
 @click.option("--bundle", is_flag=True, help="Also replace these files of the package's cards.")
 def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None:
-    """Measure the reference egos on every test task, and `stay` on the validation tasks.
+    """Measure the reference egos on every test task.
 
-    Writes their results into OUT, and OUT/headroom.json, OUT/headroom.md and OUT/stay.json from them.
+    `stay` also plays the validation tasks, since scores are relative to it. Writes their results into OUT, and
+    OUT/headroom.json, OUT/headroom.md and OUT/stay.json from them.
     """
     from icrl4aht_baselines.report.cards import HEADROOM_FILES, measure_headroom, write_headroom_cards
 

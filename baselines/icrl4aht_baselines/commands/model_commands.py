@@ -13,7 +13,16 @@ from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue
-from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, LAYOUT, TRACK, Folder, NewFile, examples, overwrite_option
+from icrl4aht_data.commands.options import (
+    COUNT,
+    COUNT_OR_NONE,
+    LAYOUT,
+    TRACK,
+    Folder,
+    NewFile,
+    examples,
+    overwrite_option,
+)
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -200,7 +209,7 @@ def reference_command(
 @click.command(
     "submit",
     epilog=examples(
-        "icrl4aht-data submit runs/mine-results --about 'AD, own encoder' --data 'mini, noise' --labels oracle --out m.json"
+        "icrl4aht-data submit runs/results --about 'AD, own encoder' --data noise --labels oracle --out mine.json"
     ),
 )
 @click.argument("folders", nargs=-1, type=Folder(), metavar="FOLDER...")
@@ -222,7 +231,7 @@ def submit_command(
     overwrite: bool,
     **facts: Any,
 ) -> None:
-    """Make a file of results that can be added to the page of results.
+    """Make a file of results for the page of `results`.
 
     Checks that FOLDERs of `evaluate` have all test tasks of a track, or of both, under protocol seeded with seeds 0, 1
     and 2, and say what the agent was trained on. Several folders of one agent are its tracks, or its trainings with
@@ -251,7 +260,7 @@ def submit_command(
         "icrl4aht-data results mine.json --out build/results",
     ),
 )
-@click.argument("files", nargs=-1, type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar="[FILE]...")
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE]...")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the page here.")
 @click.option("--store", is_flag=True, help="Also add the results to the package's stored results.")
 @overwrite_option

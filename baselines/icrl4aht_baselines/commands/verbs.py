@@ -13,7 +13,7 @@ VERBS = (
     Verb("evaluate", f"{_CLI}:evaluate_command", _TRAIN, "Evaluate an agent on test tasks, or on validation tasks."),
     Verb("report", f"{_CLI}:report_command", _TRAIN, "Compare results with the paper's."),
     Verb("results", f"{_MODELS}:results_command", _TRAIN, "Compare models on the benchmark's tasks."),
-    Verb("submit", f"{_MODELS}:submit_command", _TRAIN, "Make a file of results that can be added to that page."),
+    Verb("submit", f"{_MODELS}:submit_command", _TRAIN, "Make a file of results for the page of `results`."),
     Verb("models", f"{_MODELS}:models_command", _TRAIN, "List the bundled models."),
     Verb("watch", f"{_CLI}:watch_command", _TRAIN, "Play an episode and draw it as a GIF."),
     Verb("collect", f"{_MODELS}:collect_command", _TRAIN, "Record histories of an agent with a release's teammates."),

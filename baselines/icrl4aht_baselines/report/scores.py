@@ -213,13 +213,14 @@ def block_difference(
 
 def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
     """Return the results of two agents in a cell on the tasks, seeds and trainings that both have, in one order."""
-    tasks, seeds = ([value for value in own if value in theirs] for own, theirs in zip(one[:2], other[:2], strict=True))
+    tasks = tuple(task for task in one.tasks if task in other.tasks)
+    seeds = tuple(seed for seed in one.seeds if seed in other.seeds)
     trainings = min(len(found.blocks["all"]) for found in (one, other))
 
     def chosen(found: CellReturns) -> CellReturns:
         rows, columns = [found.tasks.index(task) for task in tasks], [found.seeds.index(seed) for seed in seeds]
         blocks = {name: values[:trainings, rows][:, :, columns] for name, values in found.blocks.items()}
-        return CellReturns(tuple(tasks), tuple(seeds), blocks, found.overlaps)
+        return CellReturns(tasks, seeds, blocks, found.overlaps)
 
     return chosen(one), chosen(other)
 

@@ -23,7 +23,7 @@ from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write, read_text
+from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.text import counted_noun
 
 SUBMITTED_PROTOCOL = "seeded"
@@ -134,7 +134,7 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "")
             returns = {result.task_id: result.returns for result in results}
             tasks |= set() if control else returns.keys()
             evaluations.append(Evaluation(control, training, settings | {"details": details}, returns))
-    tracks = [track for track in TRACKS if tasks & _track_tasks([track])]
+    tracks: list[Any] = [track for track in TRACKS if tasks & _track_tasks([track])]
     name = agent or evaluations[0].settings["agent"]
     found = Submission(1, name, facts, read_best_responses().version, tracks or [*TRACKS], evaluations)
     check_submission(found, ", ".join(map(str, folders)))
@@ -230,7 +230,7 @@ def read_submission(path: Path) -> Submission:
         OptionError: if it is no such file, or see `check_submission`.
     """
     try:
-        found = msgspec.json.decode(read_text(path), type=Submission)
+        found = msgspec.json.decode(path.read_bytes(), type=Submission)
     except msgspec.MsgspecError as error:
         raise OptionError(
             f"{path}: not a file of results: {error}; `icrl4aht-data submit` makes them from folders of `evaluate`"
