@@ -38,12 +38,12 @@ from icrl4aht_baselines.online.student import collect_release, release_teammates
 from icrl4aht_baselines.plotting import SMOOTHING, plot_return_curves, shrink_picture
 from icrl4aht_baselines.report.cards import model_card
 from icrl4aht_baselines.report.results import merge, note_results, read_run
-from icrl4aht_baselines.report.scores import cell_headroom, open_cells
 from icrl4aht_baselines.training.histories import prepare, start_from
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES
 from icrl4aht_baselines.training.trainer import format_loss, train
 from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError, unknown
@@ -319,8 +319,7 @@ class _Steps:
     def _tasks(self, kind: str) -> list[Task]:
         if kind in VALIDATION_KINDS:
             return bundled_tasks(self.track, kind)
-        layouts = {cell.layout for cell in open_cells("seeded")}
-        return [task for task in bundled_tasks(self.track, "test") if task.layout.name in layouts]
+        return bundled_tasks(self.track, "test")
 
     def _progress(self, what: str, steps: int) -> Callable[[int, float | None], None]:
         return lambda step, loss: self.show(what, step, steps, format_loss(loss))
@@ -368,14 +367,14 @@ def write_bundled_card(
     validation = merge([read_run(found.results[kind]) for found in outcomes for kind in VALIDATION_KINDS])
     taught = f" --teacher {teacher}" if teacher else ""
     command = f"icrl4aht-data research reference --name {outcomes[0].name}{taught} --bundle-as {name}"
-    pictures, headroom = {}, cell_headroom("seeded")
+    pictures, headroom = {}, read_headroom("seeded")
     for found in outcomes:
         of_track = read_run(found.results["test-seeded"])
-        cells = [cell for cell in open_cells("seeded") if cell in of_track.cells]
+        cells = [cell for cell in of_track.cells if has_headroom(headroom[cell[:2]])]
         returns, training = f"{found.track}/{RETURNS}", f"{found.track}/{RUN_CURVES}"
         path = folder / name / returns
         panels = {cell.title: {name: of_track.cells[cell]} for cell in cells}
-        plot_return_curves(panels, path, {cell.title: headroom[cell] for cell in cells})
+        plot_return_curves(panels, path, {cell.title: headroom[cell[:2]] for cell in cells})
         shrink_picture(path, path)
         pictures[returns] = (
             f"Return in each episode of the test tasks of track {found.track}, protocol seeded: running mean over "

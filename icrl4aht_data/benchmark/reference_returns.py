@@ -26,6 +26,11 @@ def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
     return {(layout, family): agents for layout, families in content.items() for family, agents in families.items()}
 
 
+def stay_returns(protocol: str) -> dict[str, float]:
+    """Return task id -> mean return of the ego `stay`; empty if the protocol was not measured."""
+    return json.loads(card_file("stay.json").read_text(encoding="utf-8")).get(protocol, {})
+
+
 def has_headroom(references: Mapping[str, float]) -> bool:
     """Return whether `oracle` earns over one point more than `stay`."""
     return references["oracle"] - references["stay"] > _NO_HEADROOM

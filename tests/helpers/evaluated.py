@@ -1,15 +1,20 @@
-"""Results of evaluation as runs, without playing."""
+"""Results of evaluation as runs and folders, and best responses, without playing."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
 
-from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
-from icrl4aht_baselines.evaluate.results import Result
+import numpy as np
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.evaluate.results import Result, write_result
 from icrl4aht_baselines.report.results import EvaluationRun, as_run
 
+from icrl4aht_data.benchmark.best_responses import BestResponse, BestResponseCard, TrainedResponse, write_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_headroom, stay_returns
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 
 TEST_TASKS = [task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))]
@@ -47,3 +52,38 @@ def evaluated_run(
     settings |= {"details": details} if details else {}
     returns = [[value] * 20 + [value + 2.0] * 20]
     return as_run([Result(task.task_id, settings, returns) for task in played], folder or f"runs/{agent}", played)
+
+
+SPAN = 20.0
+"""How much more best responses of `write_measured` earn than `stay`, in cells where the oracle earns more."""
+
+
+def write_measured(path: Path) -> Path:
+    """Write best responses to all test tasks; the five teammates of H4 in a cell share one behaviour."""
+    stays, headroom, behaviours = stay_returns("seeded"), read_headroom("seeded"), []
+    for (layout, family), egos in headroom.items():
+        tasks = [task for task in TEST_TASKS if (task.layout.name, task.teammate_family) == (layout, family)]
+        for own in [tasks] if family == "H4" else [[task] for task in tasks]:
+            best = float(np.mean([stays[task.task_id] for task in own])) + SPAN * has_headroom(egos)
+            ids, trained = tuple(task.task_id for task in own), (TrainedResponse(1, 10, best),)
+            behaviours.append(BestResponse(layout, family, "test", ids, trained, best, "best response, seed 1"))
+    write_best_responses(path, BestResponseCard("7", "seeded", "Invented.", tuple(behaviours)))
+    return path
+
+
+def write_results(
+    folder: Path, agent: str, curve: Sequence[float], track: str = "layout", seeds=(0, 1, 2), trained_on=(), offset=0.0
+) -> Path:
+    """Write results of all test tasks of a track as `evaluate` does, the same curve of 100 returns for each seed.
+
+    Args:
+        offset: added to the returns with the second teammate of a family, twice with the third, and so on.
+    """
+    settings = {"agent": agent, "seeds": [*seeds], "protocol": dataclasses.asdict(get_protocol("seeded"))}
+    details = {} if trained_on is None else {"details": {"trained_on": [*trained_on]}}
+    for task in TEST_TASKS:
+        if task.track == track:
+            values = [value + offset * task.teammate["theta_id"] for value in curve]
+            found = {**settings, "code_version": version("icrl4aht-data"), **details}
+            write_result(folder, Result(task.task_id, found, [values] * len(seeds)))
+    return folder

@@ -87,7 +87,7 @@ def rising_histories() -> tuple[float, ...]:
     return len(histories()), len(rising), LEAST_HEADROOM
 
 
-def mean_returns(layout: str, source: str) -> tuple[float, float]:
+def mean_returns(layout: str, source: str) -> tuple[float, ...]:
     found = [entry for entry in histories() if (entry.layout, entry.source) == (layout, source)]
     return tuple(sum(getattr(entry, name) for entry in found) / len(found) for name in ("return_start", "return_end"))
 
@@ -103,6 +103,7 @@ def streams_of_the_bundle() -> tuple[float, ...]:
 
 def least_rise_of_the_bundle() -> float:
     least = load_profile("small").least_rise
+    assert least is not None
     tasks = [*histories_by_task("ppo").values(), *histories_by_task("noise").values()]
     flat = {own[0].layout for own in tasks if rise(own) < least}
     assert flat <= {"coord_simple", "test_simple"}

@@ -79,7 +79,8 @@ collect --agent stay --out c --noise 2 0 | noise = '2': expected `float` <= 1
 research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2,
 research reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states its results
 research reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
-results empty | Missing option '--out'
+results | Missing option '--out'
+submit empty --out r.json --about a | missing --data, --labels
 research tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid: ad, dpt, hybrid_ad, amago_offline.
 evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent none --out e | A trained model is named by its folder
@@ -111,7 +112,8 @@ train rl2 --layout demo_wide --every 2 | every = 2: rl2 learns by playing, not f
 train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
 collect --agent stay --source student --out c | source = student: none of Dataset(
 collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON
-results empty --out r | empty: no results in empty/tasks; run `icrl4aht-data evaluate --out empty`
+results none.json --out r | none.json: No such file or directory; check the path
+submit empty --out r.json --about a --data b --labels c | empty: no results in empty/tasks
 train ad --layout all --channels own | channels = own: the layouts coord_simple,
 report empty | empty: no results in empty/tasks; run `icrl4aht-data evaluate --out empty`
 evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in

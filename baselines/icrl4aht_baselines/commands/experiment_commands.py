@@ -119,11 +119,12 @@ def control_command(out: Path) -> None:
     default=("published", "seeded"),
     help="published or seeded; repeat for several.",
 )
-@click.option("--bundle", is_flag=True, help="Also replace headroom.json and headroom.md of the package's cards.")
+@click.option("--bundle", is_flag=True, help="Also replace these files of the package's cards.")
 def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None:
     """Measure the reference egos on every test task.
 
-    Writes their results into OUT, and OUT/headroom.json and OUT/headroom.md from them.
+    `stay` also plays the validation tasks, since scores are relative to it. Writes their results into OUT, and
+    OUT/headroom.json, OUT/headroom.md and OUT/stay.json from them.
     """
     from icrl4aht_baselines.report.cards import HEADROOM_FILES, measure_headroom, write_headroom_cards
 
@@ -197,23 +198,19 @@ def drift_command(run: Path, layout: str | None, family: str, protocol: str, epi
 )
 @click.option("--versions", type=COUNT, default=16, help="Number of rearranged versions of each layout.")
 @click.option("--episodes", type=COUNT, default=40, help="Episodes on each version with each family of teammates.")
-@click.option("--store", is_flag=True, help="Also add the results to the package's stored results.")
 def unseen_command(
-    agents: tuple[str, ...], greedy: bool | None, layouts: tuple[str, ...], versions: int, episodes: int, store: bool
+    agents: tuple[str, ...], greedy: bool | None, layouts: tuple[str, ...], versions: int, episodes: int
 ) -> None:
     """Evaluate on rearranged layouts that no model was trained on.
 
     This shows whether a model learned the game or only its training layouts, and needs no test task. The versions have
     pots, piles and counters in other places; the teammates are the diverse validation ones. Prints mean returns on each
-    layout and the normalised return, with 95 % intervals over the versions.
+    layout, with 95 % intervals over the versions.
     """
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks
     from icrl4aht_baselines.online.unseen import unseen_returns
-    from icrl4aht_baselines.report import comparison
-    from icrl4aht_baselines.report.results import ENDS
+    from icrl4aht_baselines.report.tables import unseen_table
 
-    if store and episodes < 2 * ENDS:
-        raise click.UsageError(f"--episodes {episodes}: expected at least {2 * ENDS} with --store")
     names = {get_layout(name).name for name in layouts}
     tasks = [
         task
@@ -235,8 +232,4 @@ def unseen_command(
             show("unseen layouts", done, total, what)
 
         found = unseen_returns({ego.name: ego.make for ego in egos}, tasks, versions, episodes, played)
-    click.echo(comparison.unseen_table(comparison.add_unseen(comparison.StoredResults(), found)))
-    if store:
-        comparison.write_stored(
-            comparison.results_file(), comparison.add_unseen(comparison.read_stored(comparison.results_file()), found)
-        )
+    click.echo(unseen_table(found))

@@ -13,7 +13,16 @@ from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue
-from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, LAYOUT, TRACK, Folder, examples, overwrite_option
+from icrl4aht_data.commands.options import (
+    COUNT,
+    COUNT_OR_NONE,
+    LAYOUT,
+    TRACK,
+    Folder,
+    NewFile,
+    examples,
+    overwrite_option,
+)
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -198,29 +207,76 @@ def reference_command(
 
 
 @click.command(
+    "submit",
+    epilog=examples(
+        "icrl4aht-data submit runs/results --about 'AD, own encoder' --data noise --labels oracle --out mine.json"
+    ),
+)
+@click.argument("folders", nargs=-1, type=Folder(), metavar="FOLDER...")
+@click.option("--about", default="", help="One sentence on how the agent was made.")
+@click.option("--data", default="", help="Its training data in a few words; none if it was not trained.")
+@click.option("--labels", default="", help="The targets of its training in a few words; none without any.")
+@click.option("--steps", default="", help="Length of the training, such as '4,000 updates'.")
+@click.option("--core-hours", type=click.FloatRange(min=0), help="Core-hours of the training and all it needs.")
+@click.option("--link", default="", help="Address of a paper or repository.")
+@click.option("--name", default="", help="Name of the agent in tables.", show_default="that in the results")
+@click.option("--schema", is_flag=True, help="Only print the JSON schema of the file.")
+@click.option("--out", type=NewFile(".json"), metavar="FILE", help="Write this file.")
+@overwrite_option
+def submit_command(
+    folders: tuple[Path, ...],
+    name: str,
+    schema: bool,
+    out: Path | None,
+    overwrite: bool,
+    **facts: Any,
+) -> None:
+    """Make a file of results for the page of `results`.
+
+    Checks that FOLDERs of `evaluate` have all test tasks of a track, or of both, under protocol seeded with seeds 0, 1
+    and 2, and say what the agent was trained on. Several folders of one agent are its tracks, or its trainings with
+    different seeds. Results of `evaluate --controls` are included. A pull request that adds the file puts the agent on
+    the page; `icrl4aht-data results FILE` shows it there.
+    """
+    from icrl4aht_baselines.report import submission
+
+    if schema:
+        click.echo(submission.submission_schema())
+        return
+    required = {"FOLDER": folders, "--out": out, **{f"--{of}": facts[of] for of in ("about", "data", "labels")}}
+    if missing := [option for option, value in required.items() if not value]:
+        raise click.UsageError(f"missing {', '.join(missing)}")
+    assert out is not None
+    check_output(out, overwrite)
+    found = submission.make_submission(folders, submission.AgentFacts(**facts), name)
+    submission.write_submission(out, found)
+    click.echo(f"wrote {out}: {found.agent}, {' and '.join(found.tracks)}; `icrl4aht-data results {out}` shows it")
+
+
+@click.command(
     "results",
     epilog=examples(
         "icrl4aht-data results --out build/results",
-        "icrl4aht-data results runs/ad-results --about 'AD on noise histories' --out build/results",
+        "icrl4aht-data results mine.json --out build/results",
     ),
 )
-@click.argument("runs", nargs=-1, type=Folder(), metavar="[RESULTS]...")
-@click.option("--about", default="", help="One sentence on how the agent of RESULTS was made.")
-@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write results.md and results.png here.")
-@click.option("--store", is_flag=True, help="Also add RESULTS to the package's stored results.")
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE]...")
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the page here.")
+@click.option("--store", is_flag=True, help="Also add the results to the package's stored results.")
 @overwrite_option
-def results_command(runs: tuple[Path, ...], about: str, out: Path, store: bool, overwrite: bool) -> None:
-    """Compare reference models with the paper's numbers.
+def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: bool) -> None:
+    """Compare models on the benchmark's tasks.
 
-    Writes a page with tables and a figure from the package's stored results, to which those of RESULTS, folders that
-    `evaluate` made, are added.
+    Writes a page with three tables and a figure, results.md and results.png, and every number, results.csv and
+    results.parquet, from the package's stored results and those of FILEs that `submit` made.
     """
     from icrl4aht_baselines.report import comparison
+    from icrl4aht_baselines.report.submission import read_submission
 
     check_output(out, overwrite, comparison.RESULTS_FILES)
     stored = comparison.read_stored(comparison.results_file())
-    for folder in runs:
-        stored = comparison.add_results(stored, folder, about)
+    for path in files:
+        stored = comparison.add_submission(stored, read_submission(path))
     if store:
         comparison.write_stored(comparison.results_file(), stored)
     for path in comparison.write_comparison(stored, out):

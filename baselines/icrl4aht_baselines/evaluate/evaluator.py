@@ -279,7 +279,8 @@ def prepare_rollout(
         for _ in seeds
     ]
     numbers = np.array([layouts.index(task.layout) for task in tasks for _ in seeds]) if several else None
-    ego = make_ego(layouts) if several and make_ego in SCRIPTED else make_ego(layouts[0])
+    every: Any = layouts if several and make_ego in SCRIPTED else layouts[0]
+    ego = make_ego(every)
     rollout = EvaluationRollout(layouts if several else layouts[0], ego, mates, protocol, numbers)
     state = _first_state(rollout, tasks, seeds) if earlier is None else _next_state(rollout, earlier)
     programs = Programs() if programs is None else programs

@@ -7,7 +7,7 @@ from icrl4aht_baselines import CallablePackage
 from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.report.page import markdown, write_report
 from icrl4aht_baselines.report.results import as_run, merge, read_run
-from icrl4aht_baselines.report.scores import rows
+from icrl4aht_baselines.report.tables import rows
 
 __all__ = ["as_run", "markdown", "merge", "read_run", "report", "rows", "write_report"]
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.evaluate.evaluator import evaluate
-from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import UNUSED_OPTIONS
 from icrl4aht_baselines.report.page import markdown_sections
 from icrl4aht_baselines.report.results import (
@@ -26,16 +26,15 @@ from icrl4aht_baselines.report.results import (
     instances_range,
     published_cells,
 )
-from icrl4aht_baselines.report.scores import PAPER_METHODS
+from icrl4aht_baselines.report.tables import PAPER_METHODS
 from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
-from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.fetch import is_address
 from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.templates import fill_template, markdown_table
 
-HEADROOM_FILES = ("headroom.json", "headroom.md")
+HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json")
 
 _HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 _NOT_LISTED = ("layouts", "root", "groups", "selections", "sizes", "manifest_sha256", "data_version", "obs_shape")
@@ -184,15 +183,18 @@ def card_name(run: EvaluationRun) -> str:
 def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:
     """Evaluate every reference ego under every protocol into out/<protocol>/<agent>; finished tasks are kept.
 
+    `stay` also plays the validation tasks, since scores are relative to it.
+
     Args:
         out: folder of the results.
         protocols: their names.
         show: called with (name, tasks done, tasks), for progress.
     """
-    tasks = [task for track in TRACKS for task in read_tasks(manifest_path(track, "test"))]
     runs = []
     for protocol in protocols:
         for agent in REFERENCES:
+            splits = EVALUATION_SPLITS if agent == "stay" else ("test",)
+            tasks = [task for split in splits for track in TRACKS for task in bundled_tasks(track, split)]
             done = counted(show, f"{agent}, {protocol}", len(tasks))
             folder = out / protocol / agent
             runs.append(as_run(evaluate(agent, AGENTS[agent], tasks, get_protocol(protocol), out=folder, done=done)))
@@ -200,18 +202,26 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
 
 
 def write_headroom_cards(runs: Sequence[EvaluationRun], folder: Path) -> list[Path]:
-    """Write headroom.json and headroom.md into a folder. Return their paths.
+    """Write headroom.json, headroom.md and stay.json into a folder. Return their paths.
 
-    headroom.json holds protocol -> layout -> family -> reference ego -> mean return.
+    headroom.json holds protocol -> layout -> family -> reference ego -> mean return with the test tasks, stay.json
+    protocol -> task id -> mean return of `stay`.
     """
     content: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    stays: dict[str, dict[str, float]] = {}
     for run in runs:
         for cell, returns in run.returns.items():
-            egos = content.setdefault(run.protocol, {}).setdefault(cell.layout, {}).setdefault(cell.family, {})
-            egos[run.agent] = round(float(returns.mean.mean()), 3)
+            if cell.kind == "test":
+                egos = content.setdefault(run.protocol, {}).setdefault(cell.layout, {}).setdefault(cell.family, {})
+                egos[run.agent] = round(float(returns.mean.mean()), 3)
+            if run.agent == "stay":
+                means = returns.mean.mean(axis=1)
+                found = {task.task_id: round(float(of), 3) for task, of in zip(run.tasks(cell), means, strict=True)}
+                stays.setdefault(run.protocol, {}).update(found)
     paths = [folder / name for name in HEADROOM_FILES]
     paths[0].write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     paths[1].write_text(headroom_markdown(content), encoding="utf-8")
+    paths[2].write_text(json.dumps(stays, indent=1) + "\n", encoding="utf-8")
     return paths
 
 

@@ -1,333 +1,343 @@
-"""Stored results of reference models, `cards/results.csv`, and docs/results.md, which compares them.
-
-Shapes: U tasks, S seeds with which each was played.
-"""
+"""Stored results of agents, `cards/results.csv`, and docs/results.md, which compares them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
 
 import msgspec
 import numpy as np
 import pandas as pd
 
-from icrl4aht_baselines.evaluate.segments import FORGETS
 from icrl4aht_baselines.report.results import (
-    AGENT_COLUMNS,
     CELL_COLUMNS,
-    ENDS,
+    EPISODE_BLOCKS,
     TABLE_COLUMNS,
-    CellReturns,
+    TEST_LAYOUTS,
+    AgentReturns,
     ResultCell,
-    cell_rows,
-    episode_blocks,
     in_order,
-    published_cells,
-    published_instances,
-    read_run,
     returns_by_cell,
 )
-from icrl4aht_baselines.report.scores import PAPER_METHODS, cell_headroom, mean_of, normalise, open_cells
-from icrl4aht_baselines.report.statistics import mean_interval
-from icrl4aht_baselines.training.seen import OVERLAPS, overlap_marks
-from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.reference_returns import REFERENCES
+from icrl4aht_baselines.report.scores import (
+    CellScales,
+    block_difference,
+    cell_scales,
+    find_score,
+    open_cells,
+    score_difference,
+    track_cells,
+)
+from icrl4aht_baselines.report.statistics import MeanInterval, holm
+from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission, submitted_runs
+from icrl4aht_baselines.report.tables import mean_of
+from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
+from icrl4aht_data.benchmark.best_responses import read_best_responses
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
+from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, read_headroom
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import new_figure, save_figure
+from icrl4aht_data.plotting import legend_below, new_figure, return_limits, save_figure
+from icrl4aht_data.reading.arrow_tables import import_pyarrow
 from icrl4aht_data.utils.files import atomic_write, write_json
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
-from icrl4aht_data.utils.text import counted_noun
 
-RESULTS_FILES = ("results.md", "results.png")
+RESULTS_FILES = ("results.md", "results.png", "results.csv", "results.parquet")
 
-AgentReturns = Mapping[ResultCell, CellReturns]
-"""Returns of an agent under one protocol."""
+CURVE_COLUMNS = ["agent", "protocol", "control", "layout", "episode", "return"]
 
-UNSEEN = "unseen"
-"""Protocol name of results on rearranged layouts, see `icrl4aht_baselines.online.unseen`; a task for each version."""
-
-
-_Text = Literal["about", "ablations", "commits"]
+_PANELS = 6
+_SIGNIFICANT = 0.05
 
 
 @dataclass(frozen=True)
 class StoredResults:
-    """Results of several agents, `cards/results.csv` and the texts of `cards/results.json`.
+    """Results of several agents: `cards/results.csv`, `cards/curves.csv` and `cards/results.json`.
 
     Attributes:
-        table: the results, see `results`. Entries of ablations are stored like agents, with the experiment's name
-            instead of a protocol; results on unseen layouts with `UNSEEN`.
-        about: agent -> one sentence on how it was made; agents are shown in this order.
-        ablations: ablation -> entry -> what differs.
-        commits: agent or ablation -> commit of this repository whose code made it, if later code cannot.
+        table: the results, see `results`.
+        curves: return in each episode with test tasks, mean over the tasks of a layout, seeds and trainings, with the
+            columns `CURVE_COLUMNS`.
+        agents: agent -> what tables say about it; agents are shown in this order.
     """
 
     table: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=TABLE_COLUMNS))
-    about: dict[str, str] = field(default_factory=dict)
-    ablations: dict[str, dict[str, str]] = field(default_factory=dict)
-    commits: dict[str, str] = field(default_factory=dict)
+    curves: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=CURVE_COLUMNS))
+    agents: dict[str, AgentFacts] = field(default_factory=dict)
 
-    def protocol(self, name: str) -> dict[str, AgentReturns]:
-        """Return the results under a protocol by agent, in the order of `about`."""
-        agents = dict(iter(self.table[self.table["protocol"] == name].groupby("agent", sort=False)))
-        return {str(agent): returns_by_cell(agents[agent]) for agent in [*self.about, *agents] if agent in agents}
+    def returns(self, control: str = "", protocol: str = SUBMITTED_PROTOCOL) -> dict[str, AgentReturns]:
+        """Return the results under a protocol by agent, those with test tasks, in the order of `agents`."""
+        table = self.table
+        chosen = (table["protocol"] == protocol) & (table["control"] == control) & (table["kind"] == "test")
+        found = dict(iter(table[chosen].groupby("agent", sort=False)))
+        return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
 
 
 def results_file() -> Path:
-    """Return the path of the stored results: the texts; the table is next to it, in results.csv."""
-    return card_file("published.json").with_name("results.json")
+    """Return the path of the stored results' texts; the tables are next to it."""
+    return card_file("best_responses.json").with_name("results.json")
+
+
+def _table_paths(path: Path) -> tuple[Path, Path]:
+    return path.with_suffix(".csv"), path.with_name(f"{path.stem}_curves.csv")
 
 
 def read_stored(path: Path) -> StoredResults:
-    """Return stored results, texts in a JSON file and a table of the same name; none if there is no such file.
+    """Return stored results, texts in a JSON file and tables next to it; none if there is no such file.
 
     Raises:
         OptionError: if a file is damaged.
     """
     if not path.is_file():
         return StoredResults()
+    table, curves = _table_paths(path)
     try:
-        texts = msgspec.json.decode(path.read_bytes(), type=dict[_Text, dict[str, Any]])
-        return StoredResults(pd.read_csv(path.with_suffix(".csv"), keep_default_na=False)[TABLE_COLUMNS], **texts)
+        agents = msgspec.json.decode(path.read_bytes(), type=dict[str, AgentFacts])
+        kinds = {"task": str, "block": str}
+        frames = [pd.read_csv(file, keep_default_na=False, dtype=kinds) for file in (table, curves)]
+        return StoredResults(frames[0][TABLE_COLUMNS], frames[1][CURVE_COLUMNS], agents)
     except (OSError, ValueError, KeyError) as error:
-        raise OptionError(f"{path}: not stored results: {error!r}; restore it and {path.stem}.csv") from error
+        raise OptionError(
+            f"{path}: not stored results: {error!r}; restore it, {table.name} and {curves.name}"
+        ) from error
 
 
 def write_stored(path: Path, stored: StoredResults) -> None:
-    """Write stored results, rounded to three digits."""
-    with atomic_write(path.with_suffix(".csv")) as partial:
-        stored.table.round(3).to_csv(partial, index=False, lineterminator="\n")
+    """Write stored results, rounded to three digits, curves to two."""
+    for file, frame, digits in zip(_table_paths(path), (stored.table, stored.curves), (3, 2), strict=True):
+        with atomic_write(file) as partial:
+            frame.round(digits).to_csv(partial, index=False, lineterminator="\n")
     with atomic_write(path) as partial:
-        write_json(partial, {name: getattr(stored, name) for name in get_args(_Text)})
+        write_json(partial, msgspec.to_builtins(stored.agents))
 
 
-def add_results(stored: StoredResults, folder: Path, about: str) -> StoredResults:
-    """Return stored results with those of a folder that `evaluate` made; equal cells are replaced.
-
-    Args:
-        stored: the results so far.
-        folder: the folder.
-        about: one sentence on how the agent was made; empty to keep the stored one.
-
-    Raises:
-        OptionError: if the folder has no results, or mixed ones, if a task was played for fewer than 2 x `ENDS`
-            episodes or a published one is missing, or if `about` is empty for a new agent.
-    """
-    run = read_run(folder)
-    for cell, returns in run.cells.items():
-        if returns.shape[1] < 2 * ENDS:
-            raise OptionError(f"{folder}: {returns.shape[1]} episodes, expected at least {2 * ENDS}; evaluate more")
-        if cell.kind == "test" and not run.is_complete(cell):
-            raise OptionError(
-                f"{folder}: {len(returns)} of the {published_instances(cell)} published tasks of {cell.layout} "
-                f"{cell.family}; evaluate all of them"
-            )
-    about = about or stored.about.get(run.agent, "")
-    if not about:
-        raise OptionError(f"{folder}: results of {run.agent}, a new agent: say how it was made by --about")
-    return _replace_rows(replace(stored, about=stored.about | {run.agent: about}), run.table)
-
-
-def add_unseen(stored: StoredResults, returns: Mapping[str, Mapping[tuple[str, str], np.ndarray]]) -> StoredResults:
-    """Return stored results with those on unseen layouts, (versions, episodes); equal cells are replaced."""
-    rows = []
-    for agent, cells in returns.items():
-        for cell, values in cells.items():
-            rows += cell_rows((agent, UNSEEN), ResultCell(*cell), episode_blocks(values[:, None]))
-    return _replace_rows(stored, pd.DataFrame(rows, columns=TABLE_COLUMNS))
-
-
-def _replace_rows(stored: StoredResults, table: pd.DataFrame) -> StoredResults:
-    keys = [*AGENT_COLUMNS, *CELL_COLUMNS]
-    known = pd.MultiIndex.from_frame(stored.table[keys]).isin(pd.MultiIndex.from_frame(table[keys]))
-    parts = [part for part in (stored.table[~known], table) if len(part)]
-    return replace(stored, table=pd.concat(parts, ignore_index=True))
+def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
+    """Return stored results with those of a file; they replace all of the agent's earlier ones."""
+    tables, curves = [], defaultdict(list)
+    for one, run in submitted_runs(found):
+        tables.append(run.table.assign(agent=found.agent, training=one.training, control=one.control))
+        for cell, returns in run.cells.items():
+            curves[one.control, cell.layout].append(returns)
+    rows = [
+        (found.agent, SUBMITTED_PROTOCOL, control, layout, episode, value)
+        for (control, layout), parts in curves.items()
+        for episode, value in enumerate(np.concatenate(parts).mean(axis=0).tolist(), start=1)
+    ]
+    frames = (
+        (stored.table, pd.concat(tables, ignore_index=True)),
+        (stored.curves, pd.DataFrame(rows, columns=CURVE_COLUMNS)),
+    )
+    merged = (
+        pd.concat([part for part in (old[old["agent"] != found.agent], new) if len(part)], ignore_index=True)
+        for old, new in frames
+    )
+    return StoredResults(*merged, stored.agents | {found.agent: found.facts})
 
 
 def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
-    """Write docs/results.md and its figure into a folder. Return their paths.
+    """Write docs/results.md, its figure, and the table of results as CSV and Parquet. Return their paths.
 
     Raises:
-        OptionError: if there are no results.
+        OptionError: if there are no results, or pyarrow or matplotlib is not installed.
     """
     if not len(stored.table):
-        raise OptionError("no stored results: give folders that `icrl4aht-data evaluate` made")
+        raise OptionError("no stored results: give files that `icrl4aht-data submit` made")
+    import_pyarrow()
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / name for name in RESULTS_FILES]
-    paths[0].write_text(render_comparison(stored), encoding="utf-8")
-    plot_comparison(stored, "seeded", paths[1])
+    text, figure, csv, parquet = paths = [folder / name for name in RESULTS_FILES]
+    text.write_text(render_comparison(stored), encoding="utf-8")
+    plot_comparison(stored, figure)
+    table = add_scales(stored.table).round(3)
+    with atomic_write(csv) as partial:
+        table.to_csv(partial, index=False, lineterminator="\n")
+    with atomic_write(parquet) as partial:
+        table.astype({name: "category" for name in TABLE_COLUMNS if table[name].dtype == object}).to_parquet(
+            partial, index=False
+        )
     return paths
 
 
+def add_scales(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table of results with columns `stay` and `best`, the returns that scores are relative to."""
+    rows = [
+        (protocol, *cell[:2], cell.kind, task, scale.stay, scale.best)
+        for protocol in table["protocol"].unique()
+        for cell, of_cell in cell_scales(protocol).items()
+        for task, scale in of_cell.tasks.items()
+    ]
+    keys = ["protocol", *CELL_COLUMNS, "task"]
+    return table.merge(pd.DataFrame(rows, columns=[*keys, "stay", "best"]), how="left", on=keys)
+
+
 def render_comparison(stored: StoredResults) -> str:
-    """Return docs/results.md. Tables of single cells leave out agents that the present code does not make."""
-    seeded, published = (stored.protocol(name) for name in ("seeded", "published"))
-    current = [agent for agent in stored.about if agent not in stored.commits]
-    shown = [agent for agent in current if not agent.endswith(FORGETS)]
-    made = {agent: f" (made by commit {commit})" for agent, commit in stored.commits.items()}
-    played = in_order(cell for own in seeded.values() for cell in own)
-    validation = {kind: [cell for cell in played if cell.kind == kind] for kind in ("validation", "diverse")}
-    tracks = {
-        f"{prefix}{track}": cells_table(results, track_cells(protocol, track), shown, protocol=protocol)
-        for prefix, protocol, results in (("", "seeded", seeded), ("published_", "published", published))
-        for track in TRACKS
-    }
+    """Return docs/results.md. Tables leave out agents that the present code does not make."""
+    scales, every = cell_scales(SUBMITTED_PROTOCOL), stored.returns()
+    results = {agent: cells for agent, cells in every.items() if not stored.agents[agent].commit}
+    overlaps = {name for cells in results.values() for returns in cells.values() for name in returns.overlaps}
+    measured, scored = read_best_responses(), open_cells(scales)
     return fill_template(
         "results.md",
-        about="\n".join(f"* `{agent}`: {about}{made.get(agent, '')}" for agent, about in stored.about.items()),
-        summary=summary_table(seeded, "seeded"),
-        published_summary=summary_table(published, "published"),
-        **tracks,
-        gains=cells_table(seeded, open_cells("seeded"), current, _gain_text),
-        **{kind: cells_table(seeded, cells, shown) for kind, cells in validation.items()},
-        windows=ablation_table(stored, "ablate windows"),
-        contexts=ablation_table(stored, "ablate contexts"),
-        unseen=unseen_table(stored),
-        marks="\n".join(f"* {kind.mark}: {kind.meaning}" for kind in OVERLAPS.values()),
-        references=", ".join(f"`{name}`" for name in REFERENCES),
-        forgets=f"`NAME{FORGETS}`",
-        cells=str(len(open_cells("seeded"))),
+        agents=agents_table(stored, results, scales),
+        difference=describe_lead(results, scales),
+        controls=controls_table(stored, results, scales),
+        layouts=layouts_table(results, scales),
+        about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
+        earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
+        marks="\n".join(f"* {text}" for text in overlap_legend(overlaps)),
+        measured=f"{measured.about.rstrip('.')} (best responses of version {measured.version}).",
+        cells=f"{len(scored)} of {len(scales)} cells",
+        least=f"{LEAST_HEADROOM:g}",
+        alpha=f"{_SIGNIFICANT:g}",
+        rows=f"{len(stored.table):,}",
     )
 
 
-def track_cells(protocol: str, track: str) -> list[ResultCell]:
-    """Return the test cells of a track with headroom under a protocol."""
-    return [cell for cell in open_cells(protocol) if cell.layout in TRACKS[track]["test"]]
+def _describe_agent(agent: str, facts: AgentFacts) -> str:
+    name = f"[`{agent}`]({facts.link})" if facts.link else f"`{agent}`"
+    return f"* {name}: {facts.about.rstrip('.')}."
 
 
-def summary_table(results: Mapping[str, AgentReturns], protocol: str) -> str:
-    """Return a table with a row for each agent: normalised return by track, cells that rise, seeds of a task.
+def _shown(value: MeanInterval | None, digits: int = 2, sign: str = "") -> str:
+    return value.text(digits, sign) if value else "–"
 
-    A normalised return is left out if the agent has not played all cells of the track that have headroom.
+
+def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
+    """Return table 1: a row for each agent, what it was made of, and its scores on each track.
+
+    A track has no score unless the agent played all of its cells with headroom.
     """
-    headroom = cell_headroom(protocol)
-    groups = {**{track: track_cells(protocol, track) for track in TRACKS}, "both": open_cells(protocol)}
     body = []
     for agent, cells in results.items():
-        played = {cell: cells[cell] for cell in groups["both"] if cell in cells}
-        scores = {cell: normalise(returns.mean, headroom[cell]) for cell, returns in played.items()}
-        rising = [returns for returns in played.values() if mean_interval(returns.gain).low > 0]
-        rise = ""
-        if played:
-            opening, last = (mean_of(getattr(of, name) for of in played.values()) for name in ("opening", "last"))
-            gain = mean_interval(*(returns.last - returns.opening for returns in played.values()))
-            rise = f"{opening:z.1f} to {last:z.1f}, {gain.text(sign='+')}"
-        texts = [
-            mean_interval(*map(scores.__getitem__, of)).text(2) if set(of) <= scores.keys() else ""
-            for of in groups.values()
-        ]
-        seeds = " or ".join(map(str, sorted({returns.mean.shape[1] for returns in played.values()})))
-        marks = overlap_marks({name for returns in cells.values() for name in returns.overlaps}).strip()
-        body.append([f"`{agent}`{marks}", *texts, f"{len(rising)} of {len(played)}", rise, seeds])
-    scored = [f"{track} ({counted_noun(len(of), 'cell')})" for track, of in groups.items()]
-    return markdown_table(["agent", *scored, "rising", "first episode to last 20", "seeds"], body)
+        facts, marks = stored.agents[agent], {name for of in cells.values() for name in of.overlaps}
+        hours = "–" if facts.core_hours is None else f"{facts.core_hours:g}"
+        row = [f"`{agent}`{overlap_marks(marks)}", facts.data, facts.labels, facts.steps or "–", hours]
+        for track in TRACKS:
+            score = find_score(cells, track_cells(open_cells(scales), track), scales)
+            row += [_shown(score and score.total), _shown(score and score.middle)]
+        body.append(row)
+    scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")]
+    return markdown_table(["model", "data", "labels", "budget", "core-hours", *scored], body)
 
 
-def _mean_text(returns: CellReturns) -> str:
-    return f"{returns.mean.mean():z.1f}{overlap_marks(returns.overlaps).strip()}"
+def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
+    """Return a sentence on the difference between the two agents with the highest primary endpoint; or why none."""
+    cells = track_cells(open_cells(scales), "teammate")
+    scores = {agent: found.total.mean for agent, of in results.items() if (found := find_score(of, cells, scales))}
+    if len(scores) < 2:
+        return "No two models have a score on the track `teammate`."
+    first, second = sorted(scores, key=scores.__getitem__, reverse=True)[:2]
+    difference = score_difference(results[first], results[second], cells, scales)
+    return (
+        f"The two highest on the track `teammate`, paired by task and seed: `{first}` minus `{second}` is "
+        f"{difference.text(2, '+')}."
+    )
 
 
-def _gain_text(returns: CellReturns) -> str:
-    gain = mean_interval(returns.gain)
-    text = f"{returns.first.mean():z.1f} to {returns.last.mean():z.1f}, {gain.text(sign='+')}"
-    text += overlap_marks(returns.overlaps).strip()
-    return f"**{text}**" if gain.low > 0 else text
+def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
+    """Return table 2: M, P and the mean return in blocks of episodes, of each agent.
 
-
-def cells_table(
-    results: Mapping[str, AgentReturns],
-    cells: Sequence[ResultCell],
-    agents: Sequence[str],
-    text: Callable[[CellReturns], str] = _mean_text,
-    protocol: str = "",
-) -> str:
-    """Return a table with a row for each cell, and a column for each agent that played one.
-
-    Args:
-        results: agent -> its results.
-        cells: the cells.
-        agents: the agents.
-        text: returns the text on an agent's results in a cell, by default their mean.
-        protocol: if given, there are also columns of the reference egos' returns under it, and of the paper's numbers,
-            which are of protocol `published`.
+    The means are over the cells with headroom, or over all cells that the agent played if best responses were not
+    measured. M and P are bold if they are above 0 with a p-value below 0.05, corrected for all M and P of the table.
     """
-    headroom = cell_headroom(protocol)
+    controls = {control: stored.returns(control) for control in ("forgets", "swapped")}
+    found: dict[tuple[str, str], MeanInterval] = {}
+    chosen = {}
+    for agent, cells in results.items():
+        chosen[agent] = [cell for cell in open_cells(scales) if cell in cells] or [*cells]
+        for name, control, block in (("M", "forgets", "all"), ("P", "swapped", "last 20")):
+            other = controls[control].get(agent, {})
+            played = [cell for cell in chosen[agent] if cell in other]
+            if difference := block_difference(cells, other, played, block, scales):
+                found[agent, name] = difference
+    corrected = holm({key: difference.p for key, difference in found.items()})
     body = []
-    for cell in cells:
-        row = {"layout": cell.layout, "family": cell.family}
-        if protocol:
-            paper = {f"{name} (paper)": published_cells(name)[cell.layout][cell.family][0] for name in PAPER_METHODS}
-            egos = {name: headroom[cell][name] for name in ("stay", "random")}
-            row |= {name: f"{value:z.1f}" for name, value in (egos | paper).items()}
-        for agent in (agent for agent in agents if not results.get(agent, {}).keys().isdisjoint(cells)):
-            row[f"`{agent}`"] = text(results[agent][cell]) if cell in results[agent] else ""
-        body.append(row | ({"oracle": f"{headroom[cell]['oracle']:z.1f}"} if protocol else {}))
-    header = [*body[0]] if body else ["layout", "family"]
-    return markdown_table(header, [[*row.values()] for row in body], right=len(header) - 2)
+    for agent, cells in results.items():
+        row = [f"`{agent}`"]
+        for name in ("M", "P"):
+            text = _shown(found.get((agent, name)), 1, "+")
+            is_clear = (agent, name) in found and found[agent, name].mean > 0
+            row.append(f"**{text}**" if is_clear and corrected[agent, name] < _SIGNIFICANT else text)
+        for block in EPISODE_BLOCKS:
+            parts = [cells[cell].blocks[block] for cell in chosen[agent] if block in cells[cell].blocks]
+            row.append(f"{mean_of(parts):z.1f}" if parts else "–")
+        body.append(row)
+    return markdown_table(["model", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))
 
 
-def ablation_table(stored: StoredResults, name: str) -> str:
-    """Return a table with a row for each stored entry of an ablation.
+def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
+    """Return table 3: mean return on each layout, with N in parentheses, the worst teammate and the regret.
 
-    Returns, their differences to the first entry, and gains are means over tasks and seeds, with 95 % bootstrap
-    intervals.
+    The first rows have the reference egos and the best responses.
     """
-    results, body = stored.protocol(name), []
-    first: np.ndarray | None = None
-    for entry, about in stored.ablations.get(name, {}).items():
-        cells = results[entry].values()
-        mean, gain = np.concatenate([of.mean for of in cells]), np.concatenate([of.gain for of in cells])
-        known = first is not None and mean.shape == first.shape
-        difference = mean_interval(mean - first).text(sign="+") if known else ""
-        first = mean if first is None else first
-        body.append([f"`{entry}`", about, mean_interval(mean).text(), difference, mean_interval(gain).text(sign="+")])
-    return markdown_table(["entry", "difference", "mean return", "to the first", "last 20 - first 20"], body)
+    scored, headroom = open_cells(scales), read_headroom(SUBMITTED_PROTOCOL)
+    body = []
+    for ego in REFERENCES:
+        means = (np.mean([egos[ego] for cell, egos in headroom.items() if cell[0] == name]) for name in TEST_LAYOUTS)
+        body.append([f"`{ego}`", *(f"{mean:z.1f}" for mean in means), "", ""])
+    bests = []
+    for name in TEST_LAYOUTS:
+        of_layout = [scale.best for cell, scale in scales.items() if (cell.layout, cell.kind) == (name, "test")]
+        families = [cell for cell in headroom if cell[0] == name]
+        bests.append(f"{np.mean(of_layout):z.1f}" if len(of_layout) == len(families) else "–")
+    body.append(["best response", *bests, "", ""])
+    for agent, cells in results.items():
+        texts = []
+        for name in TEST_LAYOUTS:
+            played = [of.mean for cell, of in cells.items() if cell.layout == name]
+            score = find_score(cells, [cell for cell in scored if cell.layout == name], scales)
+            text = f"{mean_of(played):z.1f}" if played else "–"
+            texts.append(f"{text} ({score.total.mean:z.2f})" if score else text)
+        score = find_score(cells, [cell for cell in scored if cell in cells], scales)
+        worst = f"{score.worst[1]:z.2f}, {score.worst[0]}" if score else "–"
+        body.append([f"`{agent}`", *texts, worst, f"{score.regret:z.1f}" if score else "–"])
+    return markdown_table(["model", *TEST_LAYOUTS, "worst teammate", "regret"], body, right=len(TEST_LAYOUTS) + 2)
 
 
-def unseen_table(stored: StoredResults) -> str:
-    """Return a table with a row for each agent that played on unseen layouts, and a column for each layout's versions.
+def figure_layouts(scales: CellScales) -> list[str]:
+    """Return the layouts of the figure: those with headroom, by the oracle if no best response was measured."""
+    headroom = read_headroom(SUBMITTED_PROTOCOL)
+    cells = open_cells(scales) or in_order(ResultCell(*cell) for cell, egos in headroom.items() if has_headroom(egos))
+    return list(dict.fromkeys(cell.layout for cell in cells))[:_PANELS]
 
-    Returns are means over versions and families; normalised ones (return - `stay`) / (`oracle` - `stay`), mean over
-    layouts. Intervals are over the versions. Without `stay` and `oracle` there are no normalised ones.
+
+def plot_comparison(stored: StoredResults, path: Path) -> None:
+    """Plot the return in each episode of the agents with curves, dashed with their memory cleared, on a log axis.
+
+    An agent without curves has a point at its first episode. Lines show `stay` and the best responses.
     """
-    rows = stored.table[stored.table["protocol"] == UNSEEN]
-    families = rows.groupby(["agent", "layout", "task"], sort=False)["mean"].mean()
-    versions: Any = {key: of.to_numpy() for key, of in families.groupby(level=["agent", "layout"], sort=False)}
-    layouts, body = sorted(rows["layout"].unique()), []
-    for agent in rows["agent"].unique():
-        own, stay, oracle = ([versions.get((name, one)) for one in layouts] for name in (agent, "stay", "oracle"))
-        scored = agent not in REFERENCES and all(values is not None for values in (*own, *stay, *oracle))
-        texts = ["" if of is None else mean_interval(of).text() for of in own]
-        ends = zip(own, stay, oracle, strict=True) if scored else ()
-        scaled = [(values - low) / (high.mean() - low.mean()) for values, low, high in ends]
-        body.append([f"`{agent}`", *texts, mean_interval(*scaled).text(2) if scored else ""])
-    return markdown_table(["agent", *layouts, "normalised"], body)
-
-
-def plot_comparison(stored: StoredResults, protocol: str, path: Path) -> None:
-    """Plot mean returns in the cells with headroom: of agents as bars, of reference egos and the paper as marks."""
-    headroom, chosen = cell_headroom(protocol), open_cells(protocol)
-    results = {
-        agent: cells
-        for agent, cells in stored.protocol(protocol).items()
-        if agent not in stored.commits and not agent.endswith(FORGETS)
+    scales, results, headroom = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), read_headroom(SUBMITTED_PROTOCOL)
+    layouts = figure_layouts(scales)
+    figure = new_figure(11, 3 * -(-len(layouts) // 3) + 0.6)
+    grid = [*figure.subplots(-(-len(layouts) // 3), 3, squeeze=False).flat]
+    shown = [agent for agent in results if not stored.agents[agent].commit]
+    curves = {
+        key: of.sort_values("episode")["return"].to_numpy()
+        for key, of in stored.curves.groupby(["agent", "control", "layout"], sort=False)
     }
-    figure = new_figure(11, 4.2)
-    axes, numbers, width = figure.subplots(), np.arange(len(chosen)), 0.8 / max(1, len(results))
-    for number, (agent, cells) in enumerate(results.items()):
-        heights = [cells[cell].mean.mean() if cell in cells else np.nan for cell in chosen]
-        axes.bar(numbers - 0.4 + (number + 0.5) * width, heights, width, label=agent)
-    for name, style in (("oracle", "k_"), ("stay", "rx"), ("random", "g+")):
-        axes.plot(numbers, [headroom[cell][name] for cell in chosen], style, markersize=9, label=name)
-    for name, style in zip(PAPER_METHODS, ("ms", "cD"), strict=True):
-        returns = [published_cells(name)[cell.layout][cell.family][0] for cell in chosen]
-        axes.plot(numbers, returns, style, markersize=4, fillstyle="none", label=f"{name} (paper)")
-    axes.set_xticks(numbers, [f"{cell.layout}\n{cell.family}" for cell in chosen], rotation=60, fontsize=8)
-    axes.set_ylabel("mean return of an episode")
-    axes.axhline(0, color="gray", linewidth=0.6)
-    figure.legend(ncols=5, fontsize=8, loc="outside lower center", frameon=False)
-    axes.set_title(f"Test tasks with headroom, protocol {protocol}; the paper's numbers are of published", fontsize=10)
+    for axes, layout in zip(grid, layouts, strict=False):
+        for number, agent in enumerate(shown):
+            color = f"C{number % 10}"
+            for control, style in (("", "-"), ("forgets", "--")):
+                if (curve := curves.get((agent, control, layout))) is not None:
+                    label = agent if not control else f"{agent}, memory cleared"
+                    axes.plot(np.arange(1, len(curve) + 1), curve, style, color=color, linewidth=1.2, label=label)
+            first = [of.blocks["1"] for cell, of in results[agent].items() if cell.layout == layout]
+            if first and (agent, "", layout) not in curves:
+                axes.plot([1], [mean_of(first)], "o", color=color, markersize=4, label=f"{agent}, first episode")
+        cells = [ResultCell(*cell) for cell in headroom if cell[0] == layout]
+        axes.axhline(np.mean([headroom[cell[:2]]["stay"] for cell in cells]), color="gray", linestyle=":", label="stay")
+        if all(cell in scales for cell in cells):
+            axes.axhline(np.mean([scales[cell].best for cell in cells]), color="black", label="best response")
+        axes.set_ylim(*return_limits(value for line in axes.lines for value in np.ravel(line.get_ydata())))
+        axes.set_xscale("log")
+        axes.set_xlim(0.9, 110)
+        axes.set_xticks([1, 2, 5, 10, 20, 50, 100], ["1", "2", "5", "10", "20", "50", "100"])
+        axes.set_title(layout, fontsize=9)
+        axes.set_xlabel("episode", fontsize=8)
+        axes.grid(alpha=0.3)
+    for axes in grid[len(layouts) :]:
+        axes.set_axis_off()
+    grid[0].set_ylabel("return of an episode", fontsize=8)
+    legend_below(figure)
     save_figure(figure, path)

@@ -10,22 +10,18 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from icrl4aht_baselines.plotting import smooth_returns
 from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, in_order
-from icrl4aht_baselines.report.scores import (
-    cell_headroom,
-    describe_conditions,
-    mean_of,
-    normalised_returns,
-    paper_scores,
-)
-from icrl4aht_baselines.report.statistics import mean_interval
+from icrl4aht_baselines.report.scores import cell_scales, cell_scores
+from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
+from icrl4aht_baselines.report.tables import describe_conditions, mean_of
 from icrl4aht_baselines.training.seen import overlap_marks
-from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
+from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.plotting import MOST_PANELS, return_limits
 
 _SCORE_LIMITS = (-0.5, 1.5)  # a cell with little headroom can have a score far outside, which is clipped
@@ -35,8 +31,8 @@ _DRAWING = 1000  # units of a panel's width and height
 NumberedRuns = Mapping[int, EvaluationRun]
 """Number of a series, which has one colour on the whole page -> its run."""
 
-_CellValues = Mapping[int, Mapping[ResultCell, np.ndarray]]
-"""Number of a series -> cell -> values (U, S) of U instances and S seeds."""
+_CellValues = Mapping[int, Mapping[ResultCell, MeanInterval]]
+"""Number of a series -> cell -> value."""
 
 
 class Tick(NamedTuple):
@@ -57,21 +53,12 @@ class Bar(NamedTuple):
     tooltip: str
 
 
-class Mark(NamedTuple):
-    """The normalised score of one of the paper's methods, and its position."""
-
-    name: str
-    left: float
-    value: float
-
-
 class BarRow(NamedTuple):
     """The bars of all runs in one cell; `scale` has the returns at the ends of the scale, as text."""
 
     label: str
     bars: list[Bar]
     scale: str = ""
-    marks: Sequence[Mark] = ()
 
 
 class Curve(NamedTuple):
@@ -95,7 +82,6 @@ class Chart(NamedTuple):
         x_ticks, y_ticks: labelled positions of the axes; bars have no vertical axis.
         bars: layout -> rows of bars.
         panels: title of a panel -> curves.
-        marks: names of what is marked, in order.
     """
 
     title: str
@@ -105,7 +91,6 @@ class Chart(NamedTuple):
     y_ticks: Sequence[Tick] = ()
     bars: Mapping[str, list[BarRow]] = MappingProxyType({})
     panels: Mapping[str, list[Curve]] = MappingProxyType({})
-    marks: Sequence[str] = ()
 
 
 class _Scale(NamedTuple):
@@ -127,7 +112,7 @@ class _Scale(NamedTuple):
 
 
 def bar_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
-    """Return bars of the normalised scores, and of the returns with tasks that have none.
+    """Return bars of the scores, and of the returns with tasks that have none.
 
     Reference egos have no bars with test tasks unless there are no other agents.
     """
@@ -136,53 +121,43 @@ def bar_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
     for kind, about in TASK_KINDS.items():
         shown = agents if kind == "test" else runs
         values = {
-            number: {cell: found.mean for cell, found in run.returns.items() if cell.kind == kind}
+            number: {cell: mean_interval(found.mean) for cell, found in run.returns.items() if cell.kind == kind}
             for number, run in shown.items()
         }
         if any(values.values()) and not (kind == "test" and charts):
-            scale = _Scale(*return_limits(found.mean() for of_run in values.values() for found in of_run.values()))
+            scale = _Scale(*return_limits(found.mean for of_run in values.values() for found in of_run.values()))
             charts.append(_bar_chart(f"Return in each cell, {kind} tasks", shown, values, scale, about))
     return charts
 
 
 def _score_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
-    """Return a chart of bars from `stay` to the agents' normalised scores, with the paper's where they have any.
-
-    The bars are of the cells with headroom that a run played completely; there is no chart if there is none.
-    """
-    values, headroom = {number: normalised_returns(run) for number, run in runs.items()}, cell_headroom(protocol)
+    """Return a chart of bars from `stay` to the agents' scores; none if no cell was scored."""
+    scales = cell_scales(protocol)
+    values = {
+        number: {cell: found for cell, found in cell_scores(run, scales).items() if cell.kind == "test"}
+        for number, run in runs.items()
+    }
     cells = in_order(cell for of_run in values.values() for cell in of_run)
     if not cells:
         return []
-    stated = {
-        cell: {name: at for run in runs.values() if cell in run.cells for name, at in paper_scores(run, cell).items()}
-        for cell in cells
-    }
-    ends = [float(found.mean()) for of_run in values.values() for found in of_run.values()]
-    ends += [value for of_cell in stated.values() for value in of_cell.values()]
+    ends = [found.mean for of_run in values.values() for found in of_run.values()]
     scale = _Scale(max(_SCORE_LIMITS[0], min(-0.05, *ends)), min(_SCORE_LIMITS[1], max(1.05, *ends)))
-    played = in_order(cell for run in runs.values() for cell in run.cells)
-    others = [cell for cell in played if cell in headroom and cell not in cells]
-    flat = [cell for cell in others if not has_headroom(headroom[cell])]
+    played = in_order(cell for run in runs.values() for cell in run.cells if cell.kind == "test")
+    others = [cell for cell in played if cell not in cells]
+    flat = f"The best response earns less than {LEAST_HEADROOM:g} more than an ego that stays"
     reasons = {
-        "The oracle earns no more than an ego that stays": flat,
-        "Not all tasks were played": [cell for cell in others if cell not in flat],
+        "No best response measured": [cell for cell in others if cell not in scales],
+        flat: [cell for cell in others if cell in scales and not scales[cell].has_headroom],
+        "Not all tasks were played": [cell for cell in others if cell in scales and scales[cell].has_headroom],
     }
     about = (
-        "A bar runs from the return of an ego that stays to that of the agent, relative to the oracle, which knows "
-        "everything; next to a family are both egos' returns. *: beyond the chart.",
+        "A bar runs from the return of an ego that stays to that of the agent, relative to the best response; next to "
+        "a family are the returns of both. *: beyond the chart.",
         *(f"{why}: {', '.join(f'{cell.layout} {cell.family}' for cell in of)}." for why, of in reasons.items() if of),
     )
-    rows = {
-        cell: {
-            "scale": f"{headroom[cell]['stay']:z.1f} to {headroom[cell]['oracle']:z.1f}",
-            "marks": [Mark(name, scale.position(value), value) for name, value in stated[cell].items()],
-        }
-        for cell in cells
-    }
-    chart = _bar_chart("Normalised score in each cell", runs, values, scale, " ".join(about), rows, digits=2)
-    names = list(dict.fromkeys(name for of_cell in stated.values() for name in of_cell))
-    return [chart._replace(x_ticks=[Tick(scale.position(0), "stay"), Tick(scale.position(1), "oracle")], marks=names)]
+    ranges = {cell: f"{scales[cell].stay:z.1f} to {scales[cell].best:z.1f}" for cell in cells}
+    chart = _bar_chart("Score in each cell", runs, values, scale, " ".join(about), ranges, digits=2)
+    return [chart._replace(x_ticks=[Tick(scale.position(0), "stay"), Tick(scale.position(1), "best response")])]
 
 
 def _bar_chart(
@@ -191,25 +166,25 @@ def _bar_chart(
     values: _CellValues,
     scale: _Scale,
     about: str,
-    rows: Mapping[ResultCell, dict[str, Any]] = MappingProxyType({}),
+    ranges: Mapping[ResultCell, str] = MappingProxyType({}),
     digits: int = 1,
 ) -> Chart:
-    """Return bars from 0 to the mean of the values in each cell; `rows` has further fields of the cells' rows."""
+    """Return bars from 0 to the value in each cell; `ranges` has the returns at the ends of the scale as text."""
     shown = {number: run for number, run in runs.items() if values[number]}
     bars: dict[str, list[BarRow]] = defaultdict(list)
     cells = in_order(cell for of_run in values.values() for cell in of_run)
     for cell in cells:
         of_cell = {number: values[number][cell] for number in shown if cell in values[number]}
         drawn = [_bar(number, shown[number], cell, found, scale, digits) for number, found in of_cell.items()]
-        bars[cell.layout].append(BarRow(family_title(cell.family), drawn, **rows.get(cell, {})))
+        bars[cell.layout].append(BarRow(family_title(cell.family), drawn, ranges.get(cell, "")))
     several = any(bar.interval for rows in bars.values() for row in rows for bar in row.bars)
     lines = ["Lines: 95 % intervals over the instances."] * several
     caption = " ".join([describe_conditions(shown.values(), cells), *lines, about]).rstrip()
     return Chart(title, caption, _series(shown, cells), scale.ticks(), bars=bars)
 
 
-def _bar(number: int, run: EvaluationRun, cell: ResultCell, values: np.ndarray, scale: _Scale, digits: int) -> Bar:
-    found, returns = mean_interval(values), run.returns[cell]
+def _bar(number: int, run: EvaluationRun, cell: ResultCell, found: MeanInterval, scale: _Scale, digits: int) -> Bar:
+    returns = run.returns[cell]
     zero, end = scale.position(0), scale.position(found.mean)
     clipped = "" if scale.low <= found.mean <= scale.high else "*"
     text = f"{found.mean:z.{digits}f}{clipped}{overlap_marks(returns.overlaps).strip()}"

@@ -29,7 +29,7 @@ from icrl4aht_baselines.report.results import (
     family_title,
     read_published,
 )
-from icrl4aht_baselines.report.scores import find_headlines, returns_tables, rows
+from icrl4aht_baselines.report.tables import find_headlines, returns_tables, rows
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import check_can_draw
@@ -108,7 +108,7 @@ def summary_lines(runs: Sequence[EvaluationRun]) -> list[str]:
 
 
 def csv_text(runs: list[EvaluationRun]) -> str:
-    """Return the rows of all runs as CSV with a header, see `scores.rows`."""
+    """Return the rows of all runs as CSV with a header, see `tables.rows`."""
     body = pd.DataFrame([row for run in runs for row in rows(run)], dtype=object)
     return body.to_csv(index=False, lineterminator="\n")
 
@@ -173,7 +173,6 @@ def _environment() -> Environment:
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, **blocks)
     environment.filters |= {
         "number": lambda value, digits=1: f"{value:z.{digits}f}",
-        "signed": lambda value: f"{value:+z.1f}",
         "picture": lambda path: f"data:image/gif;base64,{base64.b64encode(path.read_bytes()).decode()}",
         "family": family_title,
     }

@@ -1,16 +1,17 @@
-"""Results of evaluation as one table.
+"""Results of evaluation as one tidy table.
 
-A table of results is a data frame with a row for each task and seed, and a column for each block of episodes:
+A table of results is a data frame with a row for each task, seed and block of episodes:
 
-    agent, protocol, layout, family, kind   the agent, and the cell of the task, see `ResultCell`
-    task, seed                              id of the task, or its number in stored results; seed, or its number
-    mean, first, last, opening              mean return of the team in all episodes, in up to 20 at each end, and in the
-                                            first one
-    overlap                                 overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
+    agent, training     name of the agent; number of its training, for several with different seeds
+    protocol, control   name of the protocol; one of `CONTROLS`
+    layout, family, kind    the cell of the task, see `ResultCell`
+    overlap             overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
+    task, seed          key of the task, see `task_key`; seed
+    block, return       one of `BLOCKS`; mean return of the team in its episodes
 
-Tasks of different kinds never share a cell, since the paper's numbers and the headroom are of published test tasks.
+Tasks of different kinds never share a cell, since the paper's numbers are of published test tasks.
 
-Shapes: U tasks of a cell, S seeds.
+Shapes: T trainings, U tasks of a cell, S seeds.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from icrl4aht_baselines.evaluate.protocols import bundled_tasks
-from icrl4aht_baselines.evaluate.results import Result, read_result
+from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks
+from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import OVERLAPS, TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, TRACKS, family_order, layout_order, track_of
@@ -47,15 +48,22 @@ OWN_TASKS, TRAINED_RUN = "tasks.jsonl", "run.json"
 PUBLISHED_PROTOCOL = "published"
 """Name of the protocol that the paper's numbers belong to."""
 
-ENDS = 20
-"""Most episodes at each end of a task for the adaptation gain (paper, App. F)."""
+BLOCKS = {"all": (0, None), "1": (0, 1), "2-5": (1, 5), "6-20": (5, 20), "21-100": (20, 100), "last 20": (-20, None)}
+"""Block of episodes -> slice of a task's episodes. Shorter evaluations have the blocks whose first episode exists."""
 
-BLOCKS = ("mean", "first", "last", "opening")
-"""Blocks of episodes, see the module's docstring."""
+EPISODE_BLOCKS = ("1", "2-5", "6-20", "21-100")
+"""The blocks that tables show side by side."""
+
+CONTROLS = {
+    "": "the agent",
+    "forgets": "the agent with its memory cleared before each episode",
+    "swapped": "the agent with a context of another teammate of the layout before the last 20 episodes",
+}
+"""Control, a folder in a folder of results -> what was evaluated."""
 
 CELL_COLUMNS = ["layout", "family", "kind"]
-AGENT_COLUMNS = ["agent", "protocol"]
-TABLE_COLUMNS = [*AGENT_COLUMNS, *CELL_COLUMNS, "overlap", "task", "seed", *BLOCKS]
+AGENT_COLUMNS = ["agent", "training", "protocol", "control"]
+TABLE_COLUMNS = [*AGENT_COLUMNS, *CELL_COLUMNS, "overlap", "task", "seed", "block", "return"]
 
 TASK_KINDS = {
     "test": "",
@@ -106,33 +114,47 @@ class ResultCell(NamedTuple):
 
 
 class CellReturns(NamedTuple):
-    """Returns of an agent in one cell, float64 (U, S).
+    """Returns of an agent in one cell.
 
     Attributes:
-        mean, first, last, opening: mean return in the episodes of a block, see the module's docstring.
+        tasks, seeds: keys of the tasks, and the seeds.
+        blocks: block of episodes -> mean returns, float64 (T, U, S), see `BLOCKS`.
         overlaps: kinds of overlap of the tasks with the training data.
     """
 
-    mean: np.ndarray
-    first: np.ndarray
-    last: np.ndarray
-    opening: np.ndarray
+    tasks: tuple[str, ...]
+    seeds: tuple[int, ...]
+    blocks: Mapping[str, np.ndarray]
     overlaps: tuple[str, ...] = ()
 
     @property
-    def gain(self) -> np.ndarray:
-        """Returns of the last minus those of the first episodes (paper, App. F)."""
-        return self.last - self.first
+    def mean(self) -> np.ndarray:
+        """Mean returns in all episodes and trainings, float64 (U, S)."""
+        return self.blocks["all"].mean(axis=0)
+
+
+AgentReturns = Mapping[ResultCell, CellReturns]
+"""Returns of an agent under one protocol."""
 
 
 def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
-    """Return the returns of one agent under one protocol, cells in the paper's order."""
+    """Return the returns of one agent and control under one protocol, cells in the paper's order."""
     found = {}
     for key, rows in table.groupby(CELL_COLUMNS, sort=False):
-        blocks = {name: rows[name].to_numpy().reshape(rows["task"].nunique(), -1) for name in BLOCKS}
-        overlaps = tuple(rows["overlap"].iloc[0].split())
-        found[ResultCell._make(map(str, key))] = CellReturns(**blocks, overlaps=overlaps)
+        codes, axes = zip(*(pd.factorize(rows[name]) for name in ("training", "task", "seed", "block")), strict=True)
+        values = np.full([len(axis) for axis in axes], np.nan)
+        values[codes] = rows["return"]
+        blocks = {str(name): values[..., number] for number, name in enumerate(axes[3])}
+        marked = " ".join(rows["overlap"].unique()).split()
+        overlaps = tuple(name for name in OVERLAPS if name in marked)
+        found[ResultCell._make(map(str, key))] = CellReturns(tuple(axes[1]), tuple(map(int, axes[2])), blocks, overlaps)
     return {cell: found[cell] for cell in in_order(found)}
+
+
+def task_key(task_id: str) -> str:
+    """Return the teammate's number and the hash at the end of a task id, such as "t0-9bc579c9"."""
+    _, number, _, digest = task_id.rsplit("_", 3)
+    return f"{number}-{digest}"
 
 
 class ResultSource(NamedTuple):
@@ -219,9 +241,13 @@ class EvaluationRun:
         """Return whether all published test tasks of a cell were played, and no others."""
         return len(self.tasks(cell)) == published_instances(cell)
 
+    def has_full_length(self, cell: ResultCell) -> bool:
+        """Return whether the episodes in a cell have the benchmark's length."""
+        return self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
+
     def is_comparable(self, cell: ResultCell) -> bool:
         """Return whether a cell has published test tasks, and its episodes have the benchmark's length."""
-        return cell.kind == "test" and self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
+        return cell.kind == "test" and self.has_full_length(cell)
 
     @cached_property
     def label(self) -> str:
@@ -236,9 +262,9 @@ class EvaluationRun:
 
 
 def cell_rows(
-    agent: tuple[str, str],
+    agent: tuple[Any, ...],
     cell: ResultCell,
-    returns: Sequence[Any],
+    returns: np.ndarray,
     overlaps: Iterable[str] = (),
     tasks: Sequence[str] = (),
     seeds: Sequence[int] = (),
@@ -246,30 +272,29 @@ def cell_rows(
     """Return the rows of a table for one cell, with a value for each of `TABLE_COLUMNS`.
 
     Args:
-        agent: agent and protocol.
+        agent: values of `AGENT_COLUMNS`.
         cell: the cell.
-        returns: of each block, in the order of `BLOCKS`, (tasks, seeds).
+        returns: return of each episode, (tasks, seeds, episodes).
         overlaps: see the module's docstring.
-        tasks, seeds: names of the tasks and seeds; numbers by default.
+        tasks, seeds: keys of the tasks, and the seeds; numbers by default.
     """
-    blocks, marks = np.stack(returns, axis=-1).tolist(), " ".join(overlaps)
+    marks = " ".join(overlaps)
     return [
-        (*agent, *cell, marks, tasks[row] if tasks else row, seeds[column] if seeds else column, *values)
-        for row, of_task in enumerate(blocks)
-        for column, values in enumerate(of_task)
+        (*agent, *cell, marks, tasks[row] if tasks else str(row), seeds[column] if seeds else column, block, value)
+        for block, values in episode_blocks(returns).items()
+        for row, of_task in enumerate(values.tolist())
+        for column, value in enumerate(of_task)
     ]
 
 
-def episode_blocks(returns: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the mean returns of each of `BLOCKS`, (...), of the returns of all episodes, (..., episodes)."""
-    count = end_episodes(returns.shape[-1])
-    first, last = returns[..., :count].mean(axis=-1), returns[..., -count:].mean(axis=-1)
-    return returns.mean(axis=-1), first, last, returns[..., 0]
-
-
-def end_episodes(episodes: int) -> int:
-    """Return the number of episodes at each end of a task that the adaptation gain compares, half if they are few."""
-    return max(1, min(ENDS, episodes // 2))
+def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the mean return in each block that exists, (...), of the returns of all episodes, (..., episodes)."""
+    episodes = returns.shape[-1]
+    return {
+        name: returns[..., start:stop].mean(axis=-1)
+        for name, (start, stop) in BLOCKS.items()
+        if episodes > (start if start >= 0 else -start)
+    }
 
 
 def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] = ()) -> None:
@@ -305,17 +330,27 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
             write_tasks(partial, (known | own).values())
 
 
+def read_results(folder: Path) -> tuple[list[Result], dict[str, Any] | None]:
+    """Return the results in a folder that `icrl4aht-data evaluate` made, and the content of its run.json or None.
+
+    Raises:
+        OptionError: if there are none.
+    """
+    results = [read_result(path) for path in sorted((folder / RESULTS).glob("*.json"))]
+    if not results:
+        raise OptionError(f"{folder}: no results in {folder / RESULTS}; run `icrl4aht-data evaluate --out {folder}`")
+    path = folder / TRAINED_RUN
+    return results, parse_json(read_text(path)) if path.exists() else None
+
+
 def read_run(folder: Path) -> EvaluationRun:
-    """Return the results in a folder that `icrl4aht-data evaluate` made.
+    """Return the results in a folder as a run.
 
     Raises:
         OptionError: if there are none, if they mix settings, or if the task of one is unknown.
     """
-    results = [read_result(path) for path in sorted((folder / "tasks").glob("*.json"))]
-    if not results:
-        raise OptionError(f"{folder}: no results in {folder / 'tasks'}; run `icrl4aht-data evaluate --out {folder}`")
+    results, trained = read_results(folder)
     own = read_tasks(folder / OWN_TASKS) if (folder / OWN_TASKS).exists() else []
-    trained = parse_json(read_text(folder / TRAINED_RUN)) if (folder / TRAINED_RUN).exists() else None
     return as_run(results, str(folder), own, trained)
 
 
@@ -349,23 +384,21 @@ def as_run(
             )
         task = known[result.task_id]
         played[cell_of(task)].append((task, result.returns))
-    seen = _find_seen(settings, trained, where)
+    seen = find_seen(settings, trained, where)
     agent, seeds = (settings["agent"], settings["protocol"]["name"]), settings["seeds"]
     rows, cells, tracks = [], {}, defaultdict(dict)
     for cell in in_order(played):
         of_cell, track = tuple(task for task, _ in played[cell]), "" if "" in seen else track_of(cell.layout)
         returns = np.array([of_task for _, of_task in played[cell]], np.float64)  # (tasks, seeds, episodes)
         cells[cell], tracks[track][cell] = returns.mean(axis=1), of_cell
-        overlaps, names = find_overlaps(of_cell, seen[track]), [task.task_id for task in of_cell]
-        rows += cell_rows(agent, cell, episode_blocks(returns), overlaps, names, seeds)
+        overlaps, names = find_overlaps(of_cell, seen[track]), [task_key(task.task_id) for task in of_cell]
+        rows += cell_rows((agent[0], 0, agent[1], ""), cell, returns, overlaps, names, seeds)
     sources = tuple(ResultSource(where, settings, trained, own, seen[track]) for track, own in tracks.items())
     variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
     return EvaluationRun(*agent, pd.DataFrame(rows, columns=TABLE_COLUMNS), cells, variant, sources=sources)
 
 
-def _find_seen(
-    settings: dict[str, Any], trained: dict[str, Any] | None, where: str
-) -> dict[str, SeenInTraining | None]:
+def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: str) -> dict[str, SeenInTraining | None]:
     """Return what an agent was trained on: nothing for reference egos, None if the results do not say.
 
     The key is empty, or the track for an agent with a model for each track.
@@ -415,6 +448,16 @@ def _rules(run: EvaluationRun) -> tuple[Any, ...]:
 def bundled_by_id(split: str) -> dict[str, Task]:
     """Return the package's tasks of a split of both tracks by id; "test" has the 160 published ones."""
     return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
+
+
+@cache
+def bundled_cells() -> dict[ResultCell, list[str]]:
+    """Return cell -> ids of its tasks, of all tasks in the package."""
+    found: dict[ResultCell, list[str]] = defaultdict(list)
+    for split in EVALUATION_SPLITS:
+        for task in bundled_by_id(split).values():
+            found[cell_of(task)].append(task.task_id)
+    return {cell: found[cell] for cell in in_order(found)}
 
 
 def published_instances(cell: ResultCell) -> int:

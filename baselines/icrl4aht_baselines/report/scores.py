@@ -1,369 +1,238 @@
-"""Scores: of one cell, of groups of cells as the rows of tables, and the numbers that a report opens with.
+"""Scores relative to best responses, and differences between agents.
 
-The score of a single cell is the mean over its instances, that of several cells the mean over the cells. A normalised
-score is (return - stay) / (oracle - stay), of cells with headroom that were played completely.
+R is the mean return of an agent with a teammate, S that of the ego `stay`, B that of the best response. The score of a
+layout is N = sum(R - S) / sum(B - S) over its tasks, that of several layouts the mean over the layouts. Only tasks of
+cells with headroom count, in which B - S is at least `LEAST_HEADROOM` in the mean.
 
-Shapes: U instances of a cell, S seeds.
+Shapes: T trainings, U tasks of a cell, S seeds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
-from functools import lru_cache
-from itertools import product
-from typing import Any, NamedTuple, TypeVar
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from icrl4aht_baselines.report.results import (
-    PUBLISHED_PROTOCOL,
-    TASK_KINDS,
+    AgentReturns,
+    CellReturns,
     EvaluationRun,
     ResultCell,
-    end_episodes,
+    bundled_cells,
     in_order,
-    instances_range,
-    published_cells,
-    published_instances,
-    read_published,
+    task_key,
 )
-from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
-from icrl4aht_baselines.training.seen import overlap_marks
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, TRACKS, family_order
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_headroom
-from icrl4aht_data.utils.text import counted_noun
-
-PAPER_METHODS = ("AD", "DPT")
-"""The published methods that an agent without published results is compared with."""
-
-AVERAGE = "Average"
-"""Label of the row of means over families, as in cards/published.json."""
-
-Returns = TypeVar("Returns", float, np.ndarray)
-"""A return or several."""
-
-Published = tuple[float, float | None]
-"""A published mean and its standard deviation, which the paper does not always state."""
+from icrl4aht_baselines.report.statistics import MeanInterval, Stratum, interquartile_mean, ratio_interval
+from icrl4aht_data.benchmark.best_responses import best_responses
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
+from icrl4aht_data.benchmark.reference_returns import stay_returns
 
 
-def cell_headroom(protocol: str) -> dict[ResultCell, dict[str, float]]:
-    """Return test cell -> reference ego -> mean return; empty if none was measured under this protocol."""
-    return {ResultCell(*cell): references for cell, references in read_headroom(protocol).items()}
+class TaskScale(NamedTuple):
+    """Returns that scores of a task are relative to.
 
-
-def open_cells(protocol: str) -> list[ResultCell]:
-    """Return the test cells with headroom under a protocol, in the paper's order."""
-    measured = cell_headroom(protocol)
-    return in_order(cell for cell in measured if has_headroom(measured[cell]))
-
-
-def normalise(returns: Returns, references: Mapping[str, float]) -> Returns:
-    """Return (return - stay) / (oracle - stay), for returns in a cell with headroom."""
-    return (returns - references["stay"]) / (references["oracle"] - references["stay"])
-
-
-@lru_cache(maxsize=256)
-def normalised_returns(run: EvaluationRun) -> dict[ResultCell, np.ndarray]:
-    """Return the normalised returns (U, S) in the cells with headroom that a run played completely."""
-    headroom = cell_headroom(run.protocol)
-    scored = [cell for cell in open_cells(run.protocol) if cell in run.cells]
-    scored = [cell for cell in scored if run.is_complete(cell) and run.is_comparable(cell)]
-    return {cell: normalise(run.returns[cell].mean, headroom[cell]) for cell in scored}
-
-
-def _is_like_the_papers(run: EvaluationRun, cell: ResultCell) -> bool:
-    return run.variant is None and run.protocol == PUBLISHED_PROTOCOL and run.is_comparable(cell)
-
-
-def paper_methods(run: EvaluationRun) -> tuple[str, ...]:
-    """Return the run's own method if the paper has results of it, or else AD and DPT."""
-    return (run.agent,) if published_cells(run.agent) else PAPER_METHODS
-
-
-def paper_scores(run: EvaluationRun, cell: ResultCell) -> dict[str, float]:
-    """Return the normalised scores of published methods in a cell with headroom.
-
-    Empty if the results are not of the paper's protocol, tasks and episode length, or of a sweep.
+    Attributes:
+        stay, best: mean returns of `stay` and of the best response.
+        behaviour: name of the teammate's behaviour; equal for tasks whose teammates behave alike.
     """
-    if not _is_like_the_papers(run, cell):
-        return {}
-    stated = {name: published_cells(name).get(cell.layout, {}).get(cell.family) for name in paper_methods(run)}
-    references = cell_headroom(run.protocol)[cell]
-    return {name: normalise(found[0], references) for name, found in stated.items() if found}
+
+    stay: float
+    best: float
+    behaviour: str
 
 
-def rows(run: EvaluationRun) -> list[dict[str, Any]]:
-    """Return one row per cell of a run.
+class CellScale(NamedTuple):
+    """Scales of the tasks of a cell that have a best response.
 
-    A row has the agent, the conditions of the evaluation, mean return, std and 95 % interval over the instances (None
-    for a single instance), the paper's numbers (None unless the protocol is `published`), the adaptation gain,
-    headroom, the normalised score (None for cells without headroom and incomplete cells), and `overlap`: the ways in
-    which training data and tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
+    Attributes:
+        tasks: key of a task -> its scale, see `results.task_key`.
     """
-    headroom, normalised, found = cell_headroom(run.protocol), normalised_returns(run), []
-    for cell, returns in run.returns.items():
-        source, interval, several = run.source(cell), mean_interval(returns.mean), len(returns.mean) > 1
-        published = published_cells(run.agent if _is_like_the_papers(run, cell) else "").get(cell.layout, {})
-        paper = published.get(cell.family, (None, None))
-        found.append(
-            {
-                "agent": run.agent,
-                "protocol": run.protocol,
-                "layout": cell.layout,
-                "family": cell.family,
-                "instances": len(returns.mean),
-                "episodes": run.cells[cell].shape[1],
-                "mean": interval.mean,
-                "std": float(returns.mean.mean(axis=1).std()) if several else None,
-                "low": interval.low if several else None,
-                "high": interval.high if several else None,
-                "published_mean": paper[0],
-                "published_std": paper[1],
-                "gain": float(returns.gain.mean()),
-                "headroom": has_headroom(headroom[cell]) if cell in headroom else None,
-                "normalised": float(normalised[cell].mean()) if cell in normalised else None,
-                "tasks": cell.kind,
-                "seeds": len(source.settings["seeds"]),
-                "steps": source.settings["protocol"]["steps"],
-                "overlap": " ".join(returns.overlaps),
-                "acting": source.detail("acting"),
-                "encoder": source.detail("encoder"),
-                "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
-            }
-        )
+
+    tasks: Mapping[str, TaskScale]
+
+    @property
+    def stay(self) -> float:
+        """Mean return of `stay`."""
+        return float(np.mean([scale.stay for scale in self.tasks.values()]))
+
+    @property
+    def best(self) -> float:
+        """Mean return of the best responses."""
+        return float(np.mean([scale.best for scale in self.tasks.values()]))
+
+    @property
+    def has_headroom(self) -> bool:
+        """Whether best responses earn `LEAST_HEADROOM` more than `stay`."""
+        return self.best - self.stay >= LEAST_HEADROOM
+
+
+CellScales = Mapping[ResultCell, CellScale]
+"""Scales of the cells that have any."""
+
+
+def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
+    """Return the scales of the package's cells under a protocol, those with at least one best response."""
+    measured, stays = best_responses(protocol), stay_returns(protocol)
+    names = {task: f"behaviour of {best.tasks[0]}" for task, best in measured.items()}
+    found: dict[ResultCell, CellScale] = {}
+    for cell, tasks in bundled_cells().items() if measured else ():
+        known = [task for task in tasks if task in measured and task in stays]
+        if known:
+            scales = {task_key(task): TaskScale(stays[task], measured[task].best, names[task]) for task in known}
+            found[cell] = CellScale(scales)
     return found
 
 
-class Headline(NamedTuple):
-    """Summary of a run's results on one kind of tasks.
+def open_cells(scales: CellScales) -> list[ResultCell]:
+    """Return the test cells with headroom, in the paper's order."""
+    return in_order(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
 
-    The numbers are means over the cells with headroom that were played completely, or over all cells played if there
-    is none. Intervals are bootstraps over the instances within each cell.
+
+def track_cells(cells: Iterable[ResultCell], track: str) -> list[ResultCell]:
+    """Return the test cells of a track among some cells."""
+    return [cell for cell in cells if cell.kind == "test" and cell.layout in TRACKS[track]["test"]]
+
+
+class Score(NamedTuple):
+    """Score of an agent on some cells with headroom.
 
     Attributes:
-        label: the run's label with marks for overlap of its training data with these tasks.
-        protocol: name of the protocol.
-        tasks: the cells of the means in words, such as "12 test cells with headroom, of 16 played".
-        score: normalised score; None without a cell with headroom.
-        mean: return of an episode.
-        gain: return of the last minus that of the first episodes; None for one episode.
-        change: returns of both in words, such as "18.7 in the first, 17.4 in the last 20 episodes".
-        paper: published method -> its normalised score in the same cells; empty unless the results are of the paper's
-            protocol.
-        why_no_score: reason for a missing score, as a sentence; empty if there is a score.
-        overlaps: kinds of overlap of the training data with these tasks.
+        total: mean over the layouts of N.
+        layouts: layout -> N.
+        middle: interquartile mean over the behaviours of (R - S) / (B - S); behaviours without headroom do not count.
+        worst: layout and family of the behaviour with the lowest value, and this value.
+        regret: B - R, mean over the tasks.
     """
 
-    label: str
-    protocol: str
-    tasks: str
-    score: MeanInterval | None
-    mean: MeanInterval
-    gain: MeanInterval | None
-    change: str
-    paper: dict[str, float]
-    why_no_score: str
-    overlaps: tuple[str, ...]
+    total: MeanInterval
+    layouts: dict[str, float]
+    middle: MeanInterval
+    worst: tuple[str, float]
+    regret: float
 
     @property
     def text(self) -> str:
-        """The summary as sentences for the console and Markdown."""
-        parts = [f"normalised score {self.score.text(2)}"] if self.score else []
-        parts.append(f"return {self.mean.text()}")
-        parts += [f"gain {self.gain.text(sign='+')}: {self.change}"] if self.gain else []
-        text = f"{self.label} ({self.protocol}), {self.tasks}: {'; '.join(parts)}."
-        text += " Parentheses: 95 % intervals." if self.mean.range() else ""
-        stated = ", ".join(f"{name} {value:z.2f}" for name, value in self.paper.items())
-        text += f" The paper's normalised score in these cells: {stated}." if stated else ""
-        return f"{text} {self.why_no_score}".rstrip()
-
-
-def find_headlines(run: EvaluationRun) -> list[Headline]:
-    """Return a run's summaries, one for each kind of tasks that was played, test tasks first."""
-    normalised, found = normalised_returns(run), []
-    for kind in TASK_KINDS:
-        played = [cell for cell in run.returns if cell.kind == kind]
-        scored = [cell for cell in played if cell in normalised]
-        if not played:
-            continue
-        cells = scored or played
-        returns, episodes = [run.returns[cell] for cell in cells], min(run.cells[cell].shape[1] for cell in cells)
-        first, last = (mean_of(getattr(of, end) for of in returns) for end in ("first", "last"))
-        ends = f"{end_episodes(episodes)} episodes" if end_episodes(episodes) > 1 else "episode"
-        counted, overlaps = counted_noun(len(cells), f"{kind} cell"), run.overlaps(cells)
-        stated = [paper_scores(run, cell) for cell in scored]
-        methods = [name for name in paper_methods(run) if stated and all(name in of_cell for of_cell in stated)]
-        found.append(
-            Headline(
-                label=run.label + overlap_marks(overlaps),
-                protocol=run.protocol,
-                tasks=f"{counted} with headroom, of {len(played)} played" if scored else counted,
-                score=mean_interval(*(normalised[cell] for cell in scored)) if scored else None,
-                mean=mean_interval(*(of.mean for of in returns)),
-                gain=mean_interval(*(of.gain for of in returns)) if episodes > 1 else None,
-                change=f"{first:z.1f} in the first, {last:z.1f} in the last {ends}",
-                paper={name: float(np.mean([of_cell[name] for of_cell in stated])) for name in methods},
-                why_no_score="" if scored else _why_no_score(run, kind, played),
-                overlaps=overlaps,
-            )
+        """The score in words."""
+        return (
+            f"score {self.total.text(2)}, interquartile mean {self.middle.mean:z.2f}, worst teammate "
+            f"{self.worst[1]:z.2f} ({self.worst[0]}), regret {self.regret:z.1f}"
         )
-    return found
 
 
-def mean_of(cells: Iterable[np.ndarray]) -> float:
-    """Return the mean of the cells' means."""
-    return float(np.mean([values.mean() for values in cells]))
+def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellScales) -> Score | None:
+    """Return the score on some cells; None if there is none, or one has no headroom or was not played completely."""
+    if not cells or not all(is_scored(returns.get(cell), scales.get(cell)) for cell in cells):
+        return None
+    groups: dict[str, list[Stratum]] = defaultdict(list)
+    values, labels, regrets = [], [], []
+    for cell in cells:
+        gains, spans, names, stratum = _scaled(returns[cell], scales[cell])
+        groups[cell.layout].append(stratum)
+        regrets.append(spans - gains.mean(axis=(0, 2)))
+        for name in dict.fromkeys(names):
+            own = [number for number, other in enumerate(names) if other == name]
+            if spans[own].mean() >= LEAST_HEADROOM:
+                values.append(float(gains[:, own].mean() / spans[own].mean()))
+                labels.append(f"{cell.layout} {cell.family}")
+    worst = int(np.argmin(values))
+    return Score(
+        total=ratio_interval([*groups.values()]),
+        layouts={layout: ratio_interval([group]).mean for layout, group in groups.items()},
+        middle=interquartile_mean(np.array(values)),
+        worst=(labels[worst], values[worst]),
+        regret=float(np.concatenate(regrets).mean()),
+    )
 
 
-def _why_no_score(run: EvaluationRun, kind: str, cells: Sequence[ResultCell]) -> str:
-    if kind != "test":
-        return f"No score: reference returns exist for test tasks only, and these are {kind} tasks."
-    if any(run.is_complete(cell) and run.is_comparable(cell) for cell in cells):
-        return "No score: no cell that was played completely has headroom."
-    return f"No score: it needs all published tasks of a cell, in episodes of {KEPT_STEPS} steps."
+def is_scored(returns: CellReturns | None, scale: CellScale | None) -> bool:
+    """Return whether a cell has headroom, and all of its tasks with a best response were played."""
+    return bool(returns and scale and scale.has_headroom and scale.tasks.keys() <= {*returns.tasks})
 
 
-class TableScore(NamedTuple):
-    """Score of an agent on a group of cells, one entry of a table.
-
-    Attributes:
-        text: mean, std over the instances of a single cell or over cells, and marks of overlaps; a dash if nothing was
-            played.
-        notes: further numbers as text: what is missing, the paper's numbers, normalised score, gain.
-        is_flat: whether no cell that was measured has headroom.
-        overlaps: the ways in which training data and tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
-    """
-
-    text: str = "–"
-    notes: Sequence[str] = ()
-    is_flat: bool = False
-    overlaps: tuple[str, ...] = ()
+def _scaled(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndarray, list[str], Stratum]:
+    """Return R - S (T, U, S), B - S (U,) and the behaviours of the tasks with a best response, and the stratum."""
+    known = [number for number, task in enumerate(returns.tasks) if task in scale.tasks]
+    of_task = [scale.tasks[returns.tasks[number]] for number in known]
+    stays, bests = (np.array([getattr(one, name) for one in of_task]) for name in ("stay", "best"))
+    gains, names = returns.blocks["all"][:, known] - stays[:, None], [one.behaviour for one in of_task]
+    return gains, bests - stays, names, _stratum(gains, bests - stays, names)
 
 
-def table_score(
-    cells: Sequence[ResultCell], run: EvaluationRun | None, protocol: str, published: Published | None = None
-) -> TableScore:
-    """Return a run's score on a group of cells.
-
-    Args:
-        cells: the group.
-        run: None if the agent was not run.
-        protocol: of the run.
-        published: the paper's mean and std; left out if a cell was not played, or with another episode length.
-    """
-    headroom, played = cell_headroom(protocol), [cell for cell in cells if run and cell in run.cells]
-    measured = [has_headroom(headroom[cell]) for cell in cells if cell in headroom]
-    is_flat = bool(measured) and not any(measured)
-    std = f" ± {published[1]:z.1f}" if published and published[1] is not None else ""
-    paper = [f"paper {published[0]:z.1f}{std}"] if published else []
-    if run is None or not played:
-        return TableScore(notes=paper, is_flat=is_flat)
-    means = [run.returns[cell].mean.mean(axis=1) for cell in played]
-    values = means[0] if len(cells) == 1 else np.array([of_cell.mean() for of_cell in means])
-    std = f" ± {values.std():z.1f}" if len(values) > 1 else ""
-    complete = all(cell.kind != "test" or run.is_complete(cell) for cell in played)
-    counts = f"{len(means[0])} of {counted_noun(published_instances(cells[0]), 'instance')}"
-    scores = [score for cell, score in normalised_returns(run).items() if cell in played]
-    overlaps = run.overlaps(played)
-    notes = [
-        f"{len(played)} of {len(cells)} cells" if len(played) < len(cells) else "",
-        "" if complete else counts if len(cells) == 1 else "incomplete cells",
-        *(paper if len(played) == len(cells) and all(map(run.is_comparable, played)) else []),
-        f"normalised {mean_of(scores):z.2f}" if scores else "",
-        f"gain {mean_of(run.returns[cell].gain for cell in played):+z.1f}",
-        "no headroom" if is_flat else "",
-    ]
-    text = f"{values.mean():z.1f}{std}{overlap_marks(overlaps)}"
-    return TableScore(text, [note for note in notes if note], is_flat, overlaps)
-
-
-class ScoreTable(NamedTuple):
-    """A table of scores of one kind of tasks.
-
-    Attributes:
-        title: heading of the table.
-        kind: kind of the tasks.
-        columns: name of a column -> layouts.
-        rows: label of a group of families and agent -> scores, one per column.
-        caption: conditions of the evaluation, as a sentence.
-    """
-
-    title: str
-    kind: str
-    columns: Mapping[str, Sequence[str]]
-    rows: Mapping[tuple[str, str], list[TableScore]]
-    caption: str
-
-
-def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTable]:
-    """Return a table for each kind of tasks that was played.
-
-    Tables of test tasks also have averages, and under the paper's protocol rows of the paper's AD, DPT and `random`.
+def _stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
+    """Return the stratum whose units are behaviours, or the seeds of a single one.
 
     Args:
-        runs: runs under one protocol.
-        protocol: name of the protocol.
+        values: numerators of the tasks, (T, U, S).
+        scales: their denominators, (U,).
+        behaviours: names of their behaviours.
     """
-    tables = []
-    for kind in TASK_KINDS:
-        cells = in_order(cell for run in runs for cell in run.cells if cell.kind == kind)
-        if not cells:
-            continue
-        layouts = tuple(dict.fromkeys(cell.layout for cell in cells))
-        families = tuple(sorted({cell.family for cell in cells}, key=family_order))
-        columns, labels = ({name: (name,) for name in names} for names in (layouts, families))
-        if kind == "test":
-            columns |= {AVERAGE: layouts} if len(layouts) > 1 else {}
-            labels |= {AVERAGE: families} if len(families) > 1 else {}
-        played = {run.label: run for run in runs if not run.cells.keys().isdisjoint(cells)}
-        rows = {}
-        quoted = (*PAPER_METHODS, "random") if (kind, protocol) == ("test", PUBLISHED_PROTOCOL) else ()
-        for label, agent in product(labels, dict.fromkeys((*played, *quoted))):
-            run, scores = played.get(agent), []
-            for of_column in columns.values():
-                group = [ResultCell(*cell, kind) for cell in product(of_column, labels[label])]
-                stated = published_score(agent if run is None else run, group) if quoted else None
-                scores.append(table_score(group, run, protocol, stated))
-            if any(score.notes or score.text != TableScore().text for score in scores):
-                rows[label, agent] = scores
-        caption = describe_conditions(played.values(), cells)
-        tables.append(ScoreTable(f"{kind.capitalize()} tasks", kind, columns, rows, caption))
-    return tables
+    names, seeds = list(dict.fromkeys(behaviours)), values.shape[2]
+    if len(names) == 1:
+        return Stratum(values.sum(axis=1) / seeds, np.full(seeds, scales.sum() / seeds))
+    member = np.array([[name == own for name in names] for own in behaviours], float)
+    return Stratum(np.moveaxis(values.mean(axis=2)[..., None] * member, 1, -1).sum(axis=-1), scales @ member)
 
 
-def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> Published | None:
-    """Return the paper's mean and std of a cell, of a layout's four cells or of a track's cells; None of other groups.
+def score_difference(
+    one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], scales: CellScales
+) -> MeanInterval:
+    """Return the score of one agent minus that of another, paired by task and seed, and by number of the training."""
+    groups: dict[str, list[Stratum]] = defaultdict(list)
+    for cell in cells:
+        pair = paired(one[cell], other[cell])
+        gains, spans, names, _ = _scaled(pair[0], scales[cell])
+        groups[cell.layout].append(_stratum(gains - _scaled(pair[1], scales[cell])[0], spans, names))
+    return ratio_interval([*groups.values()])
 
-    The paper's text states the means of some contexts, and its tables are of K = 500 and the small size.
+
+def block_difference(
+    one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], block: str, scales: CellScales
+) -> MeanInterval | None:
+    """Return the mean return of one agent minus that of another, mean over cells, paired as in `score_difference`.
 
     Args:
-        agent: name of a published method, or a run of it.
-        cells: the group.
+        one, other: the agents.
+        cells: the cells; None is returned unless both played all of them.
+        block: block of episodes, see `results.BLOCKS`.
+        scales: say which tasks have teammates that behave alike.
     """
-    name, variant = (agent, None) if isinstance(agent, str) else (agent.agent, agent.variant)
-    layouts, families = (tuple(dict.fromkeys(cell[part] for cell in cells)) for part in (0, 1))
-    if variant and variant[1] not in (500, "small"):
-        stated = read_published()["contexts"]["methods"].get(name, {}).get(layouts[0], {}).get(str(variant[1]))
-        return (stated, None) if stated is not None and (len(layouts), families) == (1, HEURISTICS) else None
-    if len(layouts) == 1:
-        label = AVERAGE if families == HEURISTICS else families[0]
-        found = published_cells(name).get(layouts[0], {}).get(label) if label == AVERAGE or len(cells) == 1 else None
-    else:
-        track = next((track for track in TRACKS if (layouts, families) == (TRACKS[track]["test"], HEURISTICS)), "")
-        found = read_published()["tracks"]["methods"].get(name, {}).get(track)
-    return found and (found[0], found[1])
+    groups = []
+    for cell in cells:
+        if cell not in one or cell not in other:
+            return None
+        first, second = paired(one[cell], other[cell])
+        if block not in first.blocks or block not in second.blocks:
+            return None
+        known = scales[cell].tasks if cell in scales else {}
+        names = [known[task].behaviour if task in known else task for task in first.tasks]
+        groups.append([_stratum(first.blocks[block] - second.blocks[block], np.ones(len(names)), names)])
+    return ratio_interval(groups) if groups else None
 
 
-def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCell] | None = None) -> str:
-    """Return a sentence with protocol, seeds, length and instances of some runs' results, all or those of `cells`.
+def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
+    """Return the results of two agents in a cell on the tasks, seeds and trainings that both have, in one order."""
+    tasks = tuple(task for task in one.tasks if task in other.tasks)
+    seeds = tuple(seed for seed in one.seeds if seed in other.seeds)
+    trainings = min(len(found.blocks["all"]) for found in (one, other))
 
-    If the conditions differ, it says which agents they are of.
-    """
-    shown = [(run, cell) for run in runs for cell in run.cells if cells is None or cell in cells]
-    labels: dict[str, dict[str, None]] = {}
-    for run, cell in shown:
-        labels.setdefault(run.source(cell).conditions, {})[run.label] = None
-    several = len(labels) > 1
-    texts = [f"{' and '.join(names)} under {text}" if several else f"under {text}" for text, names in labels.items()]
-    instances = instances_range(len(run.cells[cell]) for run, cell in shown)
-    return f"Evaluated {'; '.join(texts)}; {instances} in a cell."
+    def chosen(found: CellReturns) -> CellReturns:
+        rows, columns = [found.tasks.index(task) for task in tasks], [found.seeds.index(seed) for seed in seeds]
+        blocks = {name: values[:trainings, rows][:, :, columns] for name, values in found.blocks.items()}
+        return CellReturns(tasks, seeds, blocks, found.overlaps)
+
+    return chosen(one), chosen(other)
+
+
+def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellScales) -> list[ResultCell]:
+    """Return the cells with headroom that a run played completely, in episodes of the benchmark's length."""
+    return [cell for cell in cells if run.has_full_length(cell) and is_scored(run.returns[cell], scales.get(cell))]
+
+
+def cell_scores(run: EvaluationRun, scales: CellScales) -> dict[ResultCell, MeanInterval]:
+    """Return N of each of the `scored_cells` of a run."""
+    return {
+        cell: ratio_interval([[_scaled(run.returns[cell], scales[cell])[-1]]])
+        for cell in scored_cells(run, run.returns, scales)
+    }

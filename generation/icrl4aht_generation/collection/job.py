@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 from icrl4aht_generation.collection.noise import is_noise_finished, run_noise
@@ -53,7 +52,7 @@ class CollectionJob:
         """Folder of the artefact."""
         return self.artefacts / self.work.name
 
-    @cached_property
+    @property
     def updates(self) -> int:
         """Updates of the ego, or of the noise."""
         return self.profile.updates(self.work)

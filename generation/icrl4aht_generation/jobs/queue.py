@@ -12,6 +12,7 @@ from concurrent.futures import wait as wait_for
 from contextlib import closing
 from pathlib import Path
 from threading import current_thread, main_thread
+from typing import TypeVar
 
 from rich.console import Console
 
@@ -31,13 +32,15 @@ from icrl4aht_generation.jobs.ray_executor import run_on_ray
 
 _POLL_SECONDS = 1.0
 
+J = TypeVar("J", bound=Job)
+
 
 def run_jobs(
-    jobs: Sequence[Job],
+    jobs: Sequence[J],
     out: Path,
     console: Console,
     options: QueueOptions,
-    describe: Callable[[Job], str] = lambda job: "finished",
+    describe: Callable[[J], str] = lambda job: "finished",
 ) -> None:
     """Do every job that is unfinished.
 
@@ -60,7 +63,8 @@ def run_jobs(
             console.print(f"{labels[job.name]}: finished before")
         else:
             todo.append(job)
-    missing = {job.name for job in todo}
+    by_name = {job.name: job for job in todo}
+    missing = set(by_name)
     updates = {job.name: job.updates for job in todo}
     failures, last_error = FailureLog(out / FAILED), ""
     with (
@@ -73,7 +77,7 @@ def run_jobs(
                 console.print(f"{labels[name]}: another process works on it")
                 continue
             if outcome.status == "done":
-                console.print(f"{labels[name]}: {describe(outcome.job)}")
+                console.print(f"{labels[name]}: {describe(by_name[name])}")
                 missing.remove(name)
                 failures.forget([name])
                 continue

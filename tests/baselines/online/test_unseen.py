@@ -14,8 +14,6 @@ from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
 from icrl4aht_baselines.online import unseen
 from icrl4aht_baselines.online.unseen import unseen_layouts, unseen_returns
-from icrl4aht_baselines.report import comparison
-from icrl4aht_baselines.report.comparison import UNSEEN, read_stored
 from icrl4aht_baselines.training.options import MOST_REARRANGED
 from icrl4aht_generation.layouts.grids import canonical_map
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts
@@ -79,19 +77,16 @@ class TestCommand:
         monkeypatch.setattr(unseen, "unseen_returns", returns)
         return calls
 
-    def test_table_and_store(self, played, monkeypatch, tmp_path):
-        monkeypatch.setattr(comparison, "results_file", lambda: tmp_path / "results.json")
-        command = ["research", "unseen", "--agent", "rl2-reference", "--versions", "2", "--store"]
+    def test_table(self, played):
+        command = ["research", "unseen", "--agent", "rl2-reference", "--versions", "4"]
         result = CliRunner().invoke(cli, command, catch_exceptions=False)
         assert result.exit_code == 0, result.output
-        assert played == [(["stay", "oracle", "rl2-reference"], {"asymm_both", "cramped_up"}, 2, 40)]
-        assert "| `rl2-reference` | 5.0 (5.0 to 5.0) | 5.0 (5.0 to 5.0) | 0.25 (0.25 to 0.25) |" in result.output
-        assert list(read_stored(tmp_path / "results.json").protocol(UNSEEN)) == ["stay", "oracle", "rl2-reference"]
+        assert played == [(["stay", "oracle", "rl2-reference"], {"asymm_both", "cramped_up"}, 4, 40)]
+        assert "| `rl2-reference` | 5.0 (5.0 to 5.0) | 5.0 (5.0 to 5.0) |" in result.output
 
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            (["--episodes", "39", "--store"], "--episodes 39: expected at least 40 with --store"),
             (["--layout", "asymm_right"], "--layout asymm_right: no validation tasks; choose layouts that models are"),
             (["--agent", "rl2-refernce"], "rl2-refernce"),
         ],

@@ -1,143 +1,159 @@
-"""docs/results.md: tables computed from hand-made numbers, and the committed page."""
+"""docs/results.md: stored results, the tables computed from hand-made returns, and the committed page."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.report import comparison
 from icrl4aht_baselines.report.comparison import (
-    FORGETS,
-    UNSEEN,
+    RESULTS_FILES,
     StoredResults,
-    add_unseen,
+    add_scales,
+    add_submission,
+    agents_table,
+    controls_table,
+    describe_lead,
+    figure_layouts,
+    layouts_table,
     read_stored,
     render_comparison,
     results_file,
-    summary_table,
-    unseen_table,
+    write_comparison,
     write_stored,
 )
-from icrl4aht_baselines.report.results import BLOCKS, TABLE_COLUMNS, CellReturns, ResultCell, cell_rows
-from icrl4aht_baselines.report.scores import cell_headroom, open_cells
+from icrl4aht_baselines.report.scores import cell_scales
+from icrl4aht_baselines.report.submission import AgentFacts, make_submission
 
-from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.benchmark import best_responses
+from icrl4aht_data.errors import OptionError
+from tests.helpers.evaluated import write_results
 from tests.helpers.paths import ROOT
 
-
-def blocks(mean: Any, gain: Any = 0.0) -> CellReturns:
-    """Return results of five tasks and three seeds whose return rises by `gain`."""
-    values, gain = np.broadcast_to(mean, (5, 3)), np.broadcast_to(gain, (5, 3))
-    return CellReturns(values, values - gain / 2, values + gain / 2, values - gain)
+FACTS = AgentFacts("a rule", "noise", "oracle", steps="10 updates", core_hours=2.0)
+LOW, HIGH = [0.0] * 5 + [10.0] * 95, [10.0] * 5 + [20.0] * 95
 
 
-def everywhere(share: float, gain: float = 0.0) -> dict[ResultCell, CellReturns]:
-    """Return results of an agent with an equal normalised score in every cell."""
-    egos = cell_headroom("seeded")
-    return {
-        cell: blocks(egos[cell]["stay"] + share * (egos[cell]["oracle"] - egos[cell]["stay"]), gain)
-        for cell in open_cells("seeded")
-    }
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> Path:
+    """Return results on the layout track: of an agent that needs its memory, and of a lower one."""
+    folder = tmp_path_factory.mktemp("results")
+    write_results(folder / "high", "high", HIGH, offset=1.0)
+    write_results(folder / "high" / "forgets", "high (forgets)", [5.0] * 100, offset=0.5)
+    write_results(folder / "high" / "swapped", "high (swapped)", HIGH[:80] + [20.0] * 20, offset=1.0)
+    write_results(folder / "low", "low", LOW)
+    return folder
 
 
-def stored_of(
-    agents: Mapping[str, Mapping[ResultCell, CellReturns]], protocol: str = "seeded", overlaps=(), **texts
-) -> StoredResults:
-    rows = [
-        row
-        for agent, cells in agents.items()
-        for cell, of in cells.items()
-        for row in cell_rows((agent, protocol), cell, of[: len(BLOCKS)], overlaps)
-    ]
-    return StoredResults(pd.DataFrame(rows, columns=TABLE_COLUMNS), dict.fromkeys(agents, "a model"), **texts)
+@pytest.fixture
+def stored(folders) -> StoredResults:
+    found = StoredResults()
+    for name in ("high", "low"):
+        found = add_submission(found, make_submission([folders / name], FACTS))
+    return found
 
 
-def summary(stored: StoredResults) -> list[str]:
-    return summary_table(stored.protocol("seeded"), "seeded").splitlines()[2:]
+def row(table: str, agent: str) -> list[str]:
+    (line,) = [line for line in table.splitlines() if line.startswith(f"| `{agent}` ")]
+    return [cell.strip() for cell in line.strip("|").split(" | ")]
 
 
-def test_the_summary_has_scores_and_rising_cells():
-    cells = everywhere(0.5, gain=2.0)
-    cells[ResultCell("demo_wide", "H4")] = blocks(20.0, gain=-1.0)
-    noisy = 20 * np.linspace(-1, 1.01, 15).reshape(5, 3)
-    cells[ResultCell("demo_wide", "H3")] = blocks(20.0, gain=noisy)
-    some = {"half": everywhere(0.5), "rising": cells, "flat": {ResultCell("coord_simple", "H1"): blocks(1.0)}}
-    half, rising, flat = summary(stored_of(some, overlaps=["teammate"]))
-    stays = np.mean([cell_headroom("seeded")[cell]["stay"] for cell in open_cells("seeded")])
-    means = np.mean([of.mean.mean() for of in everywhere(0.5).values()])
-    score = "0.50 (0.50 to 0.50)"
-    assert half.startswith(f"| `half`‡ | {score} | {score} | {score} | 0 of 20 | {means:.1f} to {means:.1f}, +0.0 (")
-    assert stays < means and half.endswith("| 3 |")
-    assert "| 18 of 20 |" in rising and flat == "| `flat`‡ |  |  |  | 0 of 0 |  |  |"
-    (opening,) = summary(stored_of({"a": everywhere(0.0, gain=2.0)}))
-    assert f"| {stays - 2:.1f} to {stays + 1:.1f}, +3.0 (+3.0 to +3.0) |" in opening
-    assert summary(StoredResults()) == [], "a protocol without results"
-
-
-def test_the_page_has_a_column_for_each_current_model():
-    """Older models and models without memory appear only in the summary."""
-    agents = {"a": everywhere(0.5, gain=2.0), f"a{FORGETS}": everywhere(0.1), "old": everywhere(0.2)}
-    ablations = {"ablate windows": {"plain": "the first", "long": "K = 500"}}
-    stored = stored_of(agents, commits={"old": "71f723c"}, ablations=ablations)
-    entries = {"plain": blocks(10.0, gain=1.0), "long": blocks(12.0)}
-    found = stored_of(
-        {name: {ResultCell("demo_wide", "H1", "diverse"): of} for name, of in entries.items()}, "ablate windows"
-    )
-    stored = comparison._replace_rows(stored, found.table)
-    parts = {part.splitlines()[0]: part for part in render_comparison(stored).split("\n## ")}
-    gains = "First and last episodes, protocol `seeded`"
-    for agent, where in ((f"a{FORGETS}", {"Summary", gains}), ("old", {"Summary"})):
-        assert {title for title, part in parts.items() if f"| `{agent}`" in part} == where
-    assert "* `old`: a model (made by commit 71f723c)" in parts["# Results: reference models"]
-    assert (
-        f"| {(mean := agents['a'][ResultCell('demo_wide', 'H4')].mean.mean()):.1f} |"
-        in parts["Track teammate, protocol `seeded`"]
-    )
-    assert f"**{mean - 1:.1f} to {mean + 1:.1f}, +2.0 (+2.0 to +2.0)**" in parts[gains]
-    ablated = parts["Ablations of AD's windows and DPT's contexts"]
-    assert "| `plain` | the first | 10.0 (10.0 to 10.0) |  | +1.0 (+1.0 to +1.0) |" in ablated
-    assert "| `long` | K = 500 | 12.0 (12.0 to 12.0) | +2.0 (+2.0 to +2.0) | +0.0 (+0.0 to +0.0) |" in ablated
-
-
-def test_unseen_layouts(tmp_path):
-    """Check scores of hand-made returns on two versions of two layouts."""
-
-    def returns(*of_versions: float) -> np.ndarray:
-        return np.repeat(np.array(of_versions)[:, None], 40, axis=1)
-
-    wide, both, other = ("demo_wide", "H1"), ("asymm_both", "H1"), ("asymm_both", "H3")
-    found = {
-        "stay": {wide: returns(0, 0), both: returns(10, 10), other: returns(0, 0)},
-        "oracle": {wide: returns(40, 40), both: returns(30, 30), other: returns(20, 20)},
-        "mine": {wide: returns(10, 30), both: returns(10, 10), other: returns(0, 20)},
-    }
-    stored = add_unseen(StoredResults(), found)
-    stay, oracle, mine = unseen_table(stored).splitlines()[2:]
-    assert stay == "| `stay` | 5.0 (5.0 to 5.0) | 0.0 (0.0 to 0.0) |  |"
-    assert oracle == "| `oracle` | 25.0 (25.0 to 25.0) | 40.0 (40.0 to 40.0) |  |"
-    # asymm_both: 5 and 15 of 5 to 25; demo_wide: 10 and 30 of 40: normalised 0 and 0.5, 0.25 and 0.75
-    assert mine == "| `mine` | 10.0 (5.0 to 15.0) | 20.0 (10.0 to 30.0) | 0.38 (0.12 to 0.62) |"
+def test_stored_results_have_blocks_and_curves(stored, tmp_path):
+    assert len(stored.table) == 4 * 40 * 3 * 6 and len(stored.curves) == 4 * 2 * 100
+    curve = stored.curves[(stored.curves["agent"] == "high") & (stored.curves["control"] == "")]
+    assert curve["return"].tolist() == [value + 2.0 for value in HIGH] * 2, "mean over t0 to t4"
     write_stored(tmp_path / "results.json", stored)
-    assert unseen_table(read_stored(tmp_path / "results.json")) == unseen_table(stored)
-    alone = add_unseen(StoredResults(), {"mine": {wide: found["mine"][wide]}})
-    assert "| `mine` | 20.0 (10.0 to 30.0) |  |" in unseen_table(alone) and list(alone.protocol(UNSEEN)) == ["mine"]
+    again = read_stored(tmp_path / "results.json")
+    assert again.agents == stored.agents
+    pd.testing.assert_frame_equal(again.table, stored.table, check_dtype=False)
+    pd.testing.assert_frame_equal(again.curves, stored.curves, check_dtype=False)
+
+
+def test_results_of_an_agent_replace_its_earlier_ones(stored, folders):
+    again = add_submission(stored, make_submission([folders / "low"], FACTS, "high"))
+    assert sorted(again.table["control"].unique()) == [""] and len(again.table) == 2 * 40 * 3 * 6
+    assert list(again.agents) == ["high", "low"]
+
+
+def test_table_1_has_scores_of_complete_tracks(stored, measured):
+    scales = cell_scales("seeded")
+    table = agents_table(stored, stored.returns(), scales)
+    high, low = row(table, "high"), row(table, "low")
+    assert high[1:7] == ["noise", "oracle", "10 updates", "2", "–", "–"], "no track teammate"
+    # R - S over B - S = 20, with S = 12.0 on asymm_right in the mean and 0.0 on cramped_down
+    stays = np.mean([np.mean([scale.stay for cell, scale in scales.items() if cell.layout == name])
+                     for name in ("asymm_right", "cramped_down")])  # fmt: skip
+    for found, mean in ((high, 21.5), (low, 9.5)):
+        assert found[7].startswith(f"{(mean - stays) / 20:z.2f} (")
+    assert describe_lead(stored.returns(), scales) == "No two models have a score on the track `teammate`."
+
+
+def test_the_lead_is_the_difference_of_the_two_highest(tmp_path, measured):
+    found = StoredResults()
+    for name, value in {"a": 3.0, "b": 9.0, "c": 5.0}.items():
+        folder = write_results(tmp_path / name, name, [value] * 100, track="teammate")
+        found = add_submission(found, make_submission([folder], FACTS))
+    assert "`b` minus `c` is +0.20 (+0.20 to +0.20)" in describe_lead(found.returns(), cell_scales("seeded"))
+
+
+def test_table_2_has_the_controls_and_blocks(stored, measured):
+    table = controls_table(stored, stored.returns(), cell_scales("seeded"))
+    high, low = row(table, "high"), row(table, "low")
+    assert high[1].startswith("**+15.5 (") and high[1].endswith(")**"), "19.5 + 2 - (5 + 1)"
+    assert high[2] == "+0.0 (+0.0 to +0.0)" and high[3:] == ["12.0", "12.0", "22.0", "22.0"]
+    assert low[1:] == ["–", "–", "0.0", "0.0", "10.0", "10.0"]
+
+
+def test_table_3_has_reference_egos_and_layouts(stored, measured):
+    table = layouts_table(stored.returns(), cell_scales("seeded"))
+    assert row(table, "stay")[1:4] == ["12.8", "13.0", "12.7"] and "| best response | 12.8 | 18.0 |" in table
+    low = row(table, "low")
+    assert low[1] == "–" and low[8] == "9.5 (0.47)" and float(low[10]) == pytest.approx(26.0 - 9.5, abs=0.1)
+    assert low[9].endswith("asymm_right H4"), "stay earns 40 there"
+    none = layouts_table(stored.returns(), {})
+    assert row(none, "low")[7:] == ["9.5", "9.5", "–", "–"] and "| best response | – |" in none
+
+
+def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monkeypatch):
+    old = stored.agents | {"low": AgentFacts("an old one", "noise", "oracle", commit="71f723c")}
+    some = dataclasses.replace(stored, agents=old)
+    paths = write_comparison(some, tmp_path / "page")
+    assert [path.name for path in paths] == [*RESULTS_FILES]
+    text = paths[0].read_text(encoding="utf-8")
+    assert "| `high` | noise | oracle | 10 updates | 2 | – |" in text and "| `low`" not in text
+    assert "Models of earlier code are there as well: `low`." in text and "None measured (best responses of" in text
+    assert paths[1].stat().st_size > 10_000 and len(figure_layouts({})) == 6
+    assert len(pd.read_parquet(paths[3])) == len(stored.table)
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")
+    table = add_scales(stored.table)
+    down = table[table["layout"] == "cramped_down"]
+    assert len(table) == len(stored.table) and set(down["best"] - down["stay"]) == {20}
+    assert "20 of 32 cells" in render_comparison(some)
+    with pytest.raises(OptionError, match="no stored results: give files that"):
+        write_comparison(StoredResults(), tmp_path / "empty")
+
+
+@pytest.mark.parametrize("texts", ["{", "[]", '{"a": {}}', "{}"])
+def test_damaged_stored_results(texts, tmp_path):
+    assert len(read_stored(tmp_path / "none.json").table) == 0
+    (tmp_path / "bad.json").write_text(texts)
+    (tmp_path / "bad.csv").write_text("agent,protocol\n")
+    with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*restore it, bad\.csv and bad_curves\.csv"):
+        read_stored(tmp_path / "bad.json")
+
+
+def test_bundled_results_are_in_canonical_form(tmp_path):
+    write_stored(tmp_path / "results.json", read_stored(results_file()))
+    for name in ("results.json", "results.csv", "results_curves.csv"):
+        assert (tmp_path / name).read_bytes() == results_file().with_name(name).read_bytes()
 
 
 @pytest.mark.slow
-def test_the_committed_page_matches_the_stored_results():
+def test_the_committed_page_matches_the_stored_results(monkeypatch):
+    monkeypatch.undo()  # the package's best responses
     page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
     assert page == render_comparison(read_stored(results_file()))
-
-
-def test_the_command(tmp_path, monkeypatch):
-    target = tmp_path / "stored.json"
-    write_stored(target, stored_of({"a": everywhere(0.5)}))
-    monkeypatch.setattr(comparison, "results_file", lambda: target)
-    result = CliRunner().invoke(cli, ["results", "--out", str(tmp_path / "page")], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert "| `a` | 0.50" in (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
-    assert (tmp_path / "page" / "results.png").stat().st_size > 10_000
+    assert len(pd.read_parquet(ROOT / "docs" / "results.parquet")) == len(read_stored(comparison.results_file()).table)

@@ -20,7 +20,6 @@ from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
 from icrl4aht_baselines.report.page import markdown, report_files, write_page, write_page_with_episodes
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultCell
-from icrl4aht_baselines.report.scores import cell_headroom
 
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
@@ -71,7 +70,7 @@ def test_the_page_is_complete_and_fetches_nothing(tmp_path):
     for section in ("summary", "curves", "episodes", "tables", "settings", "paper"):
         assert f'<section id="{section}">' in text and f'href="#{section}"' in text
     parts = ["left out: &lt;nothing&gt;", "H1 &amp; an ego", "Episode 2: return 40", "&lt;its run&gt; is gone"]
-    parts += ["paper 12.5 ± 11.3", "the paper's AD", "AD, K = 250", 'name="viewport"', "prefers-color-scheme: dark"]
+    parts += ["paper 12.5 ± 11.3", "AD, K = 250", 'name="viewport"', "prefers-color-scheme: dark"]
     assert [part for part in parts if part not in text] == []
     assert text.count("<table") == text.count("<caption>") and "url(" not in text and "@import" not in text
     with pytest.raises(OptionError, match=r"report\.txt: expected a name that ends in \.html"):
@@ -86,7 +85,7 @@ def test_names_are_escaped_in_all_reports(tmp_path):
     assert Elements(text).outside == [] and EVIL not in text and EVIL in unescape(text)
     for text in (markdown([run]), model_card(run)):
         assert "<img" not in text and '&lt;img src=x onerror="alert(1)"&gt;&amp;co' in text
-        assert "<br>gain +2.0 |" in text, "line breaks in cells stay"
+        assert "<br>episodes 1: 10.0, " in text, "line breaks in cells stay"
 
 
 def test_figures_name_conditions_and_mark_overlaps(tmp_path):
@@ -98,7 +97,7 @@ def test_figures_name_conditions_and_mark_overlaps(tmp_path):
     for caption in captions:
         assert caption.startswith("Evaluated under protocol seeded, 1 seed (0), 40 episodes of 100 steps; 5 instances")
     assert text.count('<i class="key"></i>AD †</span>') == text.count('<i class="key"></i>mine ?</span>') == 2
-    (chart,) = bar_charts(dict(enumerate(runs)), "seeded")
+    (chart,) = bar_charts(dict(enumerate(runs)), "seeded")  # of returns, no best response is measured
     marks = [[bar.text.lstrip("-0123456789.") for bar in row.bars] for row in chart.bars["demo_wide"]]
     assert marks == [["", "?"]] * 3 + [["†", "?"]]
     short = evaluated_run("DPT", steps=20)
@@ -106,25 +105,26 @@ def test_figures_name_conditions_and_mark_overlaps(tmp_path):
     assert "Evaluated AD and mine under protocol seeded, 1 seed (0), 40 episodes of 100 steps; DPT under" in text
 
 
-def test_bars_run_from_stay_to_the_score():
-    run = evaluated_run("mine", ("coord_simple", "demo_wide"), value=39.0, protocol="published")
-    (chart,) = bar_charts({0: run}, "published")
+def test_bars_run_from_stay_to_the_score(measured, tmp_path):
+    run = evaluated_run("mine", ("coord_simple", "demo_wide"), value=9.0)
+    (chart,) = bar_charts({0: run}, "seeded")
     (rows,) = chart.bars.values()
-    stay, oracle = (tick.position for tick in chart.x_ticks)
+    stay, best = (tick.position for tick in chart.x_ticks)
     for row in rows:
         (bar,) = row.bars
-        egos = cell_headroom("published")[ResultCell("demo_wide", row.label)]
-        share = (40.0 - egos["stay"]) / (egos["oracle"] - egos["stay"])
-        assert (bar.start, bar.width) == (pytest.approx(stay), pytest.approx(share * (oracle - stay), abs=0.02))
-        assert [mark.name for mark in row.marks] == ["AD", "DPT"]
-    assert rows[0].scale == "0.0 to 40.0" and rows[0].bars[0].text == "1.00"
+        assert (bar.start, bar.width) == (pytest.approx(stay), pytest.approx(0.5 * (best - stay), abs=0.02))
+    assert rows[0].scale == "0.0 to 20.0" and rows[0].bars[0].text == "0.50"
     flat = ", ".join(f"coord_simple H{number}" for number in range(1, 5))
-    assert chart.caption.endswith(f"The oracle earns no more than an ego that stays: {flat}.")
+    assert chart.caption.endswith(f"The best response earns less than 5 more than an ego that stays: {flat}.")
     (low,) = bar_charts({0: evaluated_run("mine", ("asymm_right",), value=-90.0)}, "seeded")
     assert low.bars["asymm_right"][3].bars[0].text.endswith("*")
     (returns,) = bar_charts({0: evaluated_run("mine", ("coord_simple",))}, "seeded")
     assert returns.title == "Return in each cell, test tasks"
     assert [row.bars[0].text for row in returns.bars["coord_simple"]] == ["11.0"] * 4
+    text = write_page([run], tmp_path / "one.html").read_text()
+    assert "<b>0.50</b>" in text and "<span>Worst teammate</span>" in text
+    text = write_page([run, evaluated_run("other", protocol="published")], tmp_path / "two.html").read_text()
+    assert '<td data-label="regret">10.0</td>' in text and '<td data-label="regret">–</td>' in text
 
 
 def test_curves_share_their_axes_and_may_have_one_episode():
@@ -207,7 +207,7 @@ def test_headroom_cards_name_cells_without_headroom(tmp_path):
     assert "**0.0 / 0.0 / 39.9**" in text and "No headroom: coord_simple/H1, coord_simple/H2" in text
 
 
-def test_shown_episodes_prefer_cells_with_headroom(tmp_path, monkeypatch):
+def test_shown_episodes_prefer_cells_with_headroom(measured, tmp_path, monkeypatch):
     """Tasks with headroom come first, every agent appears once before any twice, reference egos last."""
     (tmp_path / "a.gif").write_bytes(GIF)
     monkeypatch.setattr(gifs, "save_episodes", lambda *a, **k: (ShownEpisode(1, 7.0, tmp_path / "a.gif"),))
@@ -245,7 +245,7 @@ def test_commands_with_a_custom_manifest(tmp_path, monkeypatch):
     played = ["evaluate", "--agent", "stay", "--manifest", str(tmp_path / "own.jsonl"), "--out", str(tmp_path / "run")]
     result = CliRunner().invoke(cli, played, catch_exceptions=False)
     summary = (
-        "stay (seeded), 1 training cell: return 0.0; gain +0.0: 0.0 in the first, 0.0 in the last episode. No score:"
+        "stay (seeded), 1 training cell: return 0.0; by episode 1: 0.0, 2-5: 0.0. No score: no best response measured."
     )
     assert summary in result.output
     arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]

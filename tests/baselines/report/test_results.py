@@ -1,20 +1,18 @@
-"""Results in one table: cells, kinds of tasks, overlap with training data, merged and stored runs."""
+"""Results in one table: cells, kinds of tasks, overlap with training data, merged runs."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import pytest
 from icrl4aht_baselines.evaluate.protocols import get_protocol
-from icrl4aht_baselines.evaluate.results import Result, write_result
+from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.report import merge, rows
-from icrl4aht_baselines.report.comparison import StoredResults, add_results, read_stored, results_file, write_stored
 from icrl4aht_baselines.report.figures import split_cells
-from icrl4aht_baselines.report.results import ResultCell, as_run, bundled_by_id, cell_of
+from icrl4aht_baselines.report.results import BLOCKS, ResultCell, as_run, cell_of, episode_blocks, task_key
 from icrl4aht_baselines.training.seen import OVERLAPS
 
 from icrl4aht_data.benchmark.tasks import Task, make_task, teammate_id
@@ -51,13 +49,23 @@ def test_a_table_has_a_row_for_each_task_seed_and_block():
     (cell,) = run.cells
     assert cell == ("demo_wide", "H4", "test") and cell.group == "H4"
     np.testing.assert_array_equal(run.cells[cell], [[0.5, 1, 1.5, 2.5, 4], [15.0] * 5])
-    found = run.table.set_index(["task", "seed"])
-    assert len(found) == 2 * 2
-    blocks = found.loc[(tasks[0].task_id, 3), ["mean", "first", "last", "opening"]]
-    assert blocks.to_dict() == {"mean": 3.8, "first": 1.5, "last": 6.5, "opening": 1.0}
+    found = run.table.set_index(["task", "seed", "block"])["return"].sort_index()
+    assert len(found) == 2 * 2 * 3, "blocks of 5 episodes"
+    assert found.xs((task_key(tasks[0].task_id), 3)).to_dict() == {"all": 3.8, "1": 1.0, "2-5": 4.5}
+    of = run.returns[cell]
+    assert (of.tasks, of.seeds) == (tuple(task_key(task.task_id) for task in tasks), (3, 4))
+    np.testing.assert_array_equal(of.blocks["all"], [[[3.8, 0.0], [10.0, 20.0]]])
     assert set(run.table["overlap"]) == {"unknown"}
     with pytest.raises(OptionError, match="results of different settings in one run"):
         as_run([Result(tasks[0].task_id, settings, [[1.0]]), Result(tasks[1].task_id, {}, [[1.0]])])
+
+
+def test_blocks_of_long_and_short_evaluations():
+    found = {episodes: episode_blocks(np.arange(1.0, 1 + episodes)) for episodes in (1, 5, 20, 30, 100)}
+    assert list(found[100]) == [*BLOCKS] and list(found[20]) == ["all", "1", "2-5", "6-20"]
+    assert list(found[5]) == ["all", "1", "2-5"] and list(found[1]) == ["all", "1"]
+    expected = {"all": 50.5, "1": 1.0, "2-5": 3.5, "6-20": 13.0, "21-100": 60.5, "last 20": 90.5}
+    assert found[100] == expected and found[30]["21-100"] == 25.5
 
 
 @pytest.mark.parametrize("kind", TASKS)
@@ -127,64 +135,6 @@ def test_cells_are_split_by_kind_and_layout():
     parts = split_cells(cells, 12)
     assert [len(part) for part in parts] == [12, 4, 1]
     assert [cell for part in parts for cell in part] == cells
-
-
-@pytest.fixture
-def ramp(tmp_path):
-    """Return results of one cell with episode returns 0..99 plus the seed in every task."""
-    settings = {"agent": "ramp", "seeds": [0, 1], "protocol": asdict(get_protocol("seeded")), "code_version": "0"}
-    settings |= {"details": {"trained_on": [{"layout": "demo_wide", "family": "H4"}]}}
-    for task in bundled_by_id("test").values():
-        if cell_of(task) == ("demo_wide", "H4", "test"):
-            returns = [[float(seed + number) for number in range(100)] for seed in range(2)]
-            write_result(tmp_path / "ramp", Result(task.task_id, settings, returns))
-    return tmp_path / "ramp"
-
-
-def test_stored_results_round_trip(ramp, tmp_path):
-    stored = add_results(add_results(StoredResults(), ramp, "a ramp"), ramp, "")
-    write_stored(tmp_path / "results.json", stored)
-    again = read_stored(tmp_path / "results.json")
-    assert again.about == {"ramp": "a ramp"}
-    for found in (stored, again):
-        blocks = found.protocol("seeded")["ramp"][ResultCell("demo_wide", "H4")]
-        expected = {"mean": [49.5, 50.5], "first": [9.5, 10.5], "last": [89.5, 90.5], "opening": [0.0, 1.0]}
-        expected |= {"gain": [80.0, 80.0]}
-        assert {name: getattr(blocks, name).tolist() for name in expected} == {
-            name: [of] * 5 for name, of in expected.items()
-        }
-        assert blocks.overlaps == ("family",)
-
-
-def test_bundled_results_are_in_canonical_form(tmp_path):
-    write_stored(tmp_path / "results.json", read_stored(results_file()))
-    for suffix in (".json", ".csv"):
-        path = results_file().with_suffix(suffix)
-        assert (tmp_path / path.name).read_bytes() == path.read_bytes()
-
-
-def test_results_that_cannot_be_stored(ramp, tmp_path):
-    with pytest.raises(OptionError, match="results of ramp, a new agent: say how it was made by --about"):
-        add_results(StoredResults(), ramp, "")
-    for path in (ramp / "tasks").iterdir():
-        content = json.loads(path.read_text())
-        content["returns"] = [row[:30] for row in content["returns"]]
-        (tmp_path / "short" / "tasks").mkdir(parents=True, exist_ok=True)
-        (tmp_path / "short" / "tasks" / path.name).write_text(json.dumps(content))
-    with pytest.raises(OptionError, match="30 episodes, expected at least 40; evaluate more"):
-        add_results(StoredResults(), tmp_path / "short", "short")
-    next((ramp / "tasks").iterdir()).unlink()
-    with pytest.raises(OptionError, match="4 of the 5 published tasks of demo_wide H4; evaluate all of them"):
-        add_results(StoredResults(), ramp, "a part")
-
-
-@pytest.mark.parametrize("texts", ["{", "[]", '{"abut": {}}', "{}"])
-def test_damaged_stored_results(texts, tmp_path):
-    assert len(read_stored(tmp_path / "none.json").table) == 0
-    (tmp_path / "bad.json").write_text(texts)
-    (tmp_path / "bad.csv").write_text("agent,protocol\n")
-    with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*restore it and bad\.csv"):
-        read_stored(tmp_path / "bad.json")
 
 
 def test_results_are_kept_for_each_track(tmp_path):

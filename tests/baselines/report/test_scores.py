@@ -1,4 +1,4 @@
-"""Scores of cells and groups, the summary and the paper's numbers, against hand-made values."""
+"""Scores relative to best responses, tables, the summary and the paper's numbers, against hand-made values."""
 
 from __future__ import annotations
 
@@ -8,77 +8,151 @@ from io import StringIO
 import numpy as np
 import pytest
 from icrl4aht_baselines.report.page import csv_text, markdown
-from icrl4aht_baselines.report.results import PUBLISHED_PROTOCOL, ResultCell, published_cells, read_published
+from icrl4aht_baselines.report.results import (
+    CellReturns,
+    ResultCell,
+    bundled_cells,
+    published_cells,
+    read_published,
+    task_key,
+)
 from icrl4aht_baselines.report.scores import (
-    AVERAGE,
-    cell_headroom,
-    find_headlines,
-    normalised_returns,
+    CellScale,
+    TaskScale,
+    block_difference,
+    cell_scales,
+    find_score,
     open_cells,
+    score_difference,
+)
+from icrl4aht_baselines.report.tables import (
+    AVERAGE,
+    find_headlines,
     published_score,
     returns_tables,
     table_score,
+    unseen_table,
 )
 
+from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.benchmark.tasks import make_task
-from tests.helpers.evaluated import TEST_TASKS, evaluated_run
+from icrl4aht_data.errors import OptionError
+from tests.helpers.evaluated import SPAN, TEST_TASKS, evaluated_run, write_measured
 
 DEMO_WIDE = [ResultCell("demo_wide", family) for family in HEURISTICS]
+WIDE, RING, FLAT = ResultCell("demo_wide", "H1"), ResultCell("coord_ring", "H2"), ResultCell("demo_simple", "H1")
 
 
-def score(value: float, cell: ResultCell) -> float:
-    egos = cell_headroom("published")[cell]
-    return (value - egos["stay"]) / (egos["oracle"] - egos["stay"])
+def returns_of(*values: float, seeds: int = 3) -> CellReturns:
+    """Return results of tasks t0, t1 and so on in which every seed earns the same."""
+    found = np.repeat(np.array(values)[None, :, None], seeds, axis=2)
+    tasks = tuple(f"t{number}" for number in range(len(values)))
+    return CellReturns(tasks, tuple(range(seeds)), {"all": found, "last 20": found + 1})
 
 
-def test_there_are_20_cells_with_headroom():
-    found = open_cells("seeded")
-    assert len(found) == 20 and ResultCell("coord_ring", "H2") in found
-    assert ResultCell("demo_simple", "H2") not in found
+def scale_of(*tasks: tuple[float, float, str]) -> CellScale:
+    return CellScale({f"t{number}": TaskScale(*task) for number, task in enumerate(tasks)})
 
 
-def test_the_score_is_the_mean_over_complete_cells_with_headroom():
-    run = evaluated_run("mine", ("coord_simple", "demo_wide"), protocol="published")
-    assert [*normalised_returns(run)] == DEMO_WIDE, "coord_simple has no headroom"
-    np.testing.assert_allclose(normalised_returns(run)[DEMO_WIDE[0]], np.full((5, 1), score(11.0, DEMO_WIDE[0])))
-    (headline,) = find_headlines(run)
-    expected = np.mean([score(11.0, cell) for cell in DEMO_WIDE])
-    assert headline.score == pytest.approx((expected,) * 3), "equal instances"
-    paper = np.mean(
-        [score(published_cells("AD")["demo_wide"][family][0], ResultCell("demo_wide", family)) for family in HEURISTICS]
+SCALES = {
+    WIDE: scale_of((0.0, 10.0, "a"), (5.0, 25.0, "b"), (0.0, 10.0, "c"), (0.0, 10.0, "c")),
+    RING: scale_of((0.0, 40.0, "d"), (0.0, 40.0, "e"), (0.0, 1.0, "f")),
+    FLAT: scale_of((10.0, 14.0, "g")),
+}
+
+
+def test_a_score_is_a_ratio_of_sums_by_layout():
+    cells = {WIDE: returns_of(5.0, 15.0, 0.0, 10.0), RING: returns_of(10.0, 10.0, 7.0), FLAT: returns_of(99.0)}
+    assert open_cells(SCALES) == [RING, WIDE], "FLAT has less than 5 points of headroom"
+    score = find_score(cells, [RING, WIDE], SCALES)
+    assert score is not None
+    wide, ring = (5 + 10 + 0 + 10) / (10 + 20 + 10 + 10), 27 / 81
+    assert score.layouts == pytest.approx({"coord_ring": ring, "demo_wide": wide})
+    assert score.total.mean == pytest.approx((wide + ring) / 2)
+    # Behaviours: d and e 0.25, a and b 0.5, c (0 + 10) / 20; f has no headroom of its own.
+    assert score.middle.mean == pytest.approx((0.25 + 0.5 + 0.5) / 3) and score.worst == ("coord_ring H2", 0.25)
+    assert score.regret == pytest.approx(((50 - 25) + (81 - 27)) / 7)
+    assert find_score(cells, [RING, FLAT], SCALES) is None and find_score(cells, [], SCALES) is None
+    assert find_score({WIDE: returns_of(5.0, 5.0)}, [WIDE], SCALES) is None, "tasks are missing"
+
+
+def test_differences_are_paired_by_task_and_seed():
+    one, other = returns_of(5.0, 15.0, 0.0, 10.0), returns_of(10.0, 0.0, 10.0, 15.0, seeds=1)
+    shuffled = other._replace(tasks=("t3", "t2", "t0", "t1"))  # 10.0 is of t3
+    difference = score_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], SCALES)
+    assert difference.mean == pytest.approx(((5 - 10) + (15 - 15) + (0 - 0) + (10 - 10)) / 50)
+    returns = block_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], "last 20", SCALES)
+    assert returns is not None and returns.mean == pytest.approx(-5 / 4)
+    assert block_difference({WIDE: one}, {}, [WIDE], "all", SCALES) is None
+    assert block_difference({WIDE: one}, {WIDE: other}, [WIDE], "1", SCALES) is None
+
+
+def test_teammates_that_behave_alike_are_one_unit():
+    """The interval of five equal teammates is that of their seeds."""
+    alike = {WIDE: scale_of(*[(0.0, 20.0, "same")] * 5)}
+    values = np.broadcast_to([2.0, 4.0, 6.0, 8.0], (1, 5, 4))
+    found = CellReturns(tuple(f"t{number}" for number in range(5)), (0, 1, 2, 3), {"all": values})
+    one = found._replace(tasks=("t0",), blocks={"all": values[:, :1]})
+    scores = [find_score({WIDE: of}, [WIDE], alike) for of in (found, one)]
+    assert scores[0] and scores[1] is None
+    single = find_score({WIDE: one}, [WIDE], {WIDE: scale_of((0.0, 20.0, "same"))})
+    assert single and single.total == pytest.approx(scores[0].total) and scores[0].total.range()
+
+
+def test_scales_have_the_tasks_with_a_best_response(measured):
+    scales = cell_scales("seeded")
+    assert len(open_cells(scales)) == 20 and RING in open_cells(scales) and cell_scales("published") == {}
+    assert all(len(scale.tasks) == 5 for scale in scales.values())
+    assert len({task.behaviour for task in scales[ResultCell("demo_wide", "H4")].tasks.values()}) == 1
+    assert {*scales[WIDE].tasks} == {task_key(task) for task in bundled_cells()[WIDE]}
+
+
+def test_damaged_best_responses(tmp_path):
+    card = read_best_responses(write_measured(tmp_path / "b.json"))
+    assert card.version == "7" and isinstance(card.behaviours[0], BestResponse)
+    text = (tmp_path / "b.json").read_text()
+    (tmp_path / "twice.json").write_text(text.replace('"behaviours": [', f'"behaviours": [{text.splitlines()[5]}', 1))
+    with pytest.raises(OptionError, match=r"twice\.json: two best responses to task teammate_test_grounded_coord_simp"):
+        read_best_responses(tmp_path / "twice.json")
+    (tmp_path / "bad.json").write_text(text.replace('"best":', '"beast":'))
+    with pytest.raises(OptionError, match=r"bad\.json: not a file of best responses: .*restore it"):
+        read_best_responses(tmp_path / "bad.json")
+
+
+def test_the_summary_of_a_run(measured):
+    (found,) = find_headlines(evaluated_run("mine", ("coord_simple", "demo_wide")))
+    assert found.score and found.score.total[:3] == pytest.approx((11.0 / SPAN,) * 3), "equal instances"
+    assert found.text == (
+        "mine (seeded), 4 test cells with headroom, of 8 played: score 0.55 (0.55 to 0.55), interquartile mean 0.55, "
+        "worst teammate 0.55 (demo_wide H1), regret 9.0; return 11.0 (11.0 to 11.0); by episode 1: 10.0, 2-5: 10.0, "
+        "6-20: 10.0, 21-100: 12.0. Parentheses: 95 % intervals."
     )
-    assert headline.paper["AD"] == pytest.approx(paper)
-    assert headline.text == (
-        "mine (published), 4 test cells with headroom, of 8 played: normalised score 0.26 (0.26 to 0.26); return 11.0 "
-        "(11.0 to 11.0); gain +2.0 (+2.0 to +2.0): 10.0 in the first, 12.0 in the last 20 episodes. Parentheses: 95 % "
-        f"intervals. The paper's normalised score in these cells: AD {paper:z.2f}, DPT {headline.paper['DPT']:z.2f}."
-    )
 
 
-def test_paper_numbers_appear_only_if_the_protocol_matches():
-    assert list(find_headlines(evaluated_run("DPT", protocol="published"))[0].paper) == ["DPT"]
-    assert find_headlines(evaluated_run("DPT"))[0].paper == {}
-    assert find_headlines(evaluated_run("DPT", protocol="published", variant=("K", 500)))[0].paper == {}
-
-
-def test_results_without_a_score_say_why():
+def test_results_without_a_score_say_why(measured, monkeypatch):
     tasks = [task for task in TEST_TASKS if task.layout.name == "demo_wide"]
     own = make_task("teammate", "validation", "demo_wide", tasks[-1].teammate | {"theta_id": 70}, 3)
     test, validation = find_headlines(evaluated_run("mine", tasks=[tasks[0], own]))
     assert test.score is None and not test.mean.range()
-    assert test.why_no_score == "No score: it needs all published tasks of a cell, in episodes of 100 steps."
-    assert "these are validation tasks" in validation.why_no_score
-    flat = find_headlines(evaluated_run("mine", ("coord_simple",)))[0]
-    assert flat.why_no_score == "No score: no cell that was played completely has headroom."
-    assert "return 11.0; gain" in test.text, "no interval of a single instance"
+    assert test.why_no_score.startswith(
+        "No score: it needs all tasks of a cell with a best response, in episodes of 100"
+    )
+    assert validation.why_no_score == "No score: no best response measured."
+    (short,) = find_headlines(evaluated_run("mine", steps=20))
+    assert short.why_no_score == test.why_no_score
+    (flat,) = find_headlines(evaluated_run("mine", ("coord_simple",)))
+    assert flat.why_no_score == "No score: no best response earns 5 more than `stay` in these cells."
+    (published,) = find_headlines(evaluated_run("mine", protocol="published"))
+    assert published.why_no_score == "No score: best responses were measured under protocol seeded."
+    assert "return 11.0; by episode" in test.text, "no interval of a single instance"
 
 
 def test_other_episode_lengths_have_no_paper_numbers():
     run = evaluated_run("AD", protocol="published", steps=20)
-    assert table_score(DEMO_WIDE[:1], run, "published", (1.0, 1.0)).notes == ["gain +2.0"]
-    assert find_headlines(run)[0].score is None
+    found = table_score(DEMO_WIDE[:1], run, {}, (1.0, 1.0))
+    assert found.notes == ["episodes 1: 10.0, 2-5: 10.0, 6-20: 10.0, 21-100: 12.0"]
 
 
 def test_tables_have_our_and_the_papers_numbers():
@@ -87,8 +161,8 @@ def test_tables_have_our_and_the_papers_numbers():
     assert list(table.columns) == ["demo_wide", "cramped_down", AVERAGE]
     assert list(dict.fromkeys(agent for _, agent in table.rows)) == ["AD", "mine", "DPT", "random"]
     one, mine = table.rows["H1", "AD"][0], table.rows["H1", "mine"][0]
-    assert (one.text, one.notes) == ("11.0 ± 0.0", ["paper -3.2 ± 2.6", "normalised 0.28", "gain +2.0"])
-    assert mine.notes == ["normalised 0.28", "gain +2.0"]
+    assert (one.text, one.notes[0]) == ("11.0 ± 0.0", "paper -3.2 ± 2.6")
+    assert not any("paper" in note for note in mine.notes)
     dpt = table.rows["H1", "DPT"][0]
     assert (dpt.text, dpt.notes) == ("–", ["paper 1.0 ± 0.7"])
     assert table.rows[AVERAGE, "AD"][0].notes[0] == "paper {:.1f} ± {:.1f}".format(
@@ -120,26 +194,37 @@ def test_the_papers_averages_equal_the_means_of_its_cells():
                 assert abs(mean - families[AVERAGE][0]) < 0.11
 
 
-def test_incomplete_groups_are_marked():
-    run = evaluated_run("AD", families=("H1", "H2"))
-    found = table_score(DEMO_WIDE, run, "seeded")
-    assert (found.text, found.notes[0]) == ("11.0 ± 0.0", "2 of 4 cells")
+def test_incomplete_and_flat_groups_are_marked(measured):
+    scales = cell_scales("seeded")
+    found = table_score(DEMO_WIDE, evaluated_run("AD", families=("H1", "H2")), scales)
+    assert (found.text, found.notes[:2]) == ("11.0 ± 0.0", ["2 of 4 cells", "score 0.55"])
     few = evaluated_run("AD", tasks=[task for task in TEST_TASKS if task.layout.name == "demo_wide"][:2])
-    assert table_score(DEMO_WIDE[:1], few, "seeded").notes == ["2 of 5 instances", "gain +2.0"]
-    assert table_score(DEMO_WIDE, few, "seeded").notes[:2] == ["1 of 4 cells", "incomplete cells"]
+    assert table_score(DEMO_WIDE[:1], few, scales).notes[0] == "2 of 5 instances"
+    assert table_score(DEMO_WIDE, few, scales).notes[:2] == ["1 of 4 cells", "incomplete cells"]
+    flat = table_score([ResultCell("coord_simple", "H1")], evaluated_run("AD", ("coord_simple",)), scales)
+    assert flat.is_flat and flat.notes[-1] == "no headroom"
+    assert not table_score(DEMO_WIDE, None, {}).is_flat, "nothing was measured"
 
 
-def test_csv_and_markdown_have_the_numbers_of_each_cell():
+def test_csv_and_markdown_have_the_numbers_of_each_cell(measured):
     runs = [evaluated_run("AD", protocol="published", trained_on=None), evaluated_run("AD", variant=("K", 250))]
     found = list(csv.DictReader(StringIO(csv_text(runs))))
     assert len(found) == 8 and [row["variant"] for row in found] == [""] * 4 + ["K = 250"] * 4
-    expected = {"mean": "11.0", "std": "0.0", "low": "11.0", "gain": "2.0", "published_mean": "-3.2", "seeds": "1"}
-    expected |= {"headroom": "True", "overlap": "unknown", "tasks": "test", "instances": "5", "episodes": "40"}
-    assert expected.items() <= found[0].items()
-    assert found[4]["published_mean"] == "" and float(found[4]["normalised"]) == pytest.approx(0.28, abs=0.01)
+    expected = {"mean": "11.0", "std": "0.0", "low": "11.0", "episodes 21-100": "12.0", "published_mean": "-3.2"}
+    expected |= {"headroom": "", "best": "", "overlap": "unknown", "tasks": "test", "instances": "5", "episodes": "40"}
+    assert expected.items() <= found[0].items() and found[4]["published_mean"] == ""
+    expected = {"stay": "0.0", "best": "20.0", "headroom": "True", "score": "0.55"}
+    assert expected.items() <= found[4].items()
     text = markdown(runs)
-    assert "| H1 | AD | 11.0 ± 0.0 ?<br>paper -3.2 ± 2.6<br>normalised 0.28<br>gain +2.0 |" in text
-    assert text.count("\n## Test tasks, ") == 2 and "| H1 | AD, K = 250 | 11.0 ± 0.0<br>" in text
+    assert "| H1 | AD | 11.0 ± 0.0 ?<br>paper -3.2 ± 2.6<br>episodes 1: 10.0, " in text
+    assert text.count("\n## Test tasks, ") == 2 and "| H1 | AD, K = 250 | 11.0 ± 0.0<br>score 0.55<br>" in text
     assert "* ? unknown training data: nothing says what the agent was trained on" in text
     assert "Evaluated under protocol published, 1 seed (0), 40 episodes of 100 steps; 5 instances in a cell." in text
-    assert PUBLISHED_PROTOCOL == "published"
+
+
+def test_unseen_layouts():
+    """Check means of hand-made returns on four versions of two layouts."""
+    wide, both, other = ("demo_wide", "H1"), ("asymm_both", "H1"), ("asymm_both", "H3")
+    steady = {wide: np.full((4, 40), 10.0), both: np.full((4, 40), 0.0), other: np.full((4, 40), 5.0)}
+    rows = unseen_table({"stay": steady, "mine": {wide: steady[wide]}}).splitlines()
+    assert rows[2:] == ["| `stay` | 2.5 (2.5 to 2.5) | 10.0 (10.0 to 10.0) |", "| `mine` |  | 10.0 (10.0 to 10.0) |"]

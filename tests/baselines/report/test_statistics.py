@@ -1,34 +1,79 @@
-"""Means and confidence intervals of values with known intervals."""
+"""Intervals and p-values against known numbers, and their coverage by simulation."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
-from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
-from scipy.stats import bootstrap
+from icrl4aht_baselines.report.statistics import (
+    MeanInterval,
+    Stratum,
+    holm,
+    interquartile_mean,
+    mean_interval,
+    mean_stratum,
+    ratio_interval,
+)
+from scipy.stats import ttest_1samp
 
 
-def test_one_cell_has_the_percentile_interval():
-    values = np.array([1.0, 2.0, 3.0, 4.0, 10.0])
+def test_normal_values_have_students_interval_and_p_value():
+    values = np.random.default_rng(3).normal(0.3, 1.0, 40)
     found = mean_interval(values)
-    expected = bootstrap((values,), np.mean, method="percentile", rng=np.random.default_rng(1)).confidence_interval
-    assert found.mean == 4.0
-    np.testing.assert_allclose([found.low, found.high], [expected.low, expected.high], atol=0.2)
+    expected: Any = ttest_1samp(values, 0.0)
+    low, high = expected.confidence_interval()
+    np.testing.assert_allclose([found.low, found.high], [low, high], atol=0.06)
+    assert found.mean == pytest.approx(values.mean()) and found.p == pytest.approx(expected.pvalue, abs=0.02)
     assert mean_interval(values) == found, "random numbers are fixed"
 
 
-def test_equal_values_single_instances_and_empty_input():
+def test_equal_values_few_values_and_empty_input():
     found = mean_interval(np.full(5, 7.0), np.full((3, 2), 1.0))
-    assert found == (4.0, 4.0, 4.0) and found.text() == "4.0 (4.0 to 4.0)"
-    single = mean_interval(np.array([[1.0, 2.0]]))
-    assert single.mean == 1.5 and np.isnan(single.low) and single.text(2, "+") == "+1.50"
+    assert found[:3] == (4.0, 4.0, 4.0) and found.p == 0 and found.text() == "4.0 (4.0 to 4.0)"
+    pair = mean_interval(np.array([[1.0, 2.0]]))
+    assert pair.mean == 1.5 and np.isnan(pair.low) and pair.text(2, "+") == "+1.50"
     assert np.isnan(mean_interval()).all() and MeanInterval(-0.01, -0.2, 0.3).text(sign="+") == "+0.0 (-0.2 to +0.3)"
 
 
 def test_seeds_do_not_count_as_instances_and_cells_are_not_resampled():
-    """Compare 15 values as instances, as seeds of five different instances and of five equal ones."""
+    """Compare 15 values as instances, and as seeds of five instances; those of one instance are resampled."""
     values = np.linspace(-1, 1, 15)
-    flat, differing, alike = (mean_interval(found) for found in (values, values.reshape(5, 3), values.reshape(3, 5).T))
-    widths = [high - low for _, low, high in (flat, differing, alike)]
-    assert widths[1] > 1.3 * widths[0] and widths[2] < widths[1]
-    assert mean_interval(np.full(3, 0.0), np.full(3, 10.0)) == pytest.approx((5.0, 5.0, 5.0))
+    flat, nested, single = (mean_interval(found) for found in (values, values.reshape(5, 3), values.reshape(1, 15)))
+    assert nested.high - nested.low > 1.3 * (flat.high - flat.low) and single == flat
+    assert mean_interval(np.full(3, 0.0), np.full(3, 10.0))[:3] == pytest.approx((5.0, 5.0, 5.0))
+
+
+def test_ratios_are_those_of_sums_and_trainings_widen_the_interval():
+    gains, scales = np.array([[1.0, 3.0, 2.0, 4.0]]), np.array([2.0, 4.0, 2.0, 8.0])
+    one = Stratum(gains, scales)
+    assert ratio_interval([[one], [Stratum(gains[:, :2], scales[:2])]]).mean == pytest.approx((10 / 16 + 4 / 6) / 2)
+    several = Stratum(np.concatenate([gains - 2, gains, gains + 2]), scales)
+    found = [ratio_interval([[stratum]]) for stratum in (one, several)]
+    assert found[0].mean == pytest.approx(found[1].mean)
+    assert found[1].high - found[1].low > found[0].high - found[0].low
+
+
+def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
+    found = interquartile_mean(np.array([-100.0, 0, 1, 2, 3, 4, 5, 900]))
+    assert found.mean == 2.5 and found.low < 2.5 < found.high
+    assert np.isnan(interquartile_mean(np.ones(3)).low)
+
+
+def test_holms_correction():
+    found = holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": float("nan")})
+    assert [found[name] for name in "abc"] == pytest.approx([0.03, 0.06, 0.06]) and np.isnan(found["d"])
+    assert holm({}) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trainings", [1, 5])
+def test_intervals_have_the_stated_coverage(trainings):
+    """Five units in each of four cells of unequal variance, and a common effect of each training."""
+    rng, covered, rounds = np.random.default_rng(1), 0, 800
+    for _ in range(rounds):
+        common = rng.normal(0.0, 0.5, (trainings, 1)) if trainings > 1 else np.zeros((1, 1))
+        cells = [common + rng.normal(cell, 1.0 + cell, 5) for cell in range(4)]
+        found = ratio_interval([[mean_stratum(cell)] for cell in cells], resamples=1000)
+        covered += found.low <= 1.5 <= found.high
+    assert 0.92 < covered / rounds < 0.98

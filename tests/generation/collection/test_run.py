@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import psutil
 import pytest
 from icrl4aht_generation.collection import job
+from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.task_folder import LEARNER, partial_folder
 from icrl4aht_generation.jobs.job import FailedJobsError, JobBoard, run_job
 from icrl4aht_generation.jobs.options import QueueOptions

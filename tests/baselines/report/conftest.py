@@ -1,0 +1,31 @@
+"""Best responses for tests of scores, which do not depend on the package's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from icrl4aht_data.benchmark import best_responses
+from icrl4aht_data.benchmark.best_responses import BestResponseCard, write_best_responses
+from tests.helpers.evaluated import write_measured
+
+
+@pytest.fixture(scope="session")
+def cards(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("cards")
+    write_measured(folder / "measured.json")
+    write_best_responses(folder / "none.json", BestResponseCard("0", "seeded", "None measured."))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def unmeasured(cards, monkeypatch) -> None:
+    """Replace the package's best responses by none."""
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "none.json")
+
+
+@pytest.fixture
+def measured(unmeasured, cards, monkeypatch) -> None:
+    """Replace the package's best responses by those of `write_measured`."""
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")

@@ -1,0 +1,129 @@
+"""Files of results: made from folders of `evaluate`, and refused where they are incomplete or not comparable."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from icrl4aht_baselines.evaluate.results import read_result
+from icrl4aht_baselines.report import comparison
+from icrl4aht_baselines.report.submission import (
+    AgentFacts,
+    Submission,
+    make_submission,
+    read_submission,
+    submission_schema,
+    write_submission,
+)
+
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import OptionError
+from tests.helpers.evaluated import TEST_TASKS, write_results
+
+CURVE = [0.0, *[10.0] * 4, *[20.5] * 95]
+FACTS = AgentFacts("a rule", "none", "none")
+
+
+@pytest.fixture(scope="module")
+def submitted(tmp_path_factory) -> Path:
+    """Return a file of two trainings of an agent, the second with a control."""
+    folder = tmp_path_factory.mktemp("submitted")
+    write_results(folder / "one", "rule", CURVE)
+    write_results(folder / "two", "rule", CURVE, trained_on=[{"layout": "asymm_both", "family": "H1"}])
+    write_results(folder / "two" / "forgets", "rule (forgets)", [0.0] * 100)
+    write_submission(folder / "rule.json", make_submission([folder / "one", folder / "two"], FACTS))
+    return folder / "rule.json"
+
+
+def test_a_file_has_all_results_of_all_folders(submitted):
+    found = read_submission(submitted)
+    assert (found.agent, found.tracks, found.facts.about) == ("rule", ["layout"], "a rule")
+    parts = [(one.control, one.training, len(one.returns)) for one in found.evaluations]
+    assert parts == [("", 0, 40), ("", 1, 40), ("forgets", 0, 40)]
+    assert next(iter(found.evaluations[0].returns.values())) == [CURVE] * 3
+    schema = json.loads(submission_schema())
+    fields = schema["$defs"]["Submission"]
+    assert set(fields["required"]) == {*Submission.__struct_fields__} and not fields["additionalProperties"]
+
+
+def changed(path: Path, target: Path, change: Any) -> Path:
+    content = json.loads(path.read_text())
+    change(content, content["evaluations"][0], next(iter(content["evaluations"][0]["returns"])))
+    target.write_text(json.dumps(content))
+    return target
+
+
+def rename(one: dict[str, Any], task: str, name: str) -> None:
+    one["returns"][name] = one["returns"].pop(task)
+
+
+OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c, one, task: c.update(best_responses="99"), r"best responses of version '99', expected '0'"),
+        (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
+        (lambda c, one, task: one["returns"].pop(task), "1 of the 40 test tasks of layout are missing, such as layout"),
+        (lambda c, one, task: rename(one, task, OTHER), f"task {OTHER} is not one of the 40 test tasks of layout"),
+        (lambda c, one, task: c.update(tracks=["teammate"]), "is not one of the 120 test tasks of teammate"),
+        (lambda c, one, task: one["settings"].update(seeds=[0, 1]), r"seeds \[2\] are missing, found \[0, 1\]"),
+        (lambda c, one, task: one["returns"][task].pop(), r"has 2 lists of \[100\] returns, expected 3 of 100"),
+        (lambda c, one, task: one["settings"]["protocol"].update(name="published"), "protocol {'name': 'published'"),
+        (lambda c, one, task: one["settings"].pop("protocol"), "settings without 'protocol'"),
+        (lambda c, one, task: one.update(control="swap"), "control 'swap', expected forgets or swapped"),
+        (lambda c, one, task: c["evaluations"].append(one), "results of a task twice"),
+        (lambda c, one, task: [each.update(control="forgets", training=n) for n, each in enumerate(c["evaluations"])],
+         "only controls"),
+        (lambda c, one, task: c.update(colour="red"), "not a file of results: Object contains unknown field `colour`"),
+        (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(submitted, tmp_path, change, message):
+    with pytest.raises(OptionError, match=message) as caught:
+        read_submission(changed(submitted, tmp_path / "bad.json", change))
+    assert str(caught.value).startswith(str(tmp_path / "bad.json"))
+
+
+def test_folders_that_are_refused(tmp_path):
+    with pytest.raises(OptionError, match=f"{tmp_path}/none: no results in"):
+        make_submission([tmp_path / "none"], FACTS)
+    folder = write_results(tmp_path / "undeclared", "rule", CURVE, trained_on=None)
+    with pytest.raises(OptionError, match="undeclared: rule, training 0: no declaration of the training data"):
+        make_submission([folder], FACTS)
+    for name, value, message in (
+        ("code_version", "0.0.1", "results of different settings in one folder"),
+        ("code_version", "0.0.1", r"results of version 0\.0\.1, expected"),
+    ):
+        paths = sorted((folder / "tasks").iterdir())
+        for path in paths[:1] if "different" in message else paths:
+            result = read_result(path)
+            other = replace(result, settings=result.settings | {name: value})
+            path.write_text(json.dumps(other.to_json()))
+        with pytest.raises(OptionError, match=message):
+            make_submission([folder], FACTS)
+
+
+def test_the_commands(submitted, tmp_path, monkeypatch):
+    monkeypatch.setattr(comparison, "results_file", lambda: tmp_path / "stored.json")
+    folder = str(write_results(tmp_path / "mine", "mine", CURVE))
+    said = ["--about", "a rule", "--data", "none", "--labels", "none", "--core-hours", "1.5", "--name", "my rule"]
+    runner = CliRunner()
+    result = runner.invoke(cli, ["submit", folder, *said, "--out", str(tmp_path / "mine.json")], catch_exceptions=False)
+    assert result.exit_code == 0 and "mine.json: my rule, layout;" in result.output
+    assert read_submission(tmp_path / "mine.json").facts.core_hours == 1.5
+    result = runner.invoke(cli, ["submit", folder, "--about", "a rule", "--out", str(tmp_path / "other.json")])
+    assert result.exit_code == 2 and "missing --data, --labels" in result.output
+    assert json.loads(runner.invoke(cli, ["submit", "--schema"]).output)["$defs"]["AgentFacts"]
+    page = ["results", str(submitted), str(tmp_path / "mine.json"), "--out", str(tmp_path / "page")]
+    result = runner.invoke(cli, page, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
+    assert "| `my rule` | none | none | – | 1.5 |" in text and "| `rule` † |" in text
+    result = runner.invoke(cli, [*page, "--overwrite", "--store"], catch_exceptions=False)
+    assert list(comparison.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
