@@ -38,12 +38,13 @@ from icrl4aht_baselines.online.student import collect_release, release_teammates
 from icrl4aht_baselines.plotting import SMOOTHING, plot_return_curves, shrink_picture
 from icrl4aht_baselines.report.cards import model_card
 from icrl4aht_baselines.report.results import merge, note_results, read_run
+from icrl4aht_baselines.report.scores import known_headroom
 from icrl4aht_baselines.training.histories import prepare, start_from
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES
 from icrl4aht_baselines.training.trainer import format_loss, train
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
+from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError, unknown
@@ -370,7 +371,7 @@ def write_bundled_card(
     pictures, headroom = {}, read_headroom("seeded")
     for found in outcomes:
         of_track = read_run(found.results["test-seeded"])
-        cells = [cell for cell in of_track.cells if has_headroom(headroom[cell[:2]])]
+        cells = [cell for cell, has_any in known_headroom("seeded").items() if has_any and cell in of_track.cells]
         returns, training = f"{found.track}/{RETURNS}", f"{found.track}/{RUN_CURVES}"
         path = folder / name / returns
         panels = {cell.title: {name: of_track.cells[cell]} for cell in cells}

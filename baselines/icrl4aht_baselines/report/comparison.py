@@ -26,6 +26,7 @@ from icrl4aht_baselines.report.scores import (
     block_difference,
     cell_scales,
     find_score,
+    known_headroom,
     open_cells,
     score_difference,
     track_cells,
@@ -36,7 +37,7 @@ from icrl4aht_baselines.report.tables import mean_of
 from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
-from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, read_headroom
+from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_headroom
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import legend_below, new_figure, return_limits, save_figure
 from icrl4aht_data.reading.arrow_tables import import_pyarrow
@@ -294,10 +295,9 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
     return markdown_table(["model", *TEST_LAYOUTS, "worst teammate", "regret"], body, right=len(TEST_LAYOUTS) + 2)
 
 
-def figure_layouts(scales: CellScales) -> list[str]:
-    """Return the layouts of the figure: those with headroom, by the oracle if no best response was measured."""
-    headroom = read_headroom(SUBMITTED_PROTOCOL)
-    cells = open_cells(scales) or in_order(ResultCell(*cell) for cell, egos in headroom.items() if has_headroom(egos))
+def figure_layouts() -> list[str]:
+    """Return the layouts of the figure, the first with headroom."""
+    cells = in_order(cell for cell, has_any in known_headroom(SUBMITTED_PROTOCOL).items() if has_any)
     return list(dict.fromkeys(cell.layout for cell in cells))[:_PANELS]
 
 
@@ -307,7 +307,7 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
     An agent without curves has a point at its first episode. Lines show `stay` and the best responses.
     """
     scales, results, headroom = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), read_headroom(SUBMITTED_PROTOCOL)
-    layouts = figure_layouts(scales)
+    layouts = figure_layouts()
     figure = new_figure(11, 3 * -(-len(layouts) // 3) + 0.6)
     grid = [*figure.subplots(-(-len(layouts) // 3), 3, squeeze=False).flat]
     shown = [agent for agent in results if not stored.agents[agent].commit]

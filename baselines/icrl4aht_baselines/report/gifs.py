@@ -16,7 +16,7 @@ from icrl4aht_baselines.evaluate.evaluator import play_tasks
 from icrl4aht_baselines.evaluate.protocols import Protocol
 from icrl4aht_baselines.evaluate.segments import FORGETS
 from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, ResultSource
-from icrl4aht_baselines.report.scores import cell_scales, open_cells
+from icrl4aht_baselines.report.scores import known_headroom
 from icrl4aht_baselines.training.seen import describe_overlap
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
@@ -110,8 +110,8 @@ def family_gifs(
     """
     chosen: list[tuple[EvaluationRun, ResultCell]] = []
     for run in runs:
-        scored, first = open_cells(cell_scales(run.protocol)), {}
-        for cell in sorted(run.cells, key=lambda cell: (cell.order[1:], cell not in scored)):
+        headroom, first = known_headroom(run.protocol), {}
+        for cell in sorted(run.cells, key=lambda cell: (cell.order[1:], not headroom.get(cell))):
             first.setdefault(cell[1:], cell)
         chosen += [(run, cell) for cell in first.values()]
     progress(_PROGRESS, 0, len(chosen))

@@ -27,7 +27,7 @@ from icrl4aht_baselines.report.results import (
 from icrl4aht_baselines.report.statistics import MeanInterval, Stratum, interquartile_mean, ratio_interval
 from icrl4aht_data.benchmark.best_responses import best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
-from icrl4aht_data.benchmark.reference_returns import stay_returns
+from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom, stay_returns
 
 
 class TaskScale(NamedTuple):
@@ -88,6 +88,12 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
 def open_cells(scales: CellScales) -> list[ResultCell]:
     """Return the test cells with headroom, in the paper's order."""
     return in_order(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
+
+
+def known_headroom(protocol: str) -> dict[ResultCell, bool]:
+    """Return whether each measured cell has headroom: by best responses, or by the oracle where there are none."""
+    egos = {ResultCell(*cell): has_headroom(of_cell) for cell, of_cell in read_headroom(protocol).items()}
+    return egos | {cell: scale.has_headroom for cell, scale in cell_scales(protocol).items()}
 
 
 def track_cells(cells: Iterable[ResultCell], track: str) -> list[ResultCell]:

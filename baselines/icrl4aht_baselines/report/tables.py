@@ -21,7 +21,15 @@ from icrl4aht_baselines.report.results import (
     published_instances,
     read_published,
 )
-from icrl4aht_baselines.report.scores import CellScales, Score, cell_scales, cell_scores, find_score, scored_cells
+from icrl4aht_baselines.report.scores import (
+    CellScales,
+    Score,
+    cell_scales,
+    cell_scores,
+    find_score,
+    known_headroom,
+    scored_cells,
+)
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.best_responses import read_best_responses
@@ -50,12 +58,12 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
 
     A row has the agent, the conditions of the evaluation, mean return, std and 95 % interval over the instances (None
     for a single instance), the paper's numbers (None unless the protocol is `published`), the mean return in blocks of
-    episodes, mean returns of `stay` and of the best responses, headroom and score (None where no best response was
-    measured; no score without headroom and of incomplete cells), and `overlap`: the ways in which training data and
+    episodes, mean returns of `stay` and of the best responses, headroom and score (None where it was not measured; no
+    score without headroom and of incomplete cells), and `overlap`: the ways in which training data and
     tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
     """
     scales = cell_scales(run.protocol)
-    scores, found = cell_scores(run, scales), []
+    scores, headroom, found = cell_scores(run, scales), known_headroom(run.protocol), []
     for cell, returns in run.returns.items():
         source, interval, several = run.source(cell), mean_interval(returns.mean), len(returns.mean) > 1
         like_paper = run.variant is None and run.protocol == PUBLISHED_PROTOCOL and run.is_comparable(cell)
@@ -78,7 +86,7 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
                 **{f"episodes {name}": value for name, value in _block_means([returns]).items()},
                 "stay": scale and scale.stay,
                 "best": scale and scale.best,
-                "headroom": scale and scale.has_headroom,
+                "headroom": headroom.get(cell),
                 "score": scores[cell].mean if cell in scores else None,
                 "tasks": cell.kind,
                 "seeds": len(source.settings["seeds"]),
@@ -183,7 +191,7 @@ class TableScore(NamedTuple):
         text: mean return, std over the instances of a single cell or over cells, and marks of overlaps; a dash if
             nothing was played.
         notes: further numbers as text: what is missing, the paper's numbers, score, blocks of episodes.
-        is_flat: whether best responses were measured in a cell, and none has headroom.
+        is_flat: whether headroom was measured in a cell, and none has any, see `scores.known_headroom`.
         overlaps: the ways in which training data and tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
     """
 
@@ -194,18 +202,19 @@ class TableScore(NamedTuple):
 
 
 def table_score(
-    cells: Sequence[ResultCell], run: EvaluationRun | None, scales: CellScales, published: Published | None = None
+    cells: Sequence[ResultCell], run: EvaluationRun | None, protocol: str, published: Published | None = None
 ) -> TableScore:
     """Return a run's results on a group of cells.
 
     Args:
         cells: the group.
         run: None if the agent was not run.
-        scales: scales of the cells under the run's protocol.
+        protocol: of the run.
         published: the paper's mean and std; left out if a cell was not played, or with another episode length.
     """
     played = [cell for cell in cells if run and cell in run.cells]
-    measured = [scales[cell].has_headroom for cell in cells if cell in scales]
+    headroom, scales = known_headroom(protocol), cell_scales(protocol)
+    measured = [headroom[cell] for cell in cells if cell in headroom]
     is_flat = bool(measured) and not any(measured)
     std = f" ± {published[1]:z.1f}" if published and published[1] is not None else ""
     paper = [f"paper {published[0]:z.1f}{std}"] if published else []
@@ -258,7 +267,7 @@ def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTa
         runs: runs under one protocol.
         protocol: name of the protocol.
     """
-    tables, scales = [], cell_scales(protocol)
+    tables = []
     for kind in TASK_KINDS:
         cells = in_order(cell for run in runs for cell in run.cells if cell.kind == kind)
         if not cells:
@@ -277,7 +286,7 @@ def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTa
             for of_column in columns.values():
                 group = [ResultCell(*cell, kind) for cell in product(of_column, labels[label])]
                 stated = published_score(agent if run is None else run, group) if quoted else None
-                scores.append(table_score(group, run, scales, stated))
+                scores.append(table_score(group, run, protocol, stated))
             if any(score.notes or score.text != TableScore().text for score in scores):
                 rows[label, agent] = scores
         caption = describe_conditions(played.values(), cells)

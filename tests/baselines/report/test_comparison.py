@@ -125,7 +125,7 @@ def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monke
     text = paths[0].read_text(encoding="utf-8")
     assert "| `high` | noise | oracle | 10 updates | 2 | – |" in text and "| `low`" not in text
     assert "Models of earlier code are there as well: `low`." in text and "None measured (best responses of" in text
-    assert paths[1].stat().st_size > 10_000 and len(figure_layouts({})) == 6
+    assert paths[1].stat().st_size > 10_000 and len(figure_layouts()) == 6
     assert len(pd.read_parquet(paths[3])) == len(stored.table)
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")
     table = add_scales(stored.table)

@@ -151,7 +151,7 @@ def test_results_without_a_score_say_why(measured, monkeypatch):
 
 def test_other_episode_lengths_have_no_paper_numbers():
     run = evaluated_run("AD", protocol="published", steps=20)
-    found = table_score(DEMO_WIDE[:1], run, {}, (1.0, 1.0))
+    found = table_score(DEMO_WIDE[:1], run, "published", (1.0, 1.0))
     assert found.notes == ["episodes 1: 10.0, 2-5: 10.0, 6-20: 10.0, 21-100: 12.0"]
 
 
@@ -195,15 +195,16 @@ def test_the_papers_averages_equal_the_means_of_its_cells():
 
 
 def test_incomplete_and_flat_groups_are_marked(measured):
-    scales = cell_scales("seeded")
-    found = table_score(DEMO_WIDE, evaluated_run("AD", families=("H1", "H2")), scales)
+    found = table_score(DEMO_WIDE, evaluated_run("AD", families=("H1", "H2")), "seeded")
     assert (found.text, found.notes[:2]) == ("11.0 ± 0.0", ["2 of 4 cells", "score 0.55"])
     few = evaluated_run("AD", tasks=[task for task in TEST_TASKS if task.layout.name == "demo_wide"][:2])
-    assert table_score(DEMO_WIDE[:1], few, scales).notes[0] == "2 of 5 instances"
-    assert table_score(DEMO_WIDE, few, scales).notes[:2] == ["1 of 4 cells", "incomplete cells"]
-    flat = table_score([ResultCell("coord_simple", "H1")], evaluated_run("AD", ("coord_simple",)), scales)
+    assert table_score(DEMO_WIDE[:1], few, "seeded").notes[0] == "2 of 5 instances"
+    assert table_score(DEMO_WIDE, few, "seeded").notes[:2] == ["1 of 4 cells", "incomplete cells"]
+    flat_cell = ResultCell("coord_simple", "H1")
+    flat = table_score([flat_cell], evaluated_run("AD", ("coord_simple",)), "seeded")
     assert flat.is_flat and flat.notes[-1] == "no headroom"
-    assert not table_score(DEMO_WIDE, None, {}).is_flat, "nothing was measured"
+    assert table_score([flat_cell], None, "published").is_flat, "by the oracle"
+    assert not table_score([flat_cell._replace(kind="validation")], None, "seeded").is_flat, "nothing was measured"
 
 
 def test_csv_and_markdown_have_the_numbers_of_each_cell(measured):
@@ -211,7 +212,14 @@ def test_csv_and_markdown_have_the_numbers_of_each_cell(measured):
     found = list(csv.DictReader(StringIO(csv_text(runs))))
     assert len(found) == 8 and [row["variant"] for row in found] == [""] * 4 + ["K = 250"] * 4
     expected = {"mean": "11.0", "std": "0.0", "low": "11.0", "episodes 21-100": "12.0", "published_mean": "-3.2"}
-    expected |= {"headroom": "", "best": "", "overlap": "unknown", "tasks": "test", "instances": "5", "episodes": "40"}
+    expected |= {
+        "headroom": "True",
+        "best": "",
+        "overlap": "unknown",
+        "tasks": "test",
+        "instances": "5",
+        "episodes": "40",
+    }
     assert expected.items() <= found[0].items() and found[4]["published_mean"] == ""
     expected = {"stay": "0.0", "best": "20.0", "headroom": "True", "score": "0.55"}
     assert expected.items() <= found[4].items()
