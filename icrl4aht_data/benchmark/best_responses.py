@@ -24,11 +24,19 @@ class TrainedResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         seed: seed of the training.
         steps: environment steps of the training.
         mean_return: mean return of an episode after it, `return` in the file.
+        choice: mean return on the episodes by which the best training is chosen.
+        acting: whether it takes its most probable actions ("greedy") or draws them ("sampled"), by the same episodes.
+        slope: rise of the return while it learned, from the third to the last quarter of the steps.
+        init: bundled model that it started from; empty for random parameters.
     """
 
     seed: int
     steps: int
     mean_return: float = msgspec.field(name="return")
+    choice: float | None = None
+    acting: str = ""
+    slope: float | None = None
+    init: str = ""
 
 
 class BestResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -9,13 +9,13 @@ from typing import Any
 import click
 from icrl4aht_generation.jobs.command_line import queue_options, read_queue_options
 
+from icrl4aht_data.benchmark.best_responses import best_responses_file
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.commands.dataclass_options import TopicCommand, topic
 from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, TRACK, Folder, Names, examples
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.templates import card_file
 
 _tasks_topic = topic(
     "Tasks",
@@ -117,6 +117,7 @@ def best_response_command(
     from rich.console import Console
 
     from icrl4aht_baselines.online.responses import (
+        RESPONSES,
         ResponseJob,
         ResponseOptions,
         find_behaviours,
@@ -134,8 +135,9 @@ def best_response_command(
     try:
         run_jobs(jobs, out, console, options, ResponseJob.finished_text)
     finally:
-        for folder in (out, card_file("best_responses.json").parent)[: 1 + bundle]:
-            console.print(f"wrote {write_responses(jobs, folder)}")
+        for path in (out / RESPONSES, best_responses_file())[: 1 + bundle]:
+            write_responses(jobs, path)
+            console.print(f"wrote {path}")
 
 
 @click.command(
@@ -192,6 +194,6 @@ def adaptation_headroom_command(
     console, settings = Console(soft_wrap=True), ResponseOptions(steps, tasks)
     jobs = headroom_jobs(sets, seeds, settings, out)
     run_jobs(jobs, out, console, options)
-    for folder in (out, card_file("best_responses.json").parent)[: 1 + bundle]:
+    for folder in (out, best_responses_file().parent)[: 1 + bundle]:
         console.print(f"wrote {write_headroom(jobs, folder)}")
     click.echo(headroom_table(out))

@@ -105,7 +105,9 @@ class HeadroomJob:
     def progress(self) -> tuple[int, float] | None:
         """Return training steps done, and environment steps per second."""
         timing = last_line(self.out / self.name / "run" / TIMING)
-        return None if timing is None else (timing["step"], timing["steps_per_second"] * self.options.tasks * KEPT_STEPS)
+        return (
+            None if timing is None else (timing["step"], timing["steps_per_second"] * self.options.tasks * KEPT_STEPS)
+        )
 
     def result(self) -> dict[str, float]:
         """Return task id -> mean return, of a finished training."""

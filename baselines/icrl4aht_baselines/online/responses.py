@@ -22,6 +22,7 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.distances import act_along, common_states, group_behaviours
 from icrl4aht_generation.teammates.draws import find_draw
 from icrl4aht_generation.teammates.registry import build_teammate
+from msgspec import to_builtins
 
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import PlayMode, learned, with_view
@@ -34,12 +35,19 @@ from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import PlayOptions, TrainOptions
 from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_data.benchmark.best_responses import (
+    BestResponse,
+    BestResponseCard,
+    TrainedResponse,
+    read_best_responses,
+    write_best_responses,
+)
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, track_of
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.options import Count, Option, Positive, check_options
 
 PROTOCOL = "seeded"
@@ -47,6 +55,9 @@ PROTOCOL = "seeded"
 
 CHOICE_SEEDS, REPORT_SEEDS = (1000,), (0, 1, 2)
 """Seeds of the episodes by which the best one of several trainings is chosen, and of those that are reported."""
+
+RESPONSES = "best_responses.json"
+"""Name of the file of best responses, in a folder of trainings and among the package's cards."""
 
 RESULT = "result.json"
 """Name of the file with the result of a training, in its folder."""
@@ -212,7 +223,7 @@ class ResponseJob:
     def progress(self) -> tuple[int, float] | None:
         """Return training steps done, and environment steps per second."""
         timing = last_line(self.out / self.name / "run" / TIMING)
-        if timing is None or "steps_per_second" not in timing:
+        if timing is None:
             return None
         return timing["step"], timing["steps_per_second"] * self.options.tasks * KEPT_STEPS
 
@@ -279,50 +290,40 @@ def _bundled_run(name: str, layout: Layout) -> Path:
     return models[name].runs[track_of(layout.name)]
 
 
-def best_of(jobs: Sequence[ResponseJob]) -> dict[str, Any]:
-    """Return the entry of a behaviour in cards/best_responses.json from its finished trainings.
+def best_of(jobs: Sequence[ResponseJob]) -> BestResponse:
+    """Return the best response to a behaviour from its finished trainings.
 
     The best one is that with the highest return on the episodes to choose by; B is its return on the others.
     """
     task, seeds = jobs[0].behaviour.tasks[0], []
     for job in jobs:
         result = job.result()
-        mode = max(result["modes"], key=lambda name: result["modes"][name]["choice"])
-        start = {"init": job.options.init} if job.options.init else {}
-        seeds.append(
-            {"seed": job.seed, "steps": job.options.updates * job.options.tasks * KEPT_STEPS, **start, "acting": mode}
-            | result["modes"][mode]
-            | {"slope": result["slope"]}
-        )
-    best = max(seeds, key=lambda one: one["choice"])
-    return {
-        "layout": task.layout.name,
-        "family": task.teammate_family,
-        "split": task.split,
-        "tasks": [one.task_id for one in jobs[0].behaviour.tasks],
-        "seeds": seeds,
-        "best": best["return"],
-        "agent": f"best response, seed {best['seed']}" + (f" from {best['init']}" if "init" in best else ""),
-    }
+        acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
+        steps = job.options.updates * job.options.tasks * KEPT_STEPS
+        found = earned["return"], earned["choice"], acting, result["slope"], job.options.init or ""
+        seeds.append(TrainedResponse(job.seed, steps, *found))
+    best = max(seeds, key=lambda one: one.choice)
+    return BestResponse(
+        layout=task.layout.name,
+        family=task.teammate_family,
+        split=task.split,
+        tasks=tuple(one.task_id for one in jobs[0].behaviour.tasks),
+        seeds=tuple(seeds),
+        best=best.mean_return,
+        agent=f"best response, seed {best.seed}" + (f" from {best.init}" if best.init else ""),
+    )
 
 
-RESPONSES = "best_responses.json"
-"""Name of the file of best responses, in a folder of trainings and among the package's cards."""
+def write_responses(jobs: Sequence[ResponseJob], path: Path) -> None:
+    """Add the best responses of finished trainings to a file, see `icrl4aht_data.benchmark.best_responses`.
 
-
-def write_responses(jobs: Sequence[ResponseJob], folder: Path) -> Path:
-    """Add the best responses of finished trainings to a folder's `RESPONSES`; those of the same tasks are replaced.
-
-    Trainings that another command made of the same behaviour are kept beside the new ones.
+    Those of the same tasks are replaced. The version is a hash of all of them.
     """
-    path, finished = folder / RESPONSES, defaultdict(list)
+    finished: dict[str, list[ResponseJob]] = defaultdict(list)
     for job in jobs:
         if job.is_finished():
             finished[job.behaviour.tasks[0].task_id].append(job)
-    card = parse_json(read_text(path)) if path.is_file() else {}
-    known = {entry["tasks"][0]: entry for entry in card.get("behaviours", [])}
+    known = {one.tasks[0]: one for one in (read_best_responses(path).behaviours if path.is_file() else ())}
     known |= {task: best_of(own) for task, own in finished.items()}
-    content = {"version": "1", "protocol": PROTOCOL, "about": ABOUT, "behaviours": list(known.values())}
-    with atomic_write(path) as partial:
-        write_json(partial, content)
-    return path
+    version = json_hash(to_builtins(tuple(known.values())))
+    write_best_responses(path, BestResponseCard(version, PROTOCOL, ABOUT, tuple(known.values())))

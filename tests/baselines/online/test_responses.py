@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icrl4aht_baselines.evaluate.protocols import bundled_tasks, test_tasks
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks
+from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
 from icrl4aht_baselines.online.adaptation import HeadroomJob, headroom_jobs, headroom_table, write_headroom
 from icrl4aht_baselines.online.responses import (
     ResponseJob,
@@ -18,16 +19,17 @@ from icrl4aht_baselines.online.responses import (
     write_responses,
 )
 
+from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.errors import OptionError
 
 TINY = ResponseOptions(steps=400, tasks=4)
-DEMO = test_tasks("teammate", "demo_wide")
+DEMO = tasks_of("teammate", "demo_wide")
 
 
 def test_tasks_with_headroom():
     """Test cells count as measured, validation tasks as their draws were."""
-    flat = {task.layout.name for task in test_tasks("teammate")} - {
-        task.layout.name for task in with_headroom(test_tasks("teammate"))
+    flat = {task.layout.name for task in tasks_of("teammate")} - {
+        task.layout.name for task in with_headroom(tasks_of("teammate"))
     }
     assert flat == {"coord_simple", "test_simple"}
     validation = bundled_tasks("teammate", "validation")
@@ -35,12 +37,9 @@ def test_tasks_with_headroom():
 
 
 def test_teammates_that_act_alike_share_a_best_response():
-    """H4's instances are one behaviour on demo_wide, H3's are five."""
-    sizes = {
-        family: [len(one.tasks) for one in find_behaviours(test_tasks("teammate", "demo_wide", family))]
-        for family in ("H3", "H4")
-    }
-    assert sizes == {"H3": [1] * 5, "H4": [5]}
+    """H4's instances are one behaviour on test_wide, H3's are five."""
+    tasks = [task for family in ("H3", "H4") for task in tasks_of("teammate", "test_wide", family)]
+    assert [len(one.tasks) for one in find_behaviours(tasks)] == [1] * 5 + [5]
 
 
 def finished(job, choice: float, earned: float, slope: float = 0.0) -> None:
@@ -58,11 +57,16 @@ def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
     finished(jobs[0], choice=10.0, earned=9.0)
     finished(jobs[1], choice=8.0, earned=20.0)
     entry = best_of(jobs[:2])
-    assert (entry["best"], entry["agent"]) == (9.0, "best response, seed 0")
-    assert [one["acting"] for one in entry["seeds"]] == ["greedy"] * 2
-    path = write_responses(jobs, tmp_path)
-    card = json.loads(path.read_text())
-    assert [(one["tasks"], len(one["seeds"])) for one in card["behaviours"]] == [([DEMO[0].task_id], 2)]
+    assert (entry.best, entry.agent) == (9.0, "best response, seed 0")
+    assert [one.acting for one in entry.seeds] == ["greedy"] * 2
+    path = tmp_path / "responses.json"
+    write_responses(jobs[:1], path)
+    first = read_best_responses(path)
+    assert first.behaviours == (best_of(jobs[:1]),)
+    write_responses(jobs, path)
+    second = read_best_responses(path)
+    assert second.behaviours == (entry,)
+    assert second.version != first.version
     other = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
     assert not other.is_finished()  # a result of other settings
 
@@ -101,7 +105,7 @@ def test_tiny_trainings(tmp_path):
     before = (tmp_path / job.name / "result.json").read_bytes()
     job.run(lambda updates, speed: pytest.fail("trained again"))
     assert (tmp_path / job.name / "result.json").read_bytes() == before
-    tasks = {"all": [DEMO[0], DEMO[5], *test_tasks("teammate", "test_wide", "H1")[:1]]}
+    tasks = {"all": [DEMO[0], DEMO[5], *tasks_of("teammate", "test_wide", "H1")[:1]]}
     for other in headroom_jobs(tasks, 1, TINY, tmp_path):
         other.run()
         assert set(other.result()) == {task.task_id for task in tasks["all"]}
