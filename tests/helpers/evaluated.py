@@ -72,18 +72,26 @@ def write_measured(path: Path) -> Path:
 
 
 def write_results(
-    folder: Path, agent: str, curve: Sequence[float], track: str = "layout", seeds=(0, 1, 2), trained_on=(), offset=0.0
+    folder: Path,
+    agent: str,
+    curve: Sequence[float],
+    track: str = "layout",
+    seeds=(0, 1, 2),
+    trained_on=(),
+    offset=0.0,
+    **details,
 ) -> Path:
     """Write results of all test tasks of a track as `evaluate` does, the same curve of 100 returns for each seed.
 
     Args:
+        details: further details of the agent, such as `forget`.
         offset: added to the returns with the second teammate of a family, twice with the third, and so on.
     """
     settings = {"agent": agent, "seeds": [*seeds], "protocol": dataclasses.asdict(get_protocol("seeded"))}
-    details = {} if trained_on is None else {"details": {"trained_on": [*trained_on]}}
+    details |= {} if trained_on is None else {"trained_on": [*trained_on]}
     for task in TEST_TASKS:
         if task.track == track:
             values = [value + offset * task.teammate["theta_id"] for value in curve]
-            found = {**settings, "code_version": version("icrl4aht-data"), **details}
+            found = {**settings, "code_version": version("icrl4aht-data"), "details": details}
             write_result(folder, Result(task.task_id, found, [values] * len(seeds)))
     return folder

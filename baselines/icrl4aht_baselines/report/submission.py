@@ -32,6 +32,8 @@ SUBMITTED_PROTOCOL = "seeded"
 SUBMITTED_SEEDS = (0, 1, 2)
 """Seeds with which every task has to be played."""
 
+_MARKS = {"forgets": "forget", "swapped": "swapped"}  # controls among the details of results
+
 _Text = Annotated[str, Meta(min_length=1)]
 
 
@@ -204,6 +206,13 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
                 f"{where}: task {task} has {shape[0]} lists of {sorted(shape[1])} returns, expected "
                 f"{len(seeds)} of {rules.episodes}, one for each seed and episode; evaluate it again"
             )
+    details = one.settings.get("details", {})
+    marks = {control for control, mark in _MARKS.items() if details.get(mark)}
+    if marks != {one.control} - {""}:
+        raise OptionError(
+            f"{where}: results of {' and '.join(sorted(marks)) or 'no control'}, expected "
+            f"{one.control or 'no control'}; give the folder that `evaluate --controls` wrote"
+        )
     if None in find_seen(one.settings, None, where).values():
         raise OptionError(
             f"{where}: no declaration of the training data; give `evaluate` details={{'{TRAINED_ON}': [...]}}, an "

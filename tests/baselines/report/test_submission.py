@@ -34,7 +34,7 @@ def submitted(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("submitted")
     write_results(folder / "one", "rule", CURVE)
     write_results(folder / "two", "rule", CURVE, trained_on=[{"layout": "asymm_both", "family": "H1"}])
-    write_results(folder / "two" / "forgets", "rule (forgets)", [0.0] * 100)
+    write_results(folder / "two" / "forgets", "rule (forgets)", [0.0] * 100, forget=True)
     write_submission(folder / "rule.json", make_submission([folder / "one", folder / "two"], FACTS))
     return folder / "rule.json"
 
@@ -78,8 +78,9 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one["settings"].pop("protocol"), "settings without 'protocol'"),
         (lambda c, one, task: one.update(control="swap"), "control 'swap', expected forgets or swapped"),
         (lambda c, one, task: c["evaluations"].append(one), "results of a task twice"),
-        (lambda c, one, task: [each.update(control="forgets", training=n) for n, each in enumerate(c["evaluations"])],
-         "only controls"),
+        (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "only controls"),
+        (lambda c, one, task: one["settings"]["details"].update(forget=True), "results of forgets, expected no control"),
+        (lambda c, one, task: c["evaluations"][2]["settings"]["details"].clear(), "of no control, expected forgets"),
         (lambda c, one, task: c.update(colour="red"), "not a file of results: Object contains unknown field `colour`"),
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
     ],
