@@ -162,15 +162,18 @@ def track_layouts(track: str, split: str) -> tuple[str, ...]:
 
 
 def track_of(layout: str) -> str:
-    """Return the track whose layouts include `layout` (short name).
+    """Return the benchmark's track whose layouts include `layout` (short name).
+
+    A published layout without indicators counts like the published one, generated and registered layouts as "layout".
 
     Raises:
         UnknownNameError: if no track includes it.
     """
+    name = layout.removesuffix("_plain")
     for track, splits in TRACKS.items():
-        if any(layout in layouts for layouts in splits.values()):
+        if any(name in layouts for layouts in splits.values()):
             return track
-    if layout in further_layout_names():
+    if layout in (*further_layout_names(), *PREFERENCE_LAYOUTS["train"], *PREFERENCE_LAYOUTS["test"]):
         return "layout"
     raise unknown("layout", layout, (*LAYOUT_NAMES, *further_layout_names()))
 

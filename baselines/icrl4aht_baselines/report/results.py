@@ -31,7 +31,7 @@ from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tas
 from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import OVERLAPS, TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, TRACKS, family_order, layout_order, track_of
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE, TRACKS, family_order, layout_order, track_of
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
@@ -77,6 +77,8 @@ TASK_KINDS = {
     "held out": "Held-out tasks (split heldout): learned teammates that a suite keeps out of its training tasks. "
     "Where an agent was trained with one of them or with others of their algorithm, its score is marked. The paper "
     "gives these as a figure without numbers (App. F).",
+    PREFERENCE: "Tasks of the track preference, which is this project's own: the teammate wants one dish throughout, which "
+    "no observation shows. The paper has no numbers of them.",
     "own": "Own tasks: not among the published test tasks, so the paper has no numbers of them.",
 }
 """Kind of tasks -> explanation; "test" are the published test tasks."""
@@ -410,7 +412,7 @@ def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: s
             return {track: read_trained_on(entries[track], where) if track in entries else None for track in TRACKS}
         if TRAINED_ON in record:
             return {"": read_trained_on(entries, where)}
-    is_reference = settings["agent"] in REFERENCES and not details and trained is None
+    is_reference = settings["agent"] in (*REFERENCES, "search") and not details and trained is None
     return {"": SeenInTraining() if is_reference else None}
 
 
@@ -468,7 +470,9 @@ def published_instances(cell: ResultCell) -> int:
 def cell_of(task: Task) -> ResultCell:
     """Return the cell of a task."""
     kind = _KIND_OF_SPLIT[task.split]
-    if task.task_id in bundled_by_id("test"):
+    if task.track == PREFERENCE and task.split == "test":
+        kind = PREFERENCE
+    elif task.task_id in bundled_by_id("test"):
         kind = "test"
     elif task.task_id in bundled_by_id("diverse"):
         kind = "diverse"
