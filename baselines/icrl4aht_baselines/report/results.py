@@ -77,8 +77,8 @@ TASK_KINDS = {
     "held out": "Held-out tasks (split heldout): learned teammates that a suite keeps out of its training tasks. "
     "Where an agent was trained with one of them or with others of their algorithm, its score is marked. The paper "
     "gives these as a figure without numbers (App. F).",
-    PREFERENCE: "Tasks of the track preference, which is this project's own: the teammate wants one dish throughout, which "
-    "no observation shows. The paper has no numbers of them.",
+    PREFERENCE: "Tasks of the track preference, which is this project's own: the teammate wants one dish throughout, "
+    "and no observation shows which. The paper has no numbers of them.",
     "own": "Own tasks: not among the published test tasks, so the paper has no numbers of them.",
 }
 """Kind of tasks -> explanation; "test" are the published test tasks."""

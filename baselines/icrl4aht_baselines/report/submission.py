@@ -138,7 +138,8 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "")
             evaluations.append(Evaluation(control, training, settings | {"details": details}, returns))
     tracks: Any = [track for track in TRACKS if tasks & _track_tasks([track])]
     name = agent or evaluations[0].settings["agent"]
-    found = Submission(1, name, facts, read_best_responses().version, tracks or [*TRACKS], evaluations)
+    tracks = tracks or [*TRACKS]
+    found = Submission(1, name, facts, read_best_responses().version, tracks, evaluations)
     check_submission(found, ", ".join(map(str, folders)))
     return found
 
