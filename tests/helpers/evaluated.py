@@ -76,7 +76,6 @@ def write_results(
     agent: str,
     curve: Sequence[float],
     track: str = "layout",
-    seeds=(0, 1, 2),
     trained_on=(),
     offset=0.0,
     **details,
@@ -87,11 +86,11 @@ def write_results(
         details: further details of the agent, such as `forget`.
         offset: added to the returns with the second teammate of a family, twice with the third, and so on.
     """
-    settings = {"agent": agent, "seeds": [*seeds], "protocol": dataclasses.asdict(get_protocol("seeded"))}
+    settings = {"agent": agent, "seeds": [0, 1, 2], "protocol": dataclasses.asdict(get_protocol("seeded"))}
     details |= {} if trained_on is None else {"trained_on": [*trained_on]}
     for task in TEST_TASKS:
         if task.track == track:
             values = [value + offset * task.teammate["theta_id"] for value in curve]
             found = {**settings, "code_version": version("icrl4aht-data"), "details": details}
-            write_result(folder, Result(task.task_id, found, [values] * len(seeds)))
+            write_result(folder, Result(task.task_id, found, [values] * 3))
     return folder

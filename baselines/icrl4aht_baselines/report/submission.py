@@ -136,9 +136,8 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "")
             returns = {result.task_id: result.returns for result in results}
             tasks |= set() if control else returns.keys()
             evaluations.append(Evaluation(control, training, settings | {"details": details}, returns))
-    tracks: Any = [track for track in TRACKS if tasks & _track_tasks([track])]
+    tracks: Any = [track for track in TRACKS if tasks & _track_tasks([track])] or [*TRACKS]
     name = agent or evaluations[0].settings["agent"]
-    tracks = tracks or [*TRACKS]
     found = Submission(1, name, facts, read_best_responses().version, tracks, evaluations)
     check_submission(found, ", ".join(map(str, folders)))
     return found

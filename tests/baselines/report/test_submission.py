@@ -79,7 +79,7 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one.update(control="swap"), "control 'swap', expected forgets or swapped"),
         (lambda c, one, task: c["evaluations"].append(one), "results of a task twice"),
         (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "only controls"),
-        (lambda c, one, task: one["settings"]["details"].update(forget=True), "results of forgets, expected no control"),
+        (lambda c, one, task: one["settings"]["details"].update(forget=True), "of forgets, expected no control"),
         (lambda c, one, task: c["evaluations"][2]["settings"]["details"].clear(), "of no control, expected forgets"),
         (lambda c, one, task: c.update(colour="red"), "not a file of results: Object contains unknown field `colour`"),
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
