@@ -287,7 +287,7 @@ def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
 )
 @overwrite_option
 def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
-    """Write the manifests of test, validation, diverse and preference tasks.
+    """Write the manifests of all tasks in the package.
 
     Makes TRACK_test.jsonl from the published parameter sets, and TRACK_validation.jsonl, TRACK_diverse_train.jsonl and
     TRACK_diverse_validation.jsonl from the drawn teammates that `draws` measured, and those of the track preference.

@@ -212,5 +212,6 @@ def check_membership(track: Any, split: Any, layout: Any) -> None:
     """
     check_choice("track", track, ALL_TRACKS)
     check_choice("split", split, SPLITS)
-    if layout not in (names := track_layouts(track, split)):
+    published = TRACKS.get(track, {}).get(split, ())
+    if layout not in published and layout not in (names := track_layouts(track, split)):
         raise unknown(f"layout of the {split} split of track {track}", layout, names)

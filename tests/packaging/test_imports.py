@@ -20,14 +20,14 @@ ORDER = {
     "": "icrl4aht_data icrl4aht_generation icrl4aht_baselines benchmarks tests",
     "icrl4aht_data": "errors utils overcooked benchmark format plotting clients fetch download reading sampling "
     "environments dataset interop writing checking publishing browsing commands",
-    "icrl4aht_generation": "plotting policy env paths learners experts layouts teammates profiles collection adapters "
-    "populations releases planning verbs commands",
+    "icrl4aht_generation": "plotting policy env paths learners jobs experts layouts teammates profiles collection "
+    "adapters populations releases planning verbs commands",
     "icrl4aht_baselines": "plotting methods training agents evaluate online control report experiments reference demo "
     "commands",
 }
 """Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""
 
-BASELINES_MAY_USE = {"env", "policy", "teammates", "learners", "experts", "layouts", "collection", "profiles"}
+BASELINES_MAY_USE = {"env", "policy", "teammates", "learners", "experts", "layouts", "collection", "profiles", "jobs"}
 """Parts of `icrl4aht_generation` that trainers and evaluators need; the others serve only a rebuild."""
 
 JAX = {"jax", "jaxlib", "flax", "optax"}

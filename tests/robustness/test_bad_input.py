@@ -46,7 +46,10 @@ def read_all(root):
         ({"layout": "demo_wied"}, r"unknown layout 'demo_wied'; valid: coord_simple, .*Did you mean 'demo_wide'\?"),
         ({"split": "valid"}, r"unknown split 'valid'; valid: train, validation, test"),
         ({"teammate_family": "H5"}, r"unknown teammate_family 'H5'; valid: rl, H1, H2, H3, H4"),
-        ({"track": "teammates"}, r"unknown track 'teammates'; valid: teammate, layout\. Did you mean 'teammate'\?"),
+        (
+            {"track": "teammates"},
+            r"unknown track 'teammates'; valid: teammate, .*\. Did you mean 'teammate'\?",
+        ),
         ({"teammate_kind": "greedy"}, r"unknown teammate_kind 'greedy'; valid: utility_greedy\. Did you mean"),
         ({"task_id": "nothing"}, r"unknown task_id 'nothing'; valid: teammate_train_"),
         ({"obs": "float16"}, r"unknown obs 'float16'; valid: float32, uint8, state"),

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 from icrl4aht_generation.experts.oracle import oracle
-from icrl4aht_generation.experts.search import search
+from icrl4aht_generation.experts.search import searcher
 from icrl4aht_generation.policy import Policy
 
 from icrl4aht_baselines.agents.bundled import bundled_models
@@ -99,10 +99,10 @@ def random(layout: Layout) -> Policy:
     return Policy((), _no_memory, _act_randomly, "situation")
 
 
-AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle, "search": search}
+AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random, "oracle": oracle, "search": searcher}
 """Reference egos: name -> function from a layout to the policy."""
 
-SCRIPTED: tuple[Callable[..., Policy], ...] = (oracle, search)
+SCRIPTED: tuple[Callable[..., Policy], ...] = (oracle, searcher)
 """Reference egos whose parameters are facts of the layouts; their functions also take several layouts."""
 
 

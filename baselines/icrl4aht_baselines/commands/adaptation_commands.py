@@ -117,7 +117,7 @@ def best_response_command(
     from rich.console import Console
 
     from icrl4aht_baselines.online.responses import (
-        RESPONSES,
+        RESPONSES_FILE,
         ResponseJob,
         ResponseOptions,
         find_behaviours,
@@ -135,7 +135,7 @@ def best_response_command(
     try:
         run_jobs(jobs, out, console, options, ResponseJob.finished_text)
     finally:
-        for path in (out / RESPONSES, best_responses_file())[: 1 + bundle]:
+        for path in (out / RESPONSES_FILE, best_responses_file())[: 1 + bundle]:
             write_responses(jobs, path)
             console.print(f"wrote {path}")
 
@@ -183,7 +183,7 @@ def adaptation_headroom_command(
     from icrl4aht_generation.jobs.queue import run_jobs
     from rich.console import Console
 
-    from icrl4aht_baselines.online.adaptation import headroom_jobs, headroom_table, write_headroom
+    from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
     from icrl4aht_baselines.online.responses import ResponseOptions
 
     chosen = _chosen_tasks(track, splits, layouts, families, manifest)
@@ -195,5 +195,5 @@ def adaptation_headroom_command(
     jobs = headroom_jobs(sets, seeds, settings, out)
     run_jobs(jobs, out, console, options)
     for folder in (out, best_responses_file().parent)[: 1 + bundle]:
-        console.print(f"wrote {write_headroom(jobs, folder)}")
-    click.echo(headroom_table(out))
+        console.print(f"wrote {write_adaptation(jobs, folder)}")
+    click.echo(adaptation_table(out))

@@ -25,7 +25,7 @@ from icrl4aht_generation.teammates.registry import build_teammate, check_theta
 
 from icrl4aht_baselines.agents.egos import SCRIPTED
 from icrl4aht_baselines.agents.host import HostPolicy
-from icrl4aht_baselines.evaluate.programs import Episode, Programs
+from icrl4aht_baselines.evaluate.programs import EpisodeProgram, Programs
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.evaluate.results import Result, find_results, write_result
 from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutState, task_key
@@ -244,7 +244,7 @@ class PreparedRollout(NamedTuple):
 
     rollout: EvaluationRollout
     state: RolloutState
-    episode: Episode
+    episode: EpisodeProgram
 
 
 def prepare_rollout(

@@ -16,7 +16,7 @@ from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout,
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout
 
-Episode = Callable[..., tuple[RolloutState, EpisodeBatch]]
+EpisodeProgram = Callable[..., tuple[RolloutState, EpisodeBatch]]
 """Compiled `EvaluationRollout.episode`."""
 
 
@@ -27,13 +27,13 @@ class Programs:
     """
 
     def __init__(self) -> None:
-        self._found: dict[Any, Future[Episode]] = {}
+        self._found: dict[Any, Future[EpisodeProgram]] = {}
         self._lock = Lock()
 
     def __len__(self) -> int:
         return len(self._found)
 
-    def episode(self, rollout: EvaluationRollout, state: RolloutState) -> Episode:
+    def episode(self, rollout: EvaluationRollout, state: RolloutState) -> EpisodeProgram:
         """Return the compiled episode of a rollout.
 
         Args:
@@ -63,7 +63,7 @@ class Programs:
         return found.result()
 
 
-def _compile(rollout: EvaluationRollout, arguments: tuple[Any, Any, RolloutState]) -> Episode:
+def _compile(rollout: EvaluationRollout, arguments: tuple[Any, Any, RolloutState]) -> EpisodeProgram:
     _check_actions(rollout, arguments[-1])
     episode = jax.jit(rollout.episode)
     return episode if isinstance(rollout.ego, HostPolicy) else episode.lower(*arguments).compile()

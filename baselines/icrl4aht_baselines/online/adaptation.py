@@ -30,8 +30,8 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.templates import markdown_table
 
-Kind = Literal["informed", "episodic"]
-KINDS: tuple[Kind, ...] = ("informed", "episodic")
+EgoKind = Literal["informed", "episodic"]
+EGO_KINDS: tuple[EgoKind, ...] = ("informed", "episodic")
 
 MEASURED_EPISODES = 100
 """Episodes of each running task over which the return of a trained ego is measured."""
@@ -58,7 +58,7 @@ class HeadroomJob:
 
     title: str
     tasks: tuple[Task, ...]
-    kind: Kind
+    kind: EgoKind
     seed: int
     options: ResponseOptions
     out: Path
@@ -167,7 +167,7 @@ def headroom_jobs(
         HeadroomJob(title, tuple(tasks), kind, seed, options, out)
         for seed in range(seeds)
         for title, tasks in sets.items()
-        for kind in KINDS
+        for kind in EGO_KINDS
     ]
 
 
@@ -176,14 +176,14 @@ def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any]:
     own = [job for job in jobs if job.title == title and job.is_finished()]
     returns = {
         kind: {str(job.seed): round(float(np.mean(list(job.result().values()))), 3) for job in own if job.kind == kind}
-        for kind in KINDS
+        for kind in EGO_KINDS
     }
     by_task = {
         kind: {
             task.task_id: round(float(np.mean([job.result()[task.task_id] for job in own if job.kind == kind])), 2)
             for task in own[0].tasks
         }
-        for kind in KINDS
+        for kind in EGO_KINDS
     }
     steps = own[0].options.updates * own[0].options.tasks * KEPT_STEPS
     return {"tasks": title, "steps": steps, "returns": returns, "by_task": by_task}
@@ -193,30 +193,30 @@ ADAPTATION = "adaptation.json"
 """Name of the file of measured sets of tasks, in a folder of trainings and among the package's cards."""
 
 
-def write_headroom(jobs: Sequence[HeadroomJob], folder: Path) -> Path:
+def write_adaptation(jobs: Sequence[HeadroomJob], folder: Path) -> Path:
     """Add the measurements of finished jobs to a folder's `ADAPTATION`; those of the same sets are replaced."""
     path = folder / ADAPTATION
-    known = {entry["tasks"]: entry for entry in read_headroom(folder)}
+    known = {entry["tasks"]: entry for entry in read_adaptation(folder)}
     known |= {title: headroom_entry(title, jobs) for title in dict.fromkeys(job.title for job in jobs)}
     with atomic_write(path) as partial:
         write_json(partial, list(known.values()))
     return path
 
 
-def read_headroom(folder: Path) -> list[dict[str, Any]]:
+def read_adaptation(folder: Path) -> list[dict[str, Any]]:
     """Return the measured sets of tasks of a folder; none if there is no such file."""
     path = folder / ADAPTATION
     return parse_json(read_text(path)) if path.is_file() else []
 
 
-def headroom_table(folder: Path) -> str:
+def adaptation_table(folder: Path) -> str:
     """Return a Markdown table of the measured sets: returns of both egos, and their difference with its 95 % interval.
 
     The interval is Student's over the seeds, which trained both egos; without a second seed there is none.
     """
     rows = []
-    for entry in read_headroom(folder):
-        returns = [entry["returns"][kind] for kind in KINDS]
+    for entry in read_adaptation(folder):
+        returns = [entry["returns"][kind] for kind in EGO_KINDS]
         seeds = sorted(returns[0].keys() & returns[1].keys())
         differences = np.array([returns[0][seed] - returns[1][seed] for seed in seeds])
         half = 0.0
@@ -227,4 +227,4 @@ def headroom_table(folder: Path) -> str:
         interval = f" ({mean - half:+.1f} to {mean + half:+.1f})" if half else ""
         means = [f"{np.mean([of[seed] for seed in seeds]):.1f}" for of in returns]
         rows.append([entry["tasks"], *means, f"{mean:+.1f}{interval}", str(len(seeds)), f"{entry['steps']:,}"])
-    return markdown_table(["tasks", *KINDS, "difference", "seeds", "steps of each"], rows, right=5)
+    return markdown_table(["tasks", *EGO_KINDS, "difference", "seeds", "steps of each"], rows, right=5)

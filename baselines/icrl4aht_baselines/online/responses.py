@@ -56,7 +56,7 @@ PROTOCOL = "seeded"
 CHOICE_SEEDS, REPORT_SEEDS = (1000,), (0, 1, 2)
 """Seeds of the episodes by which the best one of several trainings is chosen, and of those that are reported."""
 
-RESPONSES = "best_responses.json"
+RESPONSES_FILE = "best_responses.json"
 """Name of the file of best responses, in a folder of trainings and among the package's cards."""
 
 RESULT = "result.json"

@@ -3,10 +3,10 @@
 A table of results is a data frame with a row for each task, seed and block of episodes:
 
     agent, training     name of the agent; number of its training, for several with different seeds
-    protocol, control   name of the protocol; one of `CONTROLS`
+    protocol, control   name of the protocol; empty, or one of `segments.CONTROLS`
     layout, family, kind    the cell of the task, see `ResultCell`
     overlap             overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
-    task, seed          key of the task, see `task_key`; seed
+    task, seed          key of the task, see `task_label`; seed
     block, return       one of `BLOCKS`; mean return of the team in its episodes
 
 Tasks of different kinds never share a cell, since the paper's numbers are of published test tasks.
@@ -53,13 +53,6 @@ BLOCKS = {"all": (0, None), "1": (0, 1), "2-5": (1, 5), "6-20": (5, 20), "21-100
 
 EPISODE_BLOCKS = ("1", "2-5", "6-20", "21-100")
 """The blocks that tables show side by side."""
-
-CONTROLS = {
-    "": "the agent",
-    "forgets": "the agent with its memory cleared before each episode",
-    "swapped": "the agent with a context of another teammate of the layout before the last 20 episodes",
-}
-"""Control, a folder in a folder of results -> what was evaluated."""
 
 CELL_COLUMNS = ["layout", "family", "kind"]
 AGENT_COLUMNS = ["agent", "training", "protocol", "control"]
@@ -153,7 +146,7 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
     return {cell: found[cell] for cell in in_order(found)}
 
 
-def task_key(task_id: str) -> str:
+def task_label(task_id: str) -> str:
     """Return the teammate's number and the hash at the end of a task id, such as "t0-9bc579c9"."""
     _, number, _, digest = task_id.rsplit("_", 3)
     return f"{number}-{digest}"
@@ -393,7 +386,7 @@ def as_run(
         of_cell, track = tuple(task for task, _ in played[cell]), "" if "" in seen else track_of(cell.layout)
         returns = np.array([of_task for _, of_task in played[cell]], np.float64)  # (tasks, seeds, episodes)
         cells[cell], tracks[track][cell] = returns.mean(axis=1), of_cell
-        overlaps, names = find_overlaps(of_cell, seen[track]), [task_key(task.task_id) for task in of_cell]
+        overlaps, names = find_overlaps(of_cell, seen[track]), [task_label(task.task_id) for task in of_cell]
         rows += cell_rows((agent[0], 0, agent[1], ""), cell, returns, overlaps, names, seeds)
     sources = tuple(ResultSource(where, settings, trained, own, seen[track]) for track, own in tracks.items())
     variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)

@@ -22,7 +22,7 @@ from icrl4aht_baselines.report.results import (
     ResultCell,
     bundled_cells,
     in_order,
-    task_key,
+    task_label,
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, Stratum, interquartile_mean, ratio_interval
 from icrl4aht_data.benchmark.best_responses import best_responses
@@ -47,7 +47,7 @@ class CellScale(NamedTuple):
     """Scales of the tasks of a cell that have a best response.
 
     Attributes:
-        tasks: key of a task -> its scale, see `results.task_key`.
+        tasks: key of a task -> its scale, see `results.task_label`.
     """
 
     tasks: Mapping[str, TaskScale]
@@ -80,7 +80,7 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
     for cell, tasks in bundled_cells().items() if measured else ():
         known = [task for task in tasks if task in measured and task in stays]
         if known:
-            scales = {task_key(task): TaskScale(stays[task], measured[task].best, names[task]) for task in known}
+            scales = {task_label(task): TaskScale(stays[task], measured[task].best, names[task]) for task in known}
             found[cell] = CellScale(scales)
     return found
 

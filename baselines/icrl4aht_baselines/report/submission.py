@@ -18,7 +18,8 @@ from msgspec import Meta
 
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.results import RESULTS, Result
-from icrl4aht_baselines.report.results import CONTROLS, EvaluationRun, as_run, find_seen, read_results
+from icrl4aht_baselines.evaluate.segments import CONTROLS
+from icrl4aht_baselines.report.results import EvaluationRun, as_run, find_seen, read_results
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -63,7 +64,7 @@ class Evaluation(msgspec.Struct, forbid_unknown_fields=True):
     """Results of a folder that `evaluate` made.
 
     Attributes:
-        control: empty, or the control, see `results.CONTROLS`.
+        control: empty, or the control, see `segments.CONTROLS`.
         training: number of the agent's training, for several with different seeds.
         settings: settings of the results, see `evaluate.results.Result`, with `trained_on` among the details.
         returns: task id -> return of each episode, one list per seed.
@@ -114,7 +115,7 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "")
     counts: dict[str, Counter[str]] = defaultdict(Counter)  # control -> task -> trainings so far
     evaluations, tasks = [], set()
     for folder in folders:
-        for control in CONTROLS:
+        for control in ("", *CONTROLS):
             source = folder / control
             if control and not (source / RESULTS).is_dir():
                 continue
@@ -164,8 +165,8 @@ def check_submission(found: Submission, where: str) -> None:
     played: dict[tuple[str, int], list[str]] = defaultdict(list)
     for one in found.evaluations:
         part = f"{where}: {one.control or found.agent}, training {one.training}"
-        if one.control not in CONTROLS:
-            raise OptionError(f"{part}: control {one.control!r}, expected {' or '.join(filter(None, CONTROLS))}")
+        if one.control not in ("", *CONTROLS):
+            raise OptionError(f"{part}: control {one.control!r}, expected {' or '.join(CONTROLS)}")
         _check_evaluation(one, part)
         played[one.control, one.training] += one.returns
     expected = _track_tasks(found.tracks)

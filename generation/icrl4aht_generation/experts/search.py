@@ -49,7 +49,7 @@ class SearchMemory(NamedTuple):
     belief: Int[Array, ""]
 
 
-def search(layouts: Layout | Sequence[Layout]) -> Policy:
+def searcher(layouts: Layout | Sequence[Layout]) -> Policy:
     """Return the scripted ego for one layout or several, in the order of their numbers in the environment."""
     known = [layouts] if isinstance(layouts, Layout) else list(layouts)
     dishes = [possible_recipes(layout) for layout in known]

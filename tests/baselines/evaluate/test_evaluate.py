@@ -237,7 +237,7 @@ def test_unusable_teammates_are_refused_before_evaluation(tmp_path):
 def test_unknown_names():
     with pytest.raises(UnknownNameError, match=r"unknown agent 'rnadom'; valid: .*Did you mean 'random'\?"):
         find_agent("rnadom")
-    with pytest.raises(UnknownNameError, match=r"oracle, ad-reference, .*\. A trained model is named by its folder"):
+    with pytest.raises(UnknownNameError, match=r"search, ad-reference, .*\. A trained model is named by its folder"):
         find_agent("runs/ad")  # no name is close enough to suggest
     with pytest.raises(UnknownNameError, match=r"unknown protocol 'publish'; valid: published, seeded"):
         get_protocol("publish")

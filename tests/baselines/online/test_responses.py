@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
-from icrl4aht_baselines.online.adaptation import HeadroomJob, headroom_jobs, headroom_table, write_headroom
+from icrl4aht_baselines.online.adaptation import HeadroomJob, adaptation_table, headroom_jobs, write_adaptation
 from icrl4aht_baselines.online.responses import (
+    Behaviour,
     ResponseJob,
     ResponseOptions,
     best_of,
@@ -36,6 +37,7 @@ def test_tasks_with_headroom():
     assert 0 < len(with_headroom(validation)) < len(validation)
 
 
+@pytest.mark.slow
 def test_teammates_that_act_alike_share_a_best_response():
     """H4's instances are one behaviour on test_wide, H3's are five."""
     tasks = [task for family in ("H3", "H4") for task in tasks_of("teammate", "test_wide", family)]
@@ -51,7 +53,7 @@ def finished(job, choice: float, earned: float, slope: float = 0.0) -> None:
 
 
 def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
-    (behaviour,) = find_behaviours(DEMO[:1])
+    behaviour = Behaviour((DEMO[0],))
     jobs = [ResponseJob(behaviour, seed, TINY, tmp_path) for seed in range(3)]
     assert not any(job.is_finished() for job in jobs)
     finished(jobs[0], choice=10.0, earned=9.0)
@@ -81,8 +83,8 @@ def test_table_of_the_adaptation_headroom(tmp_path):
         result = {"settings": job.settings, "returns": of_task}
         (tmp_path / job.name / "result.json").write_text(json.dumps(result))
         assert job.is_finished()
-    write_headroom(jobs, tmp_path)
-    assert headroom_table(tmp_path).splitlines()[-1] == "| demo_wide | 10.5 | 5.5 | +5.0 (-7.7 to +17.7) | 2 | 400 |"
+    write_adaptation(jobs, tmp_path)
+    assert adaptation_table(tmp_path).splitlines()[-1] == "| demo_wide | 10.5 | 5.5 | +5.0 (-7.7 to +17.7) | 2 | 400 |"
 
 
 def test_every_task_must_be_played(tmp_path):
@@ -94,7 +96,7 @@ def test_every_task_must_be_played(tmp_path):
 def test_tiny_trainings(tmp_path):
     """A best response on one task from a bundled model, and both egos on two layouts and families; a second call does
     nothing."""
-    (behaviour,) = find_behaviours(DEMO[:1])
+    behaviour = Behaviour((DEMO[0],))
     job = ResponseJob(behaviour, 0, replace(TINY, init="rl2-reference"), tmp_path)
     calls = []
     job.run(lambda updates, speed: calls.append(updates))
@@ -109,4 +111,4 @@ def test_tiny_trainings(tmp_path):
     for other in headroom_jobs(tasks, 1, TINY, tmp_path):
         other.run()
         assert set(other.result()) == {task.task_id for task in tasks["all"]}
-    assert "| all |" in headroom_table(write_headroom(headroom_jobs(tasks, 1, TINY, tmp_path), tmp_path).parent)
+    assert "| all |" in adaptation_table(write_adaptation(headroom_jobs(tasks, 1, TINY, tmp_path), tmp_path).parent)

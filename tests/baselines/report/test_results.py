@@ -12,7 +12,7 @@ from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.report import merge, rows
 from icrl4aht_baselines.report.figures import split_cells
-from icrl4aht_baselines.report.results import BLOCKS, ResultCell, as_run, cell_of, episode_blocks, task_key
+from icrl4aht_baselines.report.results import BLOCKS, ResultCell, as_run, cell_of, episode_blocks, task_label
 from icrl4aht_baselines.training.seen import OVERLAPS
 
 from icrl4aht_data.benchmark.tasks import Task, make_task, teammate_id
@@ -51,9 +51,9 @@ def test_a_table_has_a_row_for_each_task_seed_and_block():
     np.testing.assert_array_equal(run.cells[cell], [[0.5, 1, 1.5, 2.5, 4], [15.0] * 5])
     found = run.table.set_index(["task", "seed", "block"])["return"].sort_index()
     assert len(found) == 2 * 2 * 3, "blocks of 5 episodes"
-    assert found.xs((task_key(tasks[0].task_id), 3)).to_dict() == {"all": 3.8, "1": 1.0, "2-5": 4.5}
+    assert found.xs((task_label(tasks[0].task_id), 3)).to_dict() == {"all": 3.8, "1": 1.0, "2-5": 4.5}
     of = run.returns[cell]
-    assert (of.tasks, of.seeds) == (tuple(task_key(task.task_id) for task in tasks), (3, 4))
+    assert (of.tasks, of.seeds) == (tuple(task_label(task.task_id) for task in tasks), (3, 4))
     np.testing.assert_array_equal(of.blocks["all"], [[[3.8, 0.0], [10.0, 20.0]]])
     assert set(run.table["overlap"]) == {"unknown"}
     with pytest.raises(OptionError, match="results of different settings in one run"):

@@ -14,7 +14,7 @@ from icrl4aht_baselines.report.results import (
     bundled_cells,
     published_cells,
     read_published,
-    task_key,
+    task_label,
 )
 from icrl4aht_baselines.report.scores import (
     CellScale,
@@ -106,7 +106,7 @@ def test_scales_have_the_tasks_with_a_best_response(measured):
     assert len(open_cells(scales)) == 20 and RING in open_cells(scales) and cell_scales("published") == {}
     assert all(len(scale.tasks) == 5 for scale in scales.values())
     assert len({task.behaviour for task in scales[ResultCell("demo_wide", "H4")].tasks.values()}) == 1
-    assert {*scales[WIDE].tasks} == {task_key(task) for task in bundled_cells()[WIDE]}
+    assert {*scales[WIDE].tasks} == {task_label(task) for task in bundled_cells()[WIDE]}
 
 
 def test_damaged_best_responses(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from icrl4aht_baselines.agents.egos import oracle
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
-from icrl4aht_generation.experts.search import search
+from icrl4aht_generation.experts.search import searcher
 from icrl4aht_generation.teammates.preference import WATCHER, all_dishes
 from icrl4aht_generation.teammates.registry import build_teammate
 
@@ -26,7 +26,7 @@ def played():
     layouts = [with_recipes(layout, (dish,)) for dish in all_dishes(layout)]
     tasks = len(layouts)
     found = {}
-    for name, make in (("search", search), ("oracle", oracle)):
+    for name, make in (("search", searcher), ("oracle", oracle)):
         mates = [build_teammate(None, WATCHER)] * tasks
         rollout = EvaluationRollout(layouts, make(layouts), mates, get_protocol("seeded"), np.arange(tasks))
         state = jax.jit(rollout.start)(jnp.stack([task_key(0, "one")] * tasks))

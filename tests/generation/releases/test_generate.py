@@ -113,7 +113,7 @@ def test_a_release_of_another_profile_is_not_replaced(built, tmp_path, monkeypat
     def never(*arguments):
         raise AssertionError("tasks were collected")
 
-    monkeypatch.setattr(build, "collect_tasks", never)
+    monkeypatch.setattr(build, "run_jobs", never)
     shutil.copytree(built / "a" / "lite", tmp_path / "lite")
     (tmp_path / "other.toml").write_text(TINY)
     with pytest.raises(OptionError, match="made with tiny, not with profile other, and is not replaced; move it away"):

@@ -51,9 +51,9 @@ def test_behaviours_are_numbered_in_order():
     assert group_behaviours(actions[:0]) == []
 
 
-def test_test_layouts_have_no_common_states():
-    with pytest.raises(UnknownNameError, match="unknown training layout 'asymm_right'"):
-        common_states(get_layout("asymm_right"))
+def test_other_layouts_have_no_common_states():
+    with pytest.raises(UnknownNameError, match="unknown layout 'asymm_both_plain'"):
+        common_states(get_layout("asymm_both_plain"))
 
 
 def count(params, key) -> jax.Array:

@@ -233,5 +233,5 @@ def test_cards_are_valid_to_the_hub(hub, published):
     teammate = fill_template("teammate.md", **dict.fromkeys([*names.split(), "return_of"], "fcp"))
     ModelCard(teammate).validate()
     names = re.findall(r"\$([a-z_]+)", card_file("baseline.md").read_text())
-    ModelCard(fill_template("baseline.md", **dict.fromkeys(names, "name"))).validate()
+    ModelCard(fill_template("baseline.md", **dict.fromkeys(names, "name") | {"datasets": ""})).validate()
     assert [request.path for request in hub.log] == ["/api/validate-yaml"] * 3
