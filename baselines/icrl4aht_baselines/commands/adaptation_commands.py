@@ -64,6 +64,20 @@ def _chosen_tasks(
     return chosen
 
 
+def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, float]]:
+    """Return model -> task id -> mean return, of the stored results of models on some tasks."""
+    from icrl4aht_baselines.report.comparison import read_stored, results_file
+    from icrl4aht_baselines.report.results import task_label
+
+    table, names = read_stored(results_file()).table, {task_label(task.task_id): task.task_id for task in tasks}
+    chosen = table[(table["protocol"] == protocol) & (table["control"] == "") & (table["block"] == "all")]
+    means = chosen[chosen["task"].isin(list(names))].groupby(["agent", "task"])["return"].mean()
+    found: dict[str, dict[str, float]] = defaultdict(dict)
+    for (agent, task), value in means.items():  # type: ignore[misc]
+        found[str(agent)][names[str(task)]] = float(value)
+    return found
+
+
 @click.command(
     "best-response",
     cls=TopicCommand,
@@ -109,14 +123,15 @@ def best_response_command(
 
     An ego with the benchmark's own view learns with one teammate alone, by PPO that imitates the oracle in its first
     half. Teammates that act alike share one. Tasks in which the oracle earns no more than `stay` are left out. The
-    best training is chosen on other episodes than those reported. Writes OUT/best_responses.json; finished trainings
-    are kept, stopped ones resume.
+    best training is chosen on other episodes than those reported; a stored model that earns more takes its place.
+    Writes OUT/best_responses.json; finished trainings are kept, stopped ones resume.
     """
     options = read_queue_options(queue)
     from icrl4aht_generation.jobs.queue import run_jobs
     from rich.console import Console
 
     from icrl4aht_baselines.online.responses import (
+        PROTOCOL,
         RESPONSES_FILE,
         ResponseJob,
         ResponseOptions,
@@ -136,7 +151,7 @@ def best_response_command(
         run_jobs(jobs, out, console, options, ResponseJob.finished_text)
     finally:
         for path in (out / RESPONSES_FILE, best_responses_file())[: 1 + bundle]:
-            write_responses(jobs, path)
+            write_responses(jobs, path, _model_returns(chosen, PROTOCOL))
             console.print(f"wrote {path}")
 
 

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.distances import act_along, common_states, group_behaviours
 from icrl4aht_generation.teammates.draws import find_draw
 from icrl4aht_generation.teammates.registry import build_teammate
-from msgspec import to_builtins
+from msgspec import structs, to_builtins
 
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import PlayMode, learned, with_view
@@ -314,10 +315,35 @@ def best_of(jobs: Sequence[ResponseJob]) -> BestResponse:
     )
 
 
-def write_responses(jobs: Sequence[ResponseJob], path: Path) -> None:
+def best_with_models(found: BestResponse, models: Mapping[str, Mapping[str, float]]) -> BestResponse:
+    """Return a best response, or the return of a model that earns more.
+
+    Args:
+        found: the best response.
+        models: model -> task id -> mean return; models without one of the behaviour's tasks do not count.
+    """
+    earned = {
+        name: float(np.mean([returns[task] for task in found.tasks]))
+        for name, returns in models.items()
+        if returns.keys() >= {*found.tasks}
+    }
+    name = max(earned, key=lambda name: earned[name], default=None)
+    if name is None or earned[name] <= found.best:
+        return found
+    return structs.replace(found, best=earned[name], agent=name)
+
+
+def write_responses(
+    jobs: Sequence[ResponseJob], path: Path, models: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+) -> None:
     """Add the best responses of finished trainings to a file, see `icrl4aht_data.benchmark.best_responses`.
 
     Those of the same tasks are replaced. The version is a hash of all of them.
+
+    Args:
+        jobs: the trainings.
+        path: the file.
+        models: returns of other models, see `best_with_models`.
     """
     finished: dict[str, list[ResponseJob]] = defaultdict(list)
     for job in jobs:
@@ -325,5 +351,6 @@ def write_responses(jobs: Sequence[ResponseJob], path: Path) -> None:
             finished[job.behaviour.tasks[0].task_id].append(job)
     known = {one.tasks[0]: one for one in (read_best_responses(path).behaviours if path.is_file() else ())}
     known |= {task: best_of(own) for task, own in finished.items()}
-    version = json_hash(to_builtins(tuple(known.values())))
-    write_best_responses(path, BestResponseCard(version, PROTOCOL, ABOUT, tuple(known.values())))
+    behaviours = tuple(best_with_models(one, models) for one in known.values())
+    card = BestResponseCard(json_hash(to_builtins(behaviours)), PROTOCOL, ABOUT, behaviours)
+    write_best_responses(path, card)

@@ -69,6 +69,10 @@ def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
     second = read_best_responses(path)
     assert second.behaviours == (entry,)
     assert second.version != first.version
+    models = {"better": {DEMO[0].task_id: 9.5}, "worse": {DEMO[0].task_id: 8.0}, "elsewhere": {"other": 50.0}}
+    write_responses(jobs, path, models)
+    (third,) = read_best_responses(path).behaviours
+    assert (third.best, third.agent, third.seeds) == (9.5, "better", entry.seeds)
     other = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
     assert not other.is_finished()  # a result of other settings
 
