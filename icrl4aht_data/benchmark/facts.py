@@ -39,17 +39,17 @@ docs/preference.md)."""
 PREFERENCE_LAYOUTS: dict[str, tuple[str, ...]] = {
     "train": (
         "asymm_both_plain",
-        "cramped_up_plain",
         "test_wide_plain",
-        "demo_wide_plain",
         "rooms-0-46",
         "rooms-0-271",
         "rooms-0-286",
+        "templates-0-46",
         "templates-0-164",
         "rooms-0-67",
         "rooms-0-202",
         "templates-0-38",
         "templates-0-60",
+        "templates-0-160",
     ),
     "test": (
         "cramped_down_plain",

@@ -80,13 +80,16 @@ def _act(params: Any, memory: SearchMemory, view: Situation, key: Key[Array, ""]
 def _learn(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"]) -> SearchMemory:
     """Return the memory updated by what happened in the previous step."""
     new, old = unpack(view.tables, view.record), unpack(view.tables, memory.oracle.record)
-    # A new episode empties hands, too, but seldom leaves an agent in the same pose in front of the goal.
+    # The first step of an episode shows no outcome. Its starts are drawn: seldom can both agents have walked there.
+    moves = jnp.asarray(view.tables.moves)[old.positions.astype(jnp.int32)]
+    follows = jnp.all(jnp.any(moves == new.positions[:, None], axis=1))
     ahead = jnp.asarray(view.tables.ahead)[old.positions.astype(jnp.int32), old.facings.astype(jnp.int32)]
     at_goal = jnp.asarray(view.tables.kinds)[ahead.astype(jnp.int32)] == GOAL
     same_pose = (new.positions == old.positions) & (new.facings == old.facings)
-    gave = (old.hands & COOKED > 0) & (new.hands == 0) & at_goal & same_pose
+    gave = (old.hands & COOKED > 0) & (new.hands == 0) & at_goal & same_pose & follows
     is_dish = (old.hands[:, None] == dishes | _FLAGS) & gave[:, None]  # (2, D)
-    paid = memory.paid | (is_dish.any(axis=0) & (new.delivered > 0))
+    # If both deliver in one step, the reward does not tell whose dish was right.
+    paid = memory.paid | (is_dish.any(axis=0) & (new.delivered > 0) & ~gave.all())
     refused = memory.refused | (is_dish[EGO] & (new.delivered == 0))
     # The teammate may know which dish it wants, so what it cooks is a hint, although it may err.
     had = old.hands[TEAMMATE]

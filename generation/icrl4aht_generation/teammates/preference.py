@@ -1,12 +1,13 @@
 """Tasks of the track `preference`: the teammate wants one dish throughout, and no observation shows which.
 
 The current recipe of a task is its dish in every episode, and only this dish is paid. The scripted teammates know it,
-as they know the recipe elsewhere; one of them only watches. The layouts have no recipe indicator, so an ego learns the
+as they know the recipe elsewhere. The layouts have no recipe indicator, so an ego learns the
 dish from what is paid, or from what its teammate cooks. Partners with hidden preferences are the field's own question:
 Yu et al. 2023 (HSP), and the biased partners of ZSC-Eval (Wang et al. 2024).
 
-Test tasks have published test teammates. Half of them are on layouts of training; the others are on layouts with rooms
-that no training layout has. Of ten dishes three are in test tasks only.
+Test tasks have published test teammates, and validation and test tasks also one that only watches. Half of the test
+tasks are on layouts of training; the others are on layouts with rooms that no training layout has. Of ten dishes three
+are in test tasks only.
 """
 
 from __future__ import annotations
@@ -67,11 +68,15 @@ def _pairs(layout: Layout, split: str, number: int, part: str) -> Iterator[tuple
         yield from ((dish, mates[(3 * k + number) % len(mates)]) for k, dish in enumerate(dishes * 4))
         return
     for k in range(_TEST_TASKS[part] if split == "test" else len(TESTED_FAMILIES)):
-        yield dishes[(k + number) % len(dishes)], mates[(6 * k + number) % len(mates)]
+        # Over the layouts every dish meets several families: their numbers modulo 5 run at different paces.
+        yield dishes[(3 * k + 7 * number) % len(dishes)], mates[(6 * k + number) % len(mates)]
 
 
 def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
-    """Return the teammates of a split on a layout, families in turn, the one that only watches after each round."""
+    """Return the teammates of a split on a layout, families in turn.
+
+    In validation and test, the one that only watches follows after each round.
+    """
     found = []
     for instance in range(INSTANCES):
         for family in TESTED_FAMILIES:
@@ -82,5 +87,5 @@ def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
             else:
                 entry = sample_teammate(family, instance, "diverse", _DRAWS[split])
             found.append(entry)
-        found.append(WATCHER)
+        found += [] if split == "train" else [WATCHER]
     return found
