@@ -133,7 +133,7 @@ def best_response_command(
     settings = [ResponseOptions(steps, tasks, init=None if init == "oracle" else init) for init in inits]
     jobs = [ResponseJob(one, seed, own, out) for seed in range(seeds) for own in settings for one in behaviours]
     try:
-        run_jobs(jobs, out, console, options, ResponseJob.finished_text)
+        run_jobs(jobs, out, console, options)
     finally:
         for path in (out / RESPONSES_FILE, best_responses_file())[: 1 + bundle]:
             write_responses(jobs, path)

@@ -268,27 +268,20 @@ def train_command(
     from icrl4aht_baselines.methods.registry import PLAYING
     from icrl4aht_baselines.training.histories import start_from
     from icrl4aht_baselines.training.run_folder import RUN_CURVES
-    from icrl4aht_baselines.training.trainer import format_loss
-    from icrl4aht_baselines.training.trainer import train as run_training
+    from icrl4aht_baselines.training.trainer import show_steps
 
     choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
     choice = replace_options(choice, histories)
-    folder, plays = out or Path("runs") / method, method in PLAYING
-    if plays and machines["processes"] > 1:
+    folder = out or Path("runs") / method
+    if method in PLAYING and machines["processes"] > 1:
         raise click.UsageError(f"--processes {machines['processes']}: {method} is trained by one process on one device")
-    job, options, description = shared.prepare_training(method, size, model, train, play, choice, manifests)
+    job, description = shared.prepare_training(method, size, model, train, play, choice, manifests)
     click.echo(description)
+    params, steps = None if init is None else start_from(init, job.method, job.about), job.options.steps
     with progress_bars(unit="steps") as show:
-
-        def done(step: int, loss: float | None) -> None:
-            show(method, step, options.steps, format_loss(loss))
-
-        watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "done": done}
-        watched |= {"trainer": job.trainer} if plays else {}
-        if init is not None:
-            watched["params"] = start_from(init, job.method, job.about)
-        run_training(job.method, job.data, options, folder, job.about, **watched)
-    trained = counted_noun(options.steps, "step")
+        watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "params": params}
+        job.train(folder, done=show_steps(show, method, steps), **watched)
+    trained = counted_noun(steps, "step")
     click.echo(f"{trained} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it")
     if not can_draw():
         click.echo(f"{RUN_CURVES} was not drawn, matplotlib is not installed: {install_command('plot')}")

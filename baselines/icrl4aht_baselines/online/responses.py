@@ -209,6 +209,10 @@ class TrainingJob:
             with atomic_write(self.folder / RESULT) as partial:
                 write_json(partial, content)
 
+    def finished_text(self) -> str:
+        """Return the text on the finished training."""
+        return "finished"
+
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
         """Train the ego, and return what was measured."""
         raise NotImplementedError
