@@ -89,7 +89,7 @@ def evaluate_command(
     ranges.
     """
     from icrl4aht_baselines.evaluate.controls import evaluate_controls
-    from icrl4aht_baselines.evaluate.evaluator import count_programs, evaluate
+    from icrl4aht_baselines.evaluate.evaluator import evaluate
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
     from icrl4aht_baselines.evaluate.segments import CONTROLS
     from icrl4aht_baselines.report.controls import control_lines
@@ -124,8 +124,7 @@ def evaluate_command(
     note_results(out, ego.run, chosen)
     for line in [*summary_lines([read_run(out)]), *lines]:
         click.echo(line)
-    programs = counted_noun(count_programs(ego.make, chosen), "compiled program")
-    click.echo(f"{counted_noun(len(chosen), 'result')} of {programs} in {out}; `icrl4aht-data report {out}` shows them")
+    click.echo(f"{counted_noun(len(chosen), 'result')} in {out}; `icrl4aht-data report {out}` shows them")
 
 
 @click.command("report")

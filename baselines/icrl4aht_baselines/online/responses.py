@@ -308,7 +308,7 @@ class ResponseJob(TrainingJob):
 
     def _mean_return(self, policy: Policy, seeds: Sequence[int]) -> float:
         # The memory is cleared before each episode, as it was in training.
-        played: dict[str, Any] = {"seeds": seeds, "control": "forgets", "done": lambda count: None}
+        played: dict[str, Any] = {"seeds": seeds, "control": "forgets", "played": lambda count: None}
         tasks = list(self.behaviour.tasks)
         results = evaluate("best response", lambda layout: policy, tasks, get_protocol(PROTOCOL), **played)
         return round(float(np.mean([result.returns for result in results])), 3)
