@@ -24,7 +24,7 @@ from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
 from icrl4aht_baselines.training.seen import overlap_legend
-from icrl4aht_baselines.training.trainer import format_loss, train
+from icrl4aht_baselines.training.trainer import show_steps
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.benchmark.tasks import Task
@@ -166,11 +166,7 @@ def _train_demo(folder: Path, settings: DemoSettings) -> None:
     histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=("noise",), labels="oracle")
     job = prepare("ad", settings.model, settings.training, histories)
     with progress_bars(unit="steps") as show:
-
-        def done(step: int, loss: float | None) -> None:
-            show("AD", step, job.options.steps, format_loss(loss))
-
-        train(job.method, job.data, job.options, folder, job.about, done=done)
+        job.train(folder, done=show_steps(show, "AD", job.options.steps))
 
 
 def _evaluate(name: str, out: Path, tasks: Sequence[Task], settings: DemoSettings) -> EvaluationRun:

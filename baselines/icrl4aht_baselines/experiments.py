@@ -26,9 +26,9 @@ from icrl4aht_baselines.methods.registry import get_method
 from icrl4aht_baselines.report.cards import write_model_cards
 from icrl4aht_baselines.report.page import report_files, write_page_with_episodes, write_report
 from icrl4aht_baselines.report.results import merge, note_results, read_run
-from icrl4aht_baselines.training.histories import TrainingTask, filter_histories, prepare
-from icrl4aht_baselines.training.options import ALL_LAYOUTS, SAVE_MINUTES, HistoryOptions, TrainOptions
-from icrl4aht_baselines.training.trainer import train
+from icrl4aht_baselines.training.histories import filter_histories, prepare
+from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, TrainOptions
+from icrl4aht_baselines.training.trainer import TrainingTask
 from icrl4aht_data.benchmark.facts import TESTED_ON, track_of
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
@@ -146,8 +146,6 @@ class ExperimentPlan:
         protocol: name of the evaluation protocol.
         acting: see `agents.egos.ACTING`; the experiment's by default.
         gifs: whether the page shows an episode per family.
-        tensorboard: whether training also writes a log for TensorBoard.
-        save_minutes: most minutes between checkpoints of a training.
     """
 
     methods: tuple[str, ...] = ()
@@ -169,8 +167,6 @@ class ExperimentPlan:
     protocol: str = "seeded"
     acting: Acting | None = None
     gifs: bool = True
-    tensorboard: bool = False
-    save_minutes: float = SAVE_MINUTES
 
 
 class ExperimentOutcome(NamedTuple):
@@ -224,7 +220,7 @@ def run_experiment(
     results = []
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout
-        _train_entry(_prepare_entry(method, entry, layout, plan), f"{entry.name} on {layout}", plan, folder, progress)
+        _train_entry(_prepare_entry(method, entry, layout, plan), f"{entry.name} on {layout}", folder, progress)
         _evaluate_entry(experiment, entry, tasks[layout], plan, folder, progress)
         results.append(folder / "results")
     runs = merge([read_run(folder) for folder in results])
@@ -368,15 +364,12 @@ def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: Exper
         raise
 
 
-def _train_entry(
-    job: TrainingTask, name: str, plan: ExperimentPlan, folder: Path, progress: ExperimentProgress
-) -> None:
+def _train_entry(job: TrainingTask, name: str, folder: Path, progress: ExperimentProgress) -> None:
     def done(step: int, loss: float | None) -> None:
         progress(f"{job.method.label} {name}: training steps", step, job.options.steps)
 
     done(0, None)
-    watched: Any = {"tensorboard": plan.tensorboard, "save_minutes": plan.save_minutes, "done": done}
-    train(job.method, job.data, job.options, folder / "run", job.about, **watched)
+    job.train(folder / "run", done=done)
     done(job.options.steps, None)
 
 

@@ -42,7 +42,7 @@ from icrl4aht_baselines.report.scores import known_headroom
 from icrl4aht_baselines.training.histories import prepare, start_from
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES
-from icrl4aht_baselines.training.trainer import format_loss, train
+from icrl4aht_baselines.training.trainer import show_steps
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
@@ -252,8 +252,7 @@ class _Steps:
         with self.timed(folder.name, was_done=_is_trained(folder, options)):
             model, play = ModelOptions(**recipe.model), PlayOptions(**TRACK_PLAY[self.track])
             job = prepare_play(recipe.method, model, options, play, choice, self.diverse_tasks())
-            done = self._progress(folder.name, options.steps)
-            train(job.method, job.data, options, folder, job.about, trainer=job.trainer, done=done)
+            job.train(folder, done=show_steps(self.show, folder.name, options.steps))
         return folder
 
     def teacher_histories(self, kind: str) -> Path:
@@ -276,8 +275,7 @@ class _Steps:
         with self.timed(folder.name, was_done=_is_trained(folder, options)):
             job = prepare(recipe.method, ModelOptions(**recipe.model), options, histories)
             params = start_from(before, job.method, job.about) if before else None
-            done = self._progress(folder.name, options.steps)
-            train(job.method, job.data, job.options, folder, job.about, params=params, done=done)
+            job.train(folder, params=params, done=show_steps(self.show, folder.name, options.steps))
 
     def add_own_histories(self, histories: Path, first: Path, run: Path) -> Path:
         """Record histories of a model that the teacher labels. Return the release of these and the given ones."""
@@ -321,9 +319,6 @@ class _Steps:
         if kind in VALIDATION_KINDS:
             return bundled_tasks(self.track, kind)
         return bundled_tasks(self.track, "test")
-
-    def _progress(self, what: str, steps: int) -> Callable[[int, float | None], None]:
-        return lambda step, loss: self.show(what, step, steps, format_loss(loss))
 
     @contextmanager
     def timed(self, part: str, was_done: bool = False) -> Iterator[None]:

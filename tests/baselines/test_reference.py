@@ -87,8 +87,11 @@ def steps(tmp_path, monkeypatch) -> list[tuple[str, ...]]:
     def note(what: str, *names: Any) -> None:
         taken.append((what, *(str(name).removeprefix(f"{tmp_path}/") for name in names)))
 
-    def train(method, data, options, folder, about, *, params=None, **rest):
-        note("train", folder, f"{options.learning_rate:g}", params)
+    def prepare(method, model, options, *rest):
+        def train(folder, *, params=None, **watched):
+            note("train", folder, f"{options.learning_rate:g}", params)
+
+        return SimpleNamespace(method=None, about=None, options=options, train=train)
 
     def collect(agent, teammates, noise, out, *, labeller=None, **rest):
         note("collect", agent, noise.episodes, out, labeller)
@@ -96,16 +99,12 @@ def steps(tmp_path, monkeypatch) -> list[tuple[str, ...]]:
     def combine(out, roots):
         note("combine", out, *roots)
 
-    job = SimpleNamespace(method=None, data=None, about=None, trainer=None)
-    monkeypatch.setattr(
-        reference, "prepare", lambda method, model, options, histories: SimpleNamespace(**vars(job), options=options)
-    )
-    monkeypatch.setattr(reference, "prepare_play", lambda *given: job)
+    for name in ("prepare", "prepare_play"):
+        monkeypatch.setattr(reference, name, prepare)
     monkeypatch.setattr(reference, "start_from", lambda before, *given: before.name)
     monkeypatch.setattr(reference, "find_agent", lambda name, **mode: Path(name).name)
     for name in ("load_icrl4aht", "release_teammates"):
         monkeypatch.setattr(reference, name, lambda *given, **options: None)
-    monkeypatch.setattr(reference, "train", train)
     monkeypatch.setattr(reference, "collect_release", collect)
     monkeypatch.setattr(reference, "combine_releases", combine)
     (tmp_path / "noise" / "lite").mkdir(parents=True)

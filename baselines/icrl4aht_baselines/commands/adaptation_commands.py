@@ -106,11 +106,6 @@ def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, floa
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/best-responses", help="Write trainings here.")
 @click.option("--bundle", is_flag=True, help="Also update best_responses.json of the package's cards.")
 def best_response_command(
-    track: tuple[str, ...],
-    splits: tuple[str, ...],
-    layouts: tuple[str, ...],
-    families: tuple[str, ...],
-    manifest: Path | None,
     seeds: int,
     steps: int,
     tasks: int,
@@ -118,6 +113,7 @@ def best_response_command(
     queue: dict[str, Any],
     out: Path,
     bundle: bool,
+    **choice: Any,
 ) -> None:
     """Train a best response to each teammate.
 
@@ -140,7 +136,7 @@ def best_response_command(
         write_responses,
     )
 
-    chosen = with_headroom(_chosen_tasks(track, splits, layouts, families, manifest))
+    chosen = with_headroom(_chosen_tasks(**choice))
     if not chosen:
         raise EmptySelectionError("none of these tasks has headroom; choose others")
     console, behaviours = Console(soft_wrap=True), find_behaviours(chosen)
@@ -148,7 +144,7 @@ def best_response_command(
     settings = [ResponseOptions(steps, tasks, init=None if init == "oracle" else init) for init in inits]
     jobs = [ResponseJob(one, seed, own, out) for seed in range(seeds) for own in settings for one in behaviours]
     try:
-        run_jobs(jobs, out, console, options, ResponseJob.finished_text)
+        run_jobs(jobs, out, console, options)
     finally:
         for path in (out / RESPONSES_FILE, best_responses_file())[: 1 + bundle]:
             write_responses(jobs, path, _model_returns(chosen, PROTOCOL))
@@ -175,11 +171,6 @@ def best_response_command(
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/adaptation", help="Write trainings here.")
 @click.option("--bundle", is_flag=True, help="Also update adaptation.json of the package's cards.")
 def adaptation_headroom_command(
-    track: tuple[str, ...],
-    splits: tuple[str, ...],
-    layouts: tuple[str, ...],
-    families: tuple[str, ...],
-    manifest: Path | None,
     together: bool,
     seeds: int,
     steps: int,
@@ -187,6 +178,7 @@ def adaptation_headroom_command(
     queue: dict[str, Any],
     out: Path,
     bundle: bool,
+    **choice: Any,
 ) -> None:
     """Measure what memory across episodes can earn at most.
 
@@ -201,13 +193,11 @@ def adaptation_headroom_command(
     from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
     from icrl4aht_baselines.online.responses import ResponseOptions
 
-    chosen = _chosen_tasks(track, splits, layouts, families, manifest)
     sets: dict[str, list[Task]] = defaultdict(list)
-    for task in chosen:
+    for task in _chosen_tasks(**choice):
         title = task.layout.name if task.recipes is None else f"{task.layout.name}-preference"
         sets["all" if together else title].append(task)
-    console, settings = Console(soft_wrap=True), ResponseOptions(steps, tasks)
-    jobs = headroom_jobs(sets, seeds, settings, out)
+    console, jobs = Console(soft_wrap=True), headroom_jobs(sets, seeds, ResponseOptions(steps, tasks), out)
     run_jobs(jobs, out, console, options)
     for folder in (out, best_responses_file().parent)[: 1 + bundle]:
         console.print(f"wrote {write_adaptation(jobs, folder)}")

@@ -131,7 +131,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:
         check_output(folder, overwrite=True, names=HEADROOM_FILES)
-    with progress_bars(unit="tasks") as show:
+    with progress_bars(unit="episodes") as show:
         runs = measure_headroom(out, protocol, show)
     for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
         click.echo(f"wrote {path}")

@@ -15,7 +15,6 @@ from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue
 from icrl4aht_data.commands.options import (
     COUNT,
-    COUNT_OR_NONE,
     LAYOUT,
     TRACK,
     Folder,
@@ -70,7 +69,6 @@ from icrl4aht_data.utils.progress import progress_bars
     help="Another agent, such as rl2-reference, whose most probable actions become the expert actions.",
 )
 @shared.manifests_option
-@click.option("--number", type=COUNT_OR_NONE, default=0, help="Number of this collection, in the tasks' seeds.")
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
 @overwrite_option
 def collect_command(
@@ -85,7 +83,6 @@ def collect_command(
     like: str | None,
     labeller: str | None,
     manifests: tuple[Path, ...],
-    number: int,
     out: Path,
     overwrite: bool,
 ) -> None:
@@ -110,7 +107,7 @@ def collect_command(
     names = [get_layout(name).name for name in layouts] or None
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
     tasks = [task for manifest in manifests for task in read_tasks(manifest)]
-    teammates = release_teammates(dataset, number, tasks)
+    teammates = release_teammates(dataset, tasks=tasks)
     with progress_bars(unit="episodes") as show:
         options: Any = {"labeller": other, "overwrite": overwrite, "progress": show}
         collect_release(ego, teammates, config, out, **options)

@@ -230,8 +230,8 @@ def prepare_training(
     play: dict[str, Any],
     histories: HistoryOptions,
     manifests: Sequence[Path] = (),
-) -> tuple[Any, TrainOptions, str]:
-    """Return a training, its options, and text that describes it.
+) -> tuple[Any, str]:
+    """Return a training, a `icrl4aht_baselines.training.trainer.TrainingTask`, and text that describes it.
 
     Args:
         method: its name.
@@ -263,7 +263,7 @@ def prepare_training(
             f"{', '.join(played['layouts'])}, canonical channels, with the teammates of {len(played['groups'])} "
             f"families and layouts"
         )
-        return job, options, text
+        return job, text
     if given := {*play, *(["manifest"] if manifests else [])}:
         raise click.UsageError(f"{_flags(given)}: not with {method}, only with rl2, which learns by playing")
     on_cpu = jax.default_backend() == "cpu"
@@ -277,7 +277,7 @@ def prepare_training(
         f"{sized.positions}, K = {options.context}, steps {options.steps}, batch size {options.batch_size}\n"
         f"{training_summary(job.about['histories'])}"
     )
-    return job, options, text
+    return job, text
 
 
 def check_alone(option: str, *others: str) -> None:
@@ -381,8 +381,6 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
         protocol_option,
         click.option("--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"),
         gifs_option,
-        save_minutes_option,
-        tensorboard_option,
         click.option("--out", type=Folder(), metavar="FOLDER", help="Write runs and report here.", show_default=out),
         dataclass_options(
             TrainOptions,

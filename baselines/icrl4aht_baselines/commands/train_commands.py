@@ -89,7 +89,7 @@ def evaluate_command(
     ranges.
     """
     from icrl4aht_baselines.evaluate.controls import evaluate_controls
-    from icrl4aht_baselines.evaluate.evaluator import count_programs, evaluate
+    from icrl4aht_baselines.evaluate.evaluator import evaluate
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
     from icrl4aht_baselines.evaluate.segments import CONTROLS
     from icrl4aht_baselines.report.controls import control_lines
@@ -124,8 +124,7 @@ def evaluate_command(
     note_results(out, ego.run, chosen)
     for line in [*summary_lines([read_run(out)]), *lines]:
         click.echo(line)
-    programs = counted_noun(count_programs(ego.make, chosen), "compiled program")
-    click.echo(f"{counted_noun(len(chosen), 'result')} of {programs} in {out}; `icrl4aht-data report {out}` shows them")
+    click.echo(f"{counted_noun(len(chosen), 'result')} in {out}; `icrl4aht-data report {out}` shows them")
 
 
 @click.command("report")
@@ -268,27 +267,20 @@ def train_command(
     from icrl4aht_baselines.methods.registry import PLAYING
     from icrl4aht_baselines.training.histories import start_from
     from icrl4aht_baselines.training.run_folder import RUN_CURVES
-    from icrl4aht_baselines.training.trainer import format_loss
-    from icrl4aht_baselines.training.trainer import train as run_training
+    from icrl4aht_baselines.training.trainer import show_steps
 
     choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
     choice = replace_options(choice, histories)
-    folder, plays = out or Path("runs") / method, method in PLAYING
-    if plays and machines["processes"] > 1:
+    folder = out or Path("runs") / method
+    if method in PLAYING and machines["processes"] > 1:
         raise click.UsageError(f"--processes {machines['processes']}: {method} is trained by one process on one device")
-    job, options, description = shared.prepare_training(method, size, model, train, play, choice, manifests)
+    job, description = shared.prepare_training(method, size, model, train, play, choice, manifests)
     click.echo(description)
+    params, steps = None if init is None else start_from(init, job.method, job.about), job.options.steps
     with progress_bars(unit="steps") as show:
-
-        def done(step: int, loss: float | None) -> None:
-            show(method, step, options.steps, format_loss(loss))
-
-        watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "done": done}
-        watched |= {"trainer": job.trainer} if plays else {}
-        if init is not None:
-            watched["params"] = start_from(init, job.method, job.about)
-        run_training(job.method, job.data, options, folder, job.about, **watched)
-    trained = counted_noun(options.steps, "step")
+        watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "params": params}
+        job.train(folder, done=show_steps(show, method, steps), **watched)
+    trained = counted_noun(steps, "step")
     click.echo(f"{trained} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it")
     if not can_draw():
         click.echo(f"{RUN_CURVES} was not drawn, matplotlib is not installed: {install_command('plot')}")

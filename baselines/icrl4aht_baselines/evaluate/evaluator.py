@@ -42,8 +42,6 @@ from icrl4aht_data.utils.system import usable_cores
 MakeEgo = Callable[[Layout], Policy | HostPolicy]
 """Function from a layout to the ego that plays on it."""
 
-_CONTROL_DETAILS: dict[Control, str] = {"forgets": "forget", "swapped": "swapped"}  # their marks in results
-
 
 def evaluate(
     agent: str,
@@ -56,13 +54,12 @@ def evaluate(
     control: Control | None = None,
     out: Path | None = None,
     details: dict[str, Any] | None = None,
-    done: Callable[[int], None] | None = None,
     played: Callable[[int], None] | None = None,
     programs: Programs | None = None,
 ) -> list[Result]:
     """Evaluate an ego and return one result per task, in the order of `tasks`.
 
-    Shows progress, unless `done` or `played` is given: a bar, or a line a minute where stderr is no terminal.
+    Shows progress, unless `played` is given: a bar, or a line a minute where stderr is no terminal.
 
     Args:
         agent: name of the ego in results and reports.
@@ -77,8 +74,8 @@ def evaluate(
         details: further settings that the results depend on, as JSON; stored and compared with the results.
             `trained_on` among them states the training data, which reports compare with the tasks: see
             `icrl4aht_baselines.training.seen.read_trained_on`.
-        done: called with the number of tasks finished since the last call, for progress.
-        played: called with the number of episodes played since the last call, or found in `out`; by several threads.
+        played: called with the number of episodes played since the last call, or found in `out`, for progress; by
+            several threads.
         programs: compiled programs of earlier evaluations of the ego, to which new ones are added.
 
     Raises:
@@ -95,7 +92,7 @@ def evaluate(
         _check_teammate(task, suite)
     if control is not None:
         check_choice("control", control, CONTROLS)
-        agent, details = f"{agent} ({control})", (details or {}) | {_CONTROL_DETAILS[control]: True}
+        agent, details = f"{agent} ({control})", (details or {}) | {CONTROLS[control]: True}
     settings = {
         "agent": agent,
         "seeds": seeds,
@@ -109,18 +106,15 @@ def evaluate(
     programs = Programs() if programs is None else programs
     evaluation = _Evaluation(make_ego, rules, control, seeds, suite, settings, programs)
     with ExitStack() as stack:
-        if played is None and done is None:
+        if played is None:
             show = stack.enter_context(progress_bars(unit="episodes"))
             played = counted(show, f"{agent}, {rules.name}", len(tasks) * len(seeds) * rules.episodes)
-        count_tasks, count_episodes = (count or (lambda number: None) for count in (done, played))
-        count_tasks(len(results))
-        count_episodes(len(results) * len(seeds) * rules.episodes)
-        for found in evaluation.play(missing, count_episodes):
+        played(len(results) * len(seeds) * rules.episodes)
+        for found in evaluation.play(missing, played):
             for result in found:
                 results[result.task_id] = result
                 if out is not None:
                     write_result(out, result)
-            count_tasks(len(found))
     return [results[task.task_id] for task in tasks]
 
 
@@ -200,12 +194,6 @@ class _Evaluation:
             )
             state = yield from play_episodes(prepared, episodes, forget=self.control == "forgets")
             prepared = prepared._replace(state=state)
-
-
-def count_programs(make_ego: MakeEgo, tasks: Sequence[Task]) -> int:
-    """Return the number of programs that an evaluation of these tasks compiles, see `evaluate`."""
-    egos = {layout: make_ego(layout) for layout in dict.fromkeys(task.layout for task in tasks)}
-    return len({_program(task, egos[task.layout], make_ego) for task in tasks})
 
 
 def _program(task: Task, ego: Policy | HostPolicy, make_ego: MakeEgo) -> tuple[Any, ...]:

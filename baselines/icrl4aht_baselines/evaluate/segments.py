@@ -17,9 +17,9 @@ from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.errors import OptionError
 
 Control = Literal["forgets", "swapped"]
-CONTROLS: tuple[Control, ...] = ("forgets", "swapped")
-"""Controls of an evaluation. `forgets`: the ego's memory is cleared before each episode. `swapped`: the teammate of
-another task plays all episodes but the last ones, see `Protocol.last_episodes`."""
+CONTROLS: dict[Control, str] = {"forgets": "forget", "swapped": "swapped"}
+"""Control of an evaluation -> its mark in the details of results. `forgets`: the ego's memory is cleared before each
+episode. `swapped`: the teammate of another task plays all episodes but the last ones, see `Protocol.last_episodes`."""
 
 FORGETS = " (forgets)"
 """End of the name of an agent whose memory is cleared before each episode."""

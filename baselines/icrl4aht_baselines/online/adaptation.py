@@ -9,21 +9,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
-from icrl4aht_generation.learners.resume import TIMING, last_line, run_lock
 from icrl4aht_generation.teammates.registry import build_teammate
 from scipy import stats
 
-from icrl4aht_baselines.methods.registry import get_method, overcooked_world
-from icrl4aht_baselines.online.responses import MODEL, PLAY, RESULT, ResponseOptions
-from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
-from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_baselines.online.responses import ResponseOptions, TrainingJob
+from icrl4aht_baselines.online.rl2 import TaskGroup
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
@@ -40,17 +36,13 @@ _MEASURE_SEED = 1_000
 
 
 @dataclass(frozen=True)
-class HeadroomJob:
-    """The training of an informed or episodic ego on a set of tasks, a job of a queue.
+class HeadroomJob(TrainingJob):
+    """The training of an informed or episodic ego on a set of tasks.
 
     Attributes:
         title: name of the set of tasks.
         tasks: the tasks, at most as many as are played at once.
         kind: "informed" or "episodic".
-        seed: seed of the training.
-        options: settings of the training.
-        out: folder of all trainings.
-        xla_threads: threads of XLA on a CPU.
 
     Raises:
         OptionError: if there are more tasks than are played at once.
@@ -82,66 +74,28 @@ class HeadroomJob:
         return f"{self.title}, {self.kind}, seed {self.seed}"
 
     @property
-    def updates(self) -> int:
-        """Updates of the training."""
-        return self.options.updates
-
-    @property
     def settings(self) -> dict[str, Any]:
         """What the result depends on."""
-        return {
-            "tasks_hash": json_hash([task.task_id for task in self.tasks]),
-            "kind": self.kind,
-            "seed": self.seed,
-            "options": asdict(self.options),
-            "code_version": version("icrl4aht-data"),
-        }
+        tasks = json_hash([task.task_id for task in self.tasks])
+        return {"tasks_hash": tasks, "kind": self.kind, **super().settings}
 
-    def is_finished(self) -> bool:
-        """Return whether the result of these settings is there."""
-        path = self.out / self.name / RESULT
-        return path.is_file() and parse_json(read_text(path))["settings"] == self.settings
-
-    def progress(self) -> tuple[int, float] | None:
-        """Return training steps done, and environment steps per second."""
-        timing = last_line(self.out / self.name / "run" / TIMING)
-        return (
-            None if timing is None else (timing["step"], timing["steps_per_second"] * self.options.tasks * KEPT_STEPS)
-        )
-
-    def result(self) -> dict[str, float]:
+    def returns(self) -> dict[str, float]:
         """Return task id -> mean return, of a finished training."""
-        return parse_json(read_text(self.out / self.name / RESULT))["returns"]
+        return self.result()["returns"]
 
-    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
-        """Train the ego and write result.json with its mean return in each task, of drawn actions in new episodes."""
-        folder = self.out / self.name
-        with run_lock(folder, wait=wait):
-            if self.is_finished():
-                return
-            groups, numbers = self._groups()
-            layouts = list(dict.fromkeys(task.layout for task in self.tasks))
-            told = len(self.tasks) if self.kind == "informed" else 0
-            method = get_method("rl2")(MODEL, overcooked_world(layouts, MODEL.encoder, canonical=True, partners=told))
-            options = self.options.training(self.seed)
-            trainer = PlayTrainer(method, options, PLAY, groups)
-            speed = self.options.tasks * KEPT_STEPS
-
-            def done(step: int, loss: float | None) -> None:
-                timing = last_line(folder / "run" / TIMING) or {}
-                on_update(step, timing.get("steps_per_second", 0.0) * speed)
-
-            data = TrainingData(None, {})
-            state = train(method, data, options, folder / "run", self.settings, trainer=trainer, done=done)
-            by_task: dict[int, list[float]] = defaultdict(list)
-            measured = trainer.measure(state.params, MEASURED_EPISODES, _MEASURE_SEED)
-            groups_played = [group for player in trainer.players for group in player.groups]
-            for group, returns in zip(groups_played, measured, strict=True):
-                for number, own in zip(numbers[group.name], returns.mean(axis=1), strict=True):
-                    by_task[number].append(float(own))
-            returns = {task.task_id: round(float(np.mean(by_task[k])), 3) for k, task in enumerate(self.tasks)}
-            with atomic_write(folder / RESULT) as partial:
-                write_json(partial, {"settings": self.settings, "returns": returns})
+    def measure(self, on_update: OnUpdate) -> dict[str, Any]:
+        """Train the ego, and return its mean return in each task, of drawn actions in new episodes."""
+        groups, numbers = self._groups()
+        layouts = list(dict.fromkeys(task.layout for task in self.tasks))
+        told = len(self.tasks) if self.kind == "informed" else 0
+        trainer, params = self.train(layouts, groups, on_update, told=told)
+        by_task: dict[int, list[float]] = defaultdict(list)
+        groups_played = [group for player in trainer.players for group in player.groups]
+        measured = trainer.measure(params, MEASURED_EPISODES, _MEASURE_SEED)
+        for group, returns in zip(groups_played, measured, strict=True):
+            for number, own in zip(numbers[group.name], returns.mean(axis=1), strict=True):
+                by_task[number].append(float(own))
+        return {"returns": {task.task_id: round(float(np.mean(by_task[k])), 3) for k, task in enumerate(self.tasks)}}
 
     def _groups(self) -> tuple[list[TaskGroup], dict[str, list[int]]]:
         """Return the groups of tasks that are played at once, and the number of the task of each, by group's name."""
@@ -175,12 +129,12 @@ def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any]:
     """Return the entry of a set of tasks in cards/adaptation.json: mean returns of each kind of ego by seed."""
     own = [job for job in jobs if job.title == title and job.is_finished()]
     returns = {
-        kind: {str(job.seed): round(float(np.mean(list(job.result().values()))), 3) for job in own if job.kind == kind}
+        kind: {str(job.seed): round(float(np.mean(list(job.returns().values()))), 3) for job in own if job.kind == kind}
         for kind in EGO_KINDS
     }
     by_task = {
         kind: {
-            task.task_id: round(float(np.mean([job.result()[task.task_id] for job in own if job.kind == kind])), 2)
+            task.task_id: round(float(np.mean([job.returns()[task.task_id] for job in own if job.kind == kind])), 2)
             for task in own[0].tasks
         }
         for kind in EGO_KINDS

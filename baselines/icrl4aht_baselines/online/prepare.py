@@ -14,7 +14,6 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.draws import find_draw
 from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate
 
-from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup, chosen_teammates, make_groups
@@ -22,7 +21,7 @@ from icrl4aht_baselines.online.teammates import check_heuristics, mixed_chances,
 from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cells
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import TASKS_SOURCE
-from icrl4aht_baselines.training.trainer import TrainingData
+from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
@@ -42,22 +41,6 @@ FOUR_RECIPES_SHARE = 0.2
 
 REARRANGED_SHARE = 1.5
 """Number of tasks on all rearranged versions of a layout, as a share of that on the layout."""
-
-
-class PlayJob(NamedTuple):
-    """Arguments of `trainer.train`, except for a folder.
-
-    Attributes:
-        method: what to train.
-        trainer: computes the steps.
-        data: no batches.
-        about: settings for config.json.
-    """
-
-    method: Method
-    trainer: PlayTrainer
-    data: TrainingData
-    about: dict[str, Any]
 
 
 class _Teammate(NamedTuple):
@@ -83,7 +66,7 @@ def prepare_play(
     play: PlayOptions,
     histories: HistoryOptions,
     tasks: Sequence[Task] = (),
-) -> PlayJob:
+) -> TrainingTask:
     """Return the training of a method that plays with the teammates of a release's histories, and of other tasks.
 
     Args:
@@ -124,7 +107,7 @@ def prepare_play(
         "trained_on": _played_cells(dataset, tasks, played, labels),
     }
     trainer = PlayTrainer(method, options, play, groups, histories.mirror)
-    return PlayJob(method, trainer, TrainingData(None, {}), about)
+    return TrainingTask(method, TrainingData(None, {}), options, about, trainer)
 
 
 def _check_unused(name: str, histories: HistoryOptions) -> None:

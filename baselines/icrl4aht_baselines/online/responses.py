@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -29,7 +28,6 @@ from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import PlayMode, learned, with_view
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import get_protocol
-from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
@@ -151,26 +149,110 @@ def with_headroom(tasks: Iterable[Task]) -> list[Task]:
     return kept
 
 
-def response_method(layout: Layout, partners: int = 0) -> Method:
-    """Return the method rl2 on a layout's canonical channels; `partners` as in `World`."""
-    return get_method("rl2")(MODEL, overcooked_world([layout], MODEL.encoder, canonical=True, partners=partners))
+class TrainingJob:
+    """A training by playing and the measurement of its ego, a job of a queue, see `icrl4aht_generation.jobs.job.Job`.
 
+    Base of dataclasses with these fields.
 
-def play_policy(method: Method, params: Any, greedy: bool) -> Policy:
-    """Return the policy of a trained ego."""
-    return with_view(learned(method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical")
+    Attributes:
+        seed: seed of the training.
+        options: settings of the training.
+        out: folder of all trainings.
+        xla_threads: threads of XLA on a CPU.
+    """
+
+    seed: int
+    options: ResponseOptions
+    out: Path
+    xla_threads: int | None
+
+    @property
+    def name(self) -> str:
+        """Name that no other job of the queue has."""
+        raise NotImplementedError
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the result depends on."""
+        return {"seed": self.seed, "options": asdict(self.options), "code_version": version("icrl4aht-data")}
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the training and its result."""
+        return self.out / self.name
+
+    @property
+    def updates(self) -> int:
+        """Updates of the training."""
+        return self.options.updates
+
+    def is_finished(self) -> bool:
+        """Return whether the result of these settings is there."""
+        return (self.folder / RESULT).is_file() and self.result()["settings"] == self.settings
+
+    def result(self) -> dict[str, Any]:
+        """Return the content of result.json: `settings`, and what `measure` returned."""
+        return parse_json(read_text(self.folder / RESULT))
+
+    def progress(self) -> tuple[int, float] | None:
+        """Return training steps done, and environment steps per second."""
+        timing = last_line(self.folder / "run" / TIMING)
+        if timing is None:
+            return None
+        return timing["step"], timing["steps_per_second"] * self.options.tasks * KEPT_STEPS
+
+    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
+        """Train the ego, measure it, and write result.json."""
+        with run_lock(self.folder, wait=wait):
+            if self.is_finished():
+                return
+            content = {"settings": self.settings, **self.measure(on_update)}
+            with atomic_write(self.folder / RESULT) as partial:
+                write_json(partial, content)
+
+    def finished_text(self) -> str:
+        """Return the text on the finished training."""
+        return "finished"
+
+    def measure(self, on_update: OnUpdate) -> dict[str, Any]:
+        """Train the ego, and return what was measured."""
+        raise NotImplementedError
+
+    def train(
+        self,
+        layouts: Sequence[Layout],
+        groups: Sequence[TaskGroup],
+        on_update: OnUpdate,
+        params: Any = None,
+        told: int = 0,
+    ) -> tuple[PlayTrainer, Any]:
+        """Train with groups of tasks, or resume. Return the trainer and the parameters.
+
+        Args:
+            layouts: layouts of the tasks.
+            groups: the tasks.
+            on_update: see `run`.
+            params: initial parameters; drawn by the seed by default.
+            told: number of tasks, for an ego that is told in every step which one it plays; otherwise 0.
+        """
+        method = get_method("rl2")(MODEL, overcooked_world(layouts, MODEL.encoder, canonical=True, partners=told))
+        options = self.options.training(self.seed)
+        trainer = PlayTrainer(method, options, PLAY, groups)
+
+        def done(step: int, loss: float | None) -> None:
+            on_update(step, (self.progress() or (0, 0.0))[1])
+
+        played: Any = {"trainer": trainer, "params": params, "done": done}
+        state = train(method, TrainingData(None, {}), options, self.folder / "run", self.settings, **played)
+        return trainer, state.params
 
 
 @dataclass(frozen=True)
-class ResponseJob:
-    """The training and evaluation of one best response, a job of a queue, see `icrl4aht_generation.jobs.job.Job`.
+class ResponseJob(TrainingJob):
+    """The training and evaluation of one best response.
 
     Attributes:
         behaviour: whom it plays with.
-        seed: seed of the training.
-        options: settings of the training.
-        out: folder of all best responses.
-        xla_threads: threads of XLA on a CPU.
     """
 
     behaviour: Behaviour
@@ -193,86 +275,41 @@ class ResponseJob:
         return f"{task.layout.name} {task.teammate_family}/t{task.teammate['theta_id']}{alike}, seed {self.seed}"
 
     @property
-    def updates(self) -> int:
-        """Updates of the training."""
-        return self.options.updates
-
-    @property
     def settings(self) -> dict[str, Any]:
         """What the result depends on."""
-        return {
-            "tasks": [task.task_id for task in self.behaviour.tasks],
-            "seed": self.seed,
-            "options": asdict(self.options),
-            "code_version": version("icrl4aht-data"),
-        }
-
-    def is_finished(self) -> bool:
-        """Return whether the result of these settings is there."""
-        path = self.out / self.name / RESULT
-        return path.is_file() and parse_json(read_text(path))["settings"] == self.settings
+        return {"tasks": [task.task_id for task in self.behaviour.tasks], **super().settings}
 
     def finished_text(self) -> str:
         """Return the text on the finished training."""
         modes = self.result()["modes"]
         return "return " + ", ".join(f"{mode} {found['return']:.1f}" for mode, found in modes.items())
 
-    def result(self) -> dict[str, Any]:
-        """Return the result, see `run`."""
-        return parse_json(read_text(self.out / self.name / RESULT))
-
-    def progress(self) -> tuple[int, float] | None:
-        """Return training steps done, and environment steps per second."""
-        timing = last_line(self.out / self.name / "run" / TIMING)
-        if timing is None:
-            return None
-        return timing["step"], timing["steps_per_second"] * self.options.tasks * KEPT_STEPS
-
-    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
-        """Train the ego, play the tasks, and write result.json: returns on the episodes to choose by and to report.
+    def measure(self, on_update: OnUpdate) -> dict[str, Any]:
+        """Train the ego, play the tasks, and return the returns on the episodes to choose by and to report.
 
         The returns are means over the behaviour's tasks, of the most probable actions ("greedy") and of drawn ones
         ("sampled"). "slope" is the rise of the training's return from the third to the last quarter of its steps.
         """
-        folder = self.out / self.name
-        with run_lock(folder, wait=wait):
-            if self.is_finished():
-                return
-            method, state = self._train(folder / "run", on_update)
-            modes = {}
-            for mode, greedy in (("greedy", True), ("sampled", False)):
-                policy = play_policy(method, state.params, greedy)
-                choice, report = (self._mean_return(policy, seeds) for seeds in (CHOICE_SEEDS, REPORT_SEEDS))
-                modes[mode] = {"choice": choice, "return": report}
-            returns = _logged_returns(folder / "run" / METRICS)
-            last, before = returns[len(returns) * 3 // 4 :], returns[len(returns) // 2 : len(returns) * 3 // 4]
-            slope = float(np.mean(last) - np.mean(before)) if len(before) else 0.0
-            with atomic_write(folder / RESULT) as partial:
-                write_json(partial, {"settings": self.settings, "modes": modes, "slope": round(slope, 3)})
-
-    def _train(self, folder: Path, on_update: OnUpdate) -> tuple[Method, Any]:
-        task, options = self.behaviour.tasks[0], self.options.training(self.seed)
-        method = response_method(task.layout)
+        task, params = self.behaviour.tasks[0], None
         mates = [build_teammate(task.layout, task.teammate)] * self.options.tasks
         group = TaskGroup([task.layout], task.teammate_kind, mates, False, task.layout.name)
-        params = None
         if self.options.init:
             params = read_trained(_bundled_run(self.options.init, task.layout)).params
-        speed = self.options.tasks * KEPT_STEPS
-
-        def done(step: int, loss: float | None) -> None:
-            timing = last_line(folder / TIMING) or {}
-            on_update(step, timing.get("steps_per_second", 0.0) * speed)
-
-        trainer = PlayTrainer(method, options, PLAY, [group])
-        state = train(
-            method, TrainingData(None, {}), options, folder, self.settings, trainer=trainer, params=params, done=done
-        )
-        return method, state
+        trainer, params = self.train([task.layout], [group], on_update, params)
+        modes = {}
+        for mode, greedy in (("greedy", True), ("sampled", False)):
+            policy = learned(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy))
+            policy = with_view(policy, "canonical")
+            choice, report = (self._mean_return(policy, seeds) for seeds in (CHOICE_SEEDS, REPORT_SEEDS))
+            modes[mode] = {"choice": choice, "return": report}
+        returns = _logged_returns(self.folder / "run" / METRICS)
+        last, before = returns[len(returns) * 3 // 4 :], returns[len(returns) // 2 : len(returns) * 3 // 4]
+        slope = float(np.mean(last) - np.mean(before)) if len(before) else 0.0
+        return {"modes": modes, "slope": round(slope, 3)}
 
     def _mean_return(self, policy: Policy, seeds: Sequence[int]) -> float:
         # The memory is cleared before each episode, as it was in training.
-        played: dict[str, Any] = {"seeds": seeds, "control": "forgets", "done": lambda count: None}
+        played: dict[str, Any] = {"seeds": seeds, "control": "forgets", "played": lambda count: None}
         tasks = list(self.behaviour.tasks)
         results = evaluate("best response", lambda layout: policy, tasks, get_protocol(PROTOCOL), **played)
         return round(float(np.mean([result.returns for result in results])), 3)
@@ -283,7 +320,6 @@ def _logged_returns(path: Path) -> list[float]:
     return [value for line in lines for name, value in line.items() if name.startswith("return ")]
 
 
-@lru_cache
 def _bundled_run(name: str, layout: Layout) -> Path:
     models = bundled_models()
     if name not in models:

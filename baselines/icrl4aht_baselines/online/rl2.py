@@ -14,11 +14,11 @@ Shapes: `B` tasks, `T` steps of an episode, `S` size of the recurrent state.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import jax
@@ -312,26 +312,6 @@ def _model_policy(method: Method, changes: bool) -> Policy:
     return Policy({}, init, act, "canonical_input")
 
 
-class StepNumbers:
-    """Numbers of the training steps, with the interface of `Batches`."""
-
-    waited = 0.0
-
-    def __init__(self, start: int, stop: int) -> None:
-        self._numbers = range(start, stop)
-
-    def __enter__(self) -> StepNumbers:
-        return self
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._numbers)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        pass
-
-
 class PlayTrainer:
     """Training by playing, with the interface of `icrl4aht_baselines.training.trainer.Trainer`.
 
@@ -397,9 +377,9 @@ class PlayTrainer:
         tasks = tuple(player.start(own) for player, own in zip(self.players, keys, strict=True))
         return PlayState(params, ppo_optimizer(self.ppo.config).init(params), tasks, jnp.int32(0))
 
-    def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 0) -> StepNumbers:
+    def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 0) -> AbstractContextManager[range]:
         """Return the numbers of the steps."""
-        return StepNumbers(start, stop)
+        return nullcontext(range(start, stop))
 
     def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
         """Return nothing: such models are compared by `evaluate` on validation tasks."""

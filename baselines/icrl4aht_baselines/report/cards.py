@@ -188,16 +188,16 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
     Args:
         out: folder of the results.
         protocols: their names.
-        show: called with (name, tasks done, tasks), for progress.
+        show: called with (name, episodes played, episodes), for progress.
     """
     runs = []
     for protocol in protocols:
         for agent in REFERENCES:
             splits = EVALUATION_SPLITS if agent == "stay" else ("test",)
             tasks = [task for split in splits for track in TRACKS for task in bundled_tasks(track, split)]
-            done = counted(show, f"{agent}, {protocol}", len(tasks))
-            folder = out / protocol / agent
-            runs.append(as_run(evaluate(agent, AGENTS[agent], tasks, get_protocol(protocol), out=folder, done=done)))
+            rules, folder = get_protocol(protocol), out / protocol / agent
+            played = counted(show, f"{agent}, {protocol}", len(tasks) * rules.episodes)
+            runs.append(as_run(evaluate(agent, AGENTS[agent], tasks, rules, out=folder, played=played)))
     return runs
 
 

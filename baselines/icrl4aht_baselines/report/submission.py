@@ -33,8 +33,6 @@ SUBMITTED_PROTOCOL = "seeded"
 SUBMITTED_SEEDS = (0, 1, 2)
 """Seeds with which every task has to be played."""
 
-_MARKS = {"forgets": "forget", "swapped": "swapped"}  # controls among the details of results
-
 _Text = Annotated[str, Meta(min_length=1)]
 
 
@@ -208,7 +206,7 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
                 f"{len(seeds)} of {rules.episodes}, one for each seed and episode; evaluate it again"
             )
     details = one.settings.get("details", {})
-    marks = {control for control, mark in _MARKS.items() if details.get(mark)}
+    marks = {control for control, mark in CONTROLS.items() if details.get(mark)}
     if marks != {one.control} - {""}:
         raise OptionError(
             f"{where}: results of {' and '.join(sorted(marks)) or 'no control'}, expected "

@@ -67,8 +67,8 @@ def rows(run: EvaluationRun) -> list[dict[str, Any]]:
     for cell, returns in run.returns.items():
         source, interval, several = run.source(cell), mean_interval(returns.mean), len(returns.mean) > 1
         like_paper = run.variant is None and run.protocol == PUBLISHED_PROTOCOL and run.is_comparable(cell)
-        published = published_cells(run.agent if like_paper else "").get(cell.layout, {})
-        paper, scale = published.get(cell.family, (None, None)), scales.get(cell)
+        paper = (published_score(run, [cell]) if like_paper else None) or (None, None)
+        scale = scales.get(cell)
         found.append(
             {
                 "agent": run.agent,

@@ -24,7 +24,7 @@ from icrl4aht_baselines.training.layout_numbers import number_layouts
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, read_config
 from icrl4aht_baselines.training.seen import TRAINED_ON
-from icrl4aht_baselines.training.trainer import TrainingData
+from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.dataset import Dataset, load_icrl4aht, teammate_ids, teammate_names
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.format.schema import MANIFEST
@@ -43,22 +43,6 @@ _CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammat
 
 VALIDATION = "validation"
 """Split of the histories that are held out where a release has them."""
-
-
-class TrainingTask(NamedTuple):
-    """Arguments of `trainer.train`, except for a folder.
-
-    Attributes:
-        method: what to train.
-        data: batches to train on and to validate with.
-        options: of the training.
-        about: settings of model and data for config.json.
-    """
-
-    method: Method
-    data: TrainingData
-    options: TrainOptions
-    about: dict[str, Any]
 
 
 def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:

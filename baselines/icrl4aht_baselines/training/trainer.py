@@ -46,6 +46,11 @@ def format_loss(loss: float | None) -> str:
     return "" if loss is None else f"loss {loss:.3f}"
 
 
+def show_steps(show: Callable[..., None], name: str, steps: int) -> StepProgress:
+    """Return a function that shows the progress of a training of `steps` steps; `show`: see `progress_bars`."""
+    return lambda step, loss: show(name, step, steps, format_loss(loss))
+
+
 class TrainingData(NamedTuple):
     """Sequences of batches, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
 
@@ -56,6 +61,28 @@ class TrainingData(NamedTuple):
 
     train: Any
     validation: Mapping[str, Any]
+
+
+class TrainingTask(NamedTuple):
+    """Arguments of `train`, except for a folder.
+
+    Attributes:
+        method: what to train.
+        data: batches to train on and to validate with.
+        options: how to train.
+        about: settings of model and data for config.json.
+        trainer: what computes the steps; None for a `Trainer`.
+    """
+
+    method: Method
+    data: TrainingData
+    options: TrainOptions
+    about: dict[str, Any]
+    trainer: Any = None
+
+    def train(self, folder: Path, **watched: Any) -> Any:
+        """Train into a folder, see `train`; `watched` are its further arguments."""
+        return train(self.method, self.data, self.options, folder, self.about, trainer=self.trainer, **watched)
 
 
 class TrainState(NamedTuple):
@@ -274,7 +301,8 @@ def train(
             if step % options.validate_every == 0 or last:
                 lines += trainer.validation_lines(state, data.validation, step)
             if lines:
-                now = step, time.perf_counter(), batches.waited
+                waited = getattr(batches, "waited", 0.0)  # steps that are played have no loader
+                now = step, time.perf_counter(), waited
                 steps, seconds, waited = np.subtract(now, before)
                 speed = {"steps_per_second": round(steps / seconds, 4), "loader_wait": round(waited / seconds, 4)}
                 log.write(*lines, timing={"step": step, **speed})

@@ -55,6 +55,10 @@ class Job(Protocol):
         """Return updates done and steps per second as its folder states them, perhaps written by another process."""
         ...
 
+    def finished_text(self) -> str:
+        """Return the text on the finished job."""
+        ...
+
     def run(self, on_update: OnUpdate, wait: bool) -> None:
         """Do it, or what is left of it.
 

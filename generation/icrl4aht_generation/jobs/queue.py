@@ -6,13 +6,12 @@ import multiprocessing
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import closing
 from pathlib import Path
 from threading import current_thread, main_thread
-from typing import TypeVar
 
 from rich.console import Console
 
@@ -32,16 +31,8 @@ from icrl4aht_generation.jobs.ray_executor import run_on_ray
 
 _POLL_SECONDS = 1.0
 
-J = TypeVar("J", bound=Job)
 
-
-def run_jobs(
-    jobs: Sequence[J],
-    out: Path,
-    console: Console,
-    options: QueueOptions,
-    describe: Callable[[J], str] = lambda job: "finished",
-) -> None:
+def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOptions) -> None:
     """Do every job that is unfinished.
 
     Jobs that another process is doing are skipped, and awaited at the end.
@@ -51,7 +42,6 @@ def run_jobs(
         out: folder of the log of failures.
         console: where outcomes are printed.
         options: how to run them.
-        describe: returns the text on a job that has just finished.
 
     Raises:
         FailedJobsError: if a job is unfinished at the end; out/failed.jsonl has the reasons.
@@ -63,8 +53,7 @@ def run_jobs(
             console.print(f"{labels[job.name]}: finished before")
         else:
             todo.append(job)
-    by_name = {job.name: job for job in todo}
-    missing = set(by_name)
+    missing = {job.name for job in todo}
     updates = {job.name: job.updates for job in todo}
     failures, last_error = FailureLog(out / FAILED), ""
     with (
@@ -77,7 +66,7 @@ def run_jobs(
                 console.print(f"{labels[name]}: another process works on it")
                 continue
             if outcome.status == "done":
-                console.print(f"{labels[name]}: {describe(by_name[name])}")
+                console.print(f"{labels[name]}: {outcome.job.finished_text()}")
                 missing.remove(name)
                 failures.forget([name])
                 continue

@@ -75,7 +75,7 @@ def build_suite(
     config = profile.teammates
     runs = population_runs(profile, algorithms, seed)
     jobs = [PopulationJob(run, suite, profile.xla_threads) for run in runs]
-    run_jobs(jobs, suite, console, options or QueueOptions(), PopulationJob.finished_text)
+    run_jobs(jobs, suite, console, options or QueueOptions())
     wanted = [(run.layout.name, run.algorithm) for run in runs]
     selections = [
         select_teammates(suite, name, algorithm, config.train, config.heldout, seed)

@@ -81,7 +81,7 @@ def build_releases(
     else:
         works, headroom, left_out = profile.works_of(tasks, sources or {}), {}, []
     jobs = [CollectionJob(work, profile, out / "artefacts", suite) for work in works]
-    run_jobs(jobs, out, console, options, CollectionJob.finished_text)
+    run_jobs(jobs, out, console, options)
     tasks = list({work.task.task_id: work.task for work in works}.values())
     artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
     with process_lock(out / _PACKING_LOCK):  # another collector on this folder packs the same releases

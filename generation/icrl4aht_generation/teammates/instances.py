@@ -124,24 +124,22 @@ def published_task(layout: str, teammate: str) -> Task:
     names = {f"{HEURISTIC_KINDS[family]}/t{t}": (family, t) for family in _FAMILIES for t in range(INSTANCES)}
     if teammate not in names:
         raise unknown("teammate", teammate, names)
-    family, number = names[teammate]
-    entry = {"kind": "heuristic", "family": family, "theta_id": number, "base_seed": 0}
-    entry["theta"] = published_thetas(name, family)[number]
     track = track_of(name)
-    return make_task(track, "test" if name in TRACKS[track]["test"] else "train", name, entry, seed=0)
+    split = "test" if name in TRACKS[track]["test"] else "train"
+    return make_task(track, split, name, published_teammate(name, *names[teammate]), seed=0)
+
+
+def published_teammate(layout: str, family: str, number: int) -> dict[str, Any]:
+    """Return the teammate entry of a test instance on a layout (short name), as in a task."""
+    theta = published_thetas(layout, family)[number]
+    return {"kind": "heuristic", "family": family, "theta_id": number, "base_seed": 0, "theta": theta}
 
 
 def published_tasks(track: str) -> list[Task]:
     """Return the published test tasks of a track, by layout, family and instance."""
     return [
-        make_task(
-            track,
-            "test",
-            layout,
-            {"kind": "heuristic", "family": family, "theta_id": number, "base_seed": 0, "theta": theta},
-            seed=0,
-        )
+        make_task(track, "test", layout, published_teammate(layout, family, number), seed=0)
         for layout in TRACKS[track]["test"]
         for family in _FAMILIES
-        for number, theta in enumerate(published_thetas(layout, family))
+        for number in range(INSTANCES)
     ]

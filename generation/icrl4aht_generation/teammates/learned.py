@@ -58,16 +58,13 @@ def build_untrained(layout: Layout, widths: Widths) -> Policy:
     return Policy(params, init, act, "observation")
 
 
-def build_learned_entry(
-    layout: Layout, teammate: dict[str, Any], suite: Path | None, action: Action = "greedy"
-) -> Policy:
+def build_learned_entry(layout: Layout, teammate: dict[str, Any], suite: Path | None) -> Policy:
     """Return the policy of a task's teammate entry of kind "rl".
 
     Args:
         layout: the layout.
         teammate: the entry.
         suite: a suite's folder, or the folder TEAMMATES of a release.
-        action: how it acts.
 
     Raises:
         OptionError: without a suite, or if the checkpoint is missing or does not fit.
@@ -78,7 +75,7 @@ def build_learned_entry(
             f"teammate {teammate['theta']['checkpoint']} is a checkpoint: give the folder of the suite of teammates"
         )
     folder = checkpoint_folder(suite, teammate)
-    policy = build_learned(layout, folder, action)
+    policy = build_learned(layout, folder)
     digest = file_hash(folder / POLICY_WEIGHTS)
     if digest != teammate["theta"]["sha256"]:
         raise TaskFormatError(

@@ -20,7 +20,7 @@ from icrl4aht_data.benchmark.facts import PREFERENCE, PREFERENCE_LAYOUTS
 from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_generation.teammates.heuristics.territory import LAZY, TERRITORY
-from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_thetas
+from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_teammate
 from icrl4aht_generation.teammates.registry import sample_teammate
 
 WATCHER: dict[str, Any] = {
@@ -82,10 +82,8 @@ def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
         for family in TESTED_FAMILIES:
             if split == "test":
                 published = layout.name.removesuffix("_plain")
-                theta = published_thetas(published if published in LAYOUTS else "demo_wide", family)[instance]
-                entry = {"kind": "heuristic", "family": family, "theta_id": instance, "base_seed": 0, "theta": theta}
+                found.append(published_teammate(published if published in LAYOUTS else "demo_wide", family, instance))
             else:
-                entry = sample_teammate(family, instance, "diverse", _DRAWS[split])
-            found.append(entry)
+                found.append(sample_teammate(family, instance, "diverse", _DRAWS[split]))
         found += [] if split == "train" else [WATCHER]
     return found

@@ -114,5 +114,5 @@ def test_tiny_trainings(tmp_path):
     tasks = {"all": [DEMO[0], DEMO[5], *tasks_of("teammate", "test_wide", "H1")[:1]]}
     for other in headroom_jobs(tasks, 1, TINY, tmp_path):
         other.run()
-        assert set(other.result()) == {task.task_id for task in tasks["all"]}
+        assert set(other.returns()) == {task.task_id for task in tasks["all"]}
     assert "| all |" in adaptation_table(write_adaptation(headroom_jobs(tasks, 1, TINY, tmp_path), tmp_path).parent)

@@ -45,7 +45,7 @@ def collect(tasks, out: Path, console: Console | None = None, **options) -> str:
     """Collect the tasks and return the printed output."""
     console = console or Console(file=StringIO(), width=500)
     jobs = [CollectionJob(work, tasks[1], out / "artefacts") for work in tasks[0]]
-    run_jobs(jobs, out, console, QueueOptions(**options), CollectionJob.finished_text)
+    run_jobs(jobs, out, console, QueueOptions(**options))
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 

@@ -41,6 +41,9 @@ class FileJob:
     def progress(self) -> tuple[int, float] | None:
         return None
 
+    def finished_text(self) -> str:
+        return "finished"
+
     def run(self, on_update: OnUpdate, wait: bool) -> None:
         if self.busy and not wait:
             raise BusyError("busy")

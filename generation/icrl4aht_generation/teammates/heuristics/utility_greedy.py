@@ -214,18 +214,6 @@ UTILITY_GREEDY = Heuristic(
         {name: span for name, span in _SPANS.items() if name != "w_start_cooking"} | {"w_press_L": (0.0, 8.0)},
     ),
     spans=_SPANS,
-    unbounded=frozenset(
-        {
-            "w_deliver",
-            "w_pickup_cooked",
-            "w_get_plate",
-            "w_add_ingredient",
-            "w_fetch_ingredient",
-            "w_stage_on_counter",
-            "w_start_cooking",
-            "w_press_L",
-            "dist_weight",
-        }
-    ),
+    unbounded=frozenset(_SPANS.keys() - {"inertia", "counter_preference"}),
 )
 """The family H4; its parameters' order is that of the published manifests."""
