@@ -120,10 +120,12 @@ def best_response_command(
     An ego with the benchmark's own view learns with one teammate alone, by PPO that imitates the oracle in its first
     half. Teammates that act alike share one. Tasks in which the oracle earns no more than `stay` are left out. The
     best training is chosen on other episodes than those reported; a stored model that earns more takes its place.
-    Writes OUT/best_responses.json; finished trainings are kept, stopped ones resume.
+    Writes OUT/best_responses.json and prints it; finished trainings are kept, stopped ones resume. Where the return
+    still rises in the last quarter, give more --steps.
     """
     options = read_queue_options(queue)
     from icrl4aht_generation.jobs.queue import run_jobs
+    from icrl4aht_generation.learners.resume import limit_xla_threads
     from rich.console import Console
 
     from icrl4aht_baselines.online.responses import (
@@ -132,10 +134,12 @@ def best_response_command(
         ResponseJob,
         ResponseOptions,
         find_behaviours,
+        responses_table,
         with_headroom,
         write_responses,
     )
 
+    limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
     chosen = with_headroom(_chosen_tasks(**choice))
     if not chosen:
         raise EmptySelectionError("none of these tasks has headroom; choose others")
@@ -149,6 +153,7 @@ def best_response_command(
         for path in (out / RESPONSES_FILE, best_responses_file())[: 1 + bundle]:
             write_responses(jobs, path, _model_returns(chosen, PROTOCOL))
             console.print(f"wrote {path}")
+        click.echo(responses_table(out / RESPONSES_FILE))
 
 
 @click.command(
@@ -180,25 +185,29 @@ def adaptation_headroom_command(
     bundle: bool,
     **choice: Any,
 ) -> None:
-    """Measure what memory across episodes can earn at most.
+    """Estimate what memory across episodes can earn.
 
     Trains two egos on the tasks of each layout: one that is told in every step which task it plays, and one that has to
-    find out in each episode. Prints the difference of their returns with an interval over the seeds. Writes
-    OUT/adaptation.json; finished trainings are kept, stopped ones resume.
+    find out in each episode. Prints the difference of their returns with an interval over the seeds. Both learn for
+    --steps only, so it is an estimate. Writes OUT/adaptation.json; finished trainings are kept, stopped ones resume.
     """
     options = read_queue_options(queue)
     from icrl4aht_generation.jobs.queue import run_jobs
+    from icrl4aht_generation.learners.resume import limit_xla_threads
     from rich.console import Console
 
     from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
     from icrl4aht_baselines.online.responses import ResponseOptions
 
+    limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
     sets: dict[str, list[Task]] = defaultdict(list)
     for task in _chosen_tasks(**choice):
-        title = task.layout.name if task.recipes is None else f"{task.layout.name}-preference"
-        sets["all" if together else title].append(task)
+        where = "all" if together else task.layout.name
+        sets["-".join((task.track, task.split, where, *choice["families"]))].append(task)
     console, jobs = Console(soft_wrap=True), headroom_jobs(sets, seeds, ResponseOptions(steps, tasks), out)
-    run_jobs(jobs, out, console, options)
-    for folder in (out, best_responses_file().parent)[: 1 + bundle]:
-        console.print(f"wrote {write_adaptation(jobs, folder)}")
-    click.echo(adaptation_table(out))
+    try:
+        run_jobs(jobs, out, console, options)
+    finally:
+        for folder in (out, best_responses_file().parent)[: 1 + bundle]:
+            console.print(f"wrote {write_adaptation(jobs, folder)}")
+        click.echo(adaptation_table(out))

@@ -90,6 +90,7 @@ def evaluate_command(
     """
     from icrl4aht_baselines.evaluate.controls import evaluate_controls
     from icrl4aht_baselines.evaluate.evaluator import evaluate
+    from icrl4aht_baselines.evaluate.programs import Programs
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
     from icrl4aht_baselines.evaluate.segments import CONTROLS
     from icrl4aht_baselines.report.controls import control_lines
@@ -113,7 +114,8 @@ def evaluate_command(
     if chosen_seeds:
         shared.check_alone("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
-    options: Any = {"seeds": seeds_of_tasks, "suite": suite, "out": out, "details": ego.details}
+    programs = Programs()
+    options: Any = {"seeds": seeds_of_tasks, "suite": suite, "out": out, "details": ego.details, "programs": programs}
     lines = []
     if controls:
         lines = control_lines(evaluate_controls(ego.name, ego.make, chosen, rules, **options), chosen)
@@ -124,7 +126,8 @@ def evaluate_command(
     note_results(out, ego.run, chosen)
     for line in [*summary_lines([read_run(out)]), *lines]:
         click.echo(line)
-    click.echo(f"{counted_noun(len(chosen), 'result')} in {out}; `icrl4aht-data report {out}` shows them")
+    counted = f"{counted_noun(len(chosen), 'result')} in {out}, {counted_noun(len(programs), 'program')} compiled"
+    click.echo(f"{counted}; `icrl4aht-data report {out}` shows them")
 
 
 @click.command("report")

@@ -22,7 +22,7 @@ VERBS = (
         "adaptation-headroom",
         f"{_ADAPT}:adaptation_headroom_command",
         _TRAIN,
-        "Measure what memory across episodes can earn at most.",
+        "Estimate what memory across episodes can earn.",
     ),
     Verb("control", f"{_LAB}:control_command", _TRAIN, "Check that AD and DPT adapt in context."),
     Verb("research tracks", f"{_LAB}:tracks_command", _PAPER, "Train and evaluate on both tracks."),

@@ -2,7 +2,8 @@
 
 Two recurrent egos are trained on the same tasks with the same budget, both with their memory cleared before each
 episode: the *informed* one is told in every step which task it plays, the *episodic* one has to find out within the
-episode. The return of the first minus that of the second is the most that memory across episodes can earn.
+episode. The return of the first minus that of the second estimates what memory across episodes can earn: both would
+earn more after a longer training, the informed one of many tasks above all.
 """
 
 from __future__ import annotations
@@ -125,22 +126,29 @@ def headroom_jobs(
     ]
 
 
-def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any]:
-    """Return the entry of a set of tasks in cards/adaptation.json: mean returns of each kind of ego by seed."""
+def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | None:
+    """Return the entry of a set of tasks in cards/adaptation.json; None before both egos of a seed are trained.
+
+    It has the mean return of each kind of ego by seed, and on each layout, mean over these seeds.
+    """
     own = [job for job in jobs if job.title == title and job.is_finished()]
-    returns = {
-        kind: {str(job.seed): round(float(np.mean(list(job.returns().values()))), 3) for job in own if job.kind == kind}
-        for kind in EGO_KINDS
+    seeds = sorted(set.intersection(*({job.seed for job in own if job.kind == kind} for kind in EGO_KINDS)))
+    if not seeds:
+        return None
+    found = {(job.kind, job.seed): job.returns() for job in own}
+    layouts = dict.fromkeys(task.layout.name for task in own[0].tasks)
+
+    def mean(kind: str, seeds: Sequence[int], layout: str = "") -> float:
+        ids = [task.task_id for task in own[0].tasks if layout in ("", task.layout.name)]
+        return round(float(np.mean([[found[kind, seed][task] for task in ids] for seed in seeds])), 3)
+
+    return {
+        "tasks": title,
+        "number": len(own[0].tasks),
+        "steps": own[0].options.updates * own[0].options.tasks * KEPT_STEPS,
+        "returns": {kind: {str(seed): mean(kind, [seed]) for seed in seeds} for kind in EGO_KINDS},
+        "layouts": {layout: {kind: mean(kind, seeds, layout) for kind in EGO_KINDS} for layout in layouts},
     }
-    by_task = {
-        kind: {
-            task.task_id: round(float(np.mean([job.returns()[task.task_id] for job in own if job.kind == kind])), 2)
-            for task in own[0].tasks
-        }
-        for kind in EGO_KINDS
-    }
-    steps = own[0].options.updates * own[0].options.tasks * KEPT_STEPS
-    return {"tasks": title, "steps": steps, "returns": returns, "by_task": by_task}
 
 
 ADAPTATION = "adaptation.json"
@@ -148,10 +156,16 @@ ADAPTATION = "adaptation.json"
 
 
 def write_adaptation(jobs: Sequence[HeadroomJob], folder: Path) -> Path:
-    """Add the measurements of finished jobs to a folder's `ADAPTATION`; those of the same sets are replaced."""
+    """Add the measurements of finished jobs to a folder's `ADAPTATION`.
+
+    They replace those of the same sets, unless these have more seeds.
+    """
     path = folder / ADAPTATION
     known = {entry["tasks"]: entry for entry in read_adaptation(folder)}
-    known |= {title: headroom_entry(title, jobs) for title in dict.fromkeys(job.title for job in jobs)}
+    for title in dict.fromkeys(job.title for job in jobs):
+        entry = headroom_entry(title, jobs)
+        if entry and len(known.get(title, entry)["returns"]["informed"]) <= len(entry["returns"]["informed"]):
+            known[title] = entry
     with atomic_write(path) as partial:
         write_json(partial, list(known.values()))
     return path
@@ -166,19 +180,20 @@ def read_adaptation(folder: Path) -> list[dict[str, Any]]:
 def adaptation_table(folder: Path) -> str:
     """Return a Markdown table of the measured sets: returns of both egos, and their difference with its 95 % interval.
 
-    The interval is Student's over the seeds, which trained both egos; without a second seed there is none.
+    The interval is Student's over the seeds, which trained both egos; without a second seed there is none. Sets of
+    several layouts are followed by a row for each layout.
     """
     rows = []
     for entry in read_adaptation(folder):
-        returns = [entry["returns"][kind] for kind in EGO_KINDS]
-        seeds = sorted(returns[0].keys() & returns[1].keys())
-        differences = np.array([returns[0][seed] - returns[1][seed] for seed in seeds])
-        half = 0.0
-        if len(seeds) > 1:
-            error = differences.std(ddof=1) / np.sqrt(len(seeds))
-            half = float(stats.t.ppf(0.975, len(seeds) - 1) * error)
-        mean = float(differences.mean())
-        interval = f" ({mean - half:+.1f} to {mean + half:+.1f})" if half else ""
-        means = [f"{np.mean([of[seed] for seed in seeds]):.1f}" for of in returns]
-        rows.append([entry["tasks"], *means, f"{mean:+.1f}{interval}", str(len(seeds)), f"{entry['steps']:,}"])
-    return markdown_table(["tasks", *EGO_KINDS, "difference", "seeds", "steps of each"], rows, right=5)
+        informed, episodic = (np.array([*entry["returns"][kind].values()]) for kind in EGO_KINDS)
+        differences, seeds = informed - episodic, len(informed)
+        interval = ""
+        if seeds > 1:
+            half = stats.t.ppf(0.975, seeds - 1) * differences.std(ddof=1) / np.sqrt(seeds)
+            interval = f" ({differences.mean() - half:+.1f} to {differences.mean() + half:+.1f})"
+        cells = [f"{informed.mean():.1f}", f"{episodic.mean():.1f}", f"{differences.mean():+.1f}{interval}"]
+        rows.append([entry["tasks"], str(entry["number"]), *cells, str(seeds), f"{entry['steps']:,}"])
+        for layout, of in entry["layouts"].items() if len(entry["layouts"]) > 1 else ():
+            one, other = (of[kind] for kind in EGO_KINDS)
+            rows.append([layout, "", f"{one:.1f}", f"{other:.1f}", f"{one - other:+.1f}", "", ""])
+    return markdown_table(["set", "tasks", *EGO_KINDS, "difference", "seeds", "steps of each"], rows, right=6)

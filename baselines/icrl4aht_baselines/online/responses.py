@@ -17,7 +17,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
-from icrl4aht_generation.learners.resume import METRICS, TIMING, last_line, run_lock
+from icrl4aht_generation.learners.resume import METRICS, TIMING, differing_settings, last_line, run_lock
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.distances import act_along, common_states, group_behaviours
 from icrl4aht_generation.teammates.draws import find_draw
@@ -41,13 +41,14 @@ from icrl4aht_data.benchmark.best_responses import (
     read_best_responses,
     write_best_responses,
 )
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, track_of
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LAYOUT_NAMES, LEAST_HEADROOM, TESTED_ON, track_of
 from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.options import Count, Option, Positive, check_options
+from icrl4aht_data.utils.templates import markdown_table
 
 PROTOCOL = "seeded"
 """Protocol under which best responses are chosen and measured."""
@@ -118,17 +119,20 @@ class Behaviour(NamedTuple):
 
 
 def find_behaviours(tasks: Iterable[Task]) -> list[Behaviour]:
-    """Group tasks with heuristic teammates that act alike: those of one layout, recipes and family below the distance
-    `SAME_BEHAVIOUR`.
+    """Group tasks with teammates that act alike: those of one split, layout, recipes and family whose distance on the
+    states of all test instances, see `teammates.distances`, is below `SAME_BEHAVIOUR`.
 
-    Raises:
-        UnknownNameError: if no distances are measured on a layout.
+    Teammates on layouts without test instances, such as generated ones, are not compared.
     """
     groups: dict[Any, list[Task]] = defaultdict(list)
     for task in tasks:
-        groups[task.layout.name, task.recipes, task.teammate_kind].append(task)
+        alone = task.task_id if task.layout.name not in LAYOUT_NAMES else ""
+        groups[task.split, task.layout.name, task.recipes, task.teammate_kind, alone].append(task)
     found = []
     for own in groups.values():
+        if len(own) == 1:
+            found.append(Behaviour((own[0],)))
+            continue
         plain = replace(own[0], recipes=None).layout
         actions = act_along(plain, [build_teammate(plain, task.teammate) for task in own], common_states(plain).records)
         numbers = np.array(group_behaviours(actions))
@@ -138,13 +142,19 @@ def find_behaviours(tasks: Iterable[Task]) -> list[Behaviour]:
 
 
 def with_headroom(tasks: Iterable[Task]) -> list[Task]:
-    """Return the tasks in which the scripted oracle earns more than `stay`, as measured for test cells and draws."""
+    """Return the tasks in which the scripted oracle earns more than `stay`, as measured for test cells and draws.
+
+    Tasks that were not measured, such as those of the track preference, are kept.
+    """
     cells = read_headroom(PROTOCOL)
     kept = []
     for task in tasks:
-        cell = cells.get((task.layout.name, task.teammate_family))
-        draw = None if task.split == "test" else find_draw(task.layout.name, task.teammate)
-        matters = has_headroom(cell) if cell and task.split == "test" else draw is None or draw.headroom
+        if task.split == "test":
+            cell = cells.get((task.layout.name, task.teammate_family))
+            matters = cell is None or has_headroom(cell)
+        else:
+            draw = find_draw(task.layout.name, task.teammate) if task.layout.name in TESTED_ON else None
+            matters = draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
         kept += [task] if matters else []
     return kept
 
@@ -174,7 +184,13 @@ class TrainingJob:
     @property
     def settings(self) -> dict[str, Any]:
         """What the result depends on."""
-        return {"seed": self.seed, "options": asdict(self.options), "code_version": version("icrl4aht-data")}
+        return {
+            "seed": self.seed,
+            "options": asdict(self.options),
+            "model": asdict(MODEL),
+            "play": asdict(PLAY),
+            "code_version": version("icrl4aht-data"),
+        }
 
     @property
     def folder(self) -> Path:
@@ -188,7 +204,8 @@ class TrainingJob:
 
     def is_finished(self) -> bool:
         """Return whether the result of these settings is there."""
-        return (self.folder / RESULT).is_file() and self.result()["settings"] == self.settings
+        path = self.folder / RESULT
+        return path.is_file() and not differing_settings(self.result()["settings"], self.settings)
 
     def result(self) -> dict[str, Any]:
         """Return the content of result.json: `settings`, and what `measure` returned."""
@@ -277,7 +294,8 @@ class ResponseJob(TrainingJob):
     @property
     def settings(self) -> dict[str, Any]:
         """What the result depends on."""
-        return {"tasks": [task.task_id for task in self.behaviour.tasks], **super().settings}
+        seeds = {"choice_seeds": list(CHOICE_SEEDS), "report_seeds": list(REPORT_SEEDS), "protocol": PROTOCOL}
+        return {"tasks": [task.task_id for task in self.behaviour.tasks], **super().settings, **seeds}
 
     def finished_text(self) -> str:
         """Return the text on the finished training."""
@@ -327,25 +345,30 @@ def _bundled_run(name: str, layout: Layout) -> Path:
     return models[name].runs[track_of(layout.name)]
 
 
-def best_of(jobs: Sequence[ResponseJob]) -> BestResponse:
-    """Return the best response to a behaviour from its finished trainings.
+def trained_response(job: ResponseJob) -> TrainedResponse:
+    """Return the record of a finished training, in the way of acting that earns more on the episodes to choose by."""
+    result = job.result()
+    acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
+    steps = job.options.updates * job.options.tasks * KEPT_STEPS
+    return TrainedResponse(
+        job.seed, steps, earned["return"], earned["choice"], acting, result["slope"], job.options.init or ""
+    )
 
-    The best one is that with the highest return on the episodes to choose by; B is its return on the others.
+
+def best_of(behaviour: Behaviour, trainings: Iterable[TrainedResponse]) -> BestResponse:
+    """Return the best response to a behaviour.
+
+    The best training is that with the highest return on the episodes to choose by; B is its return on the others. Of
+    trainings with the same seed, start and steps the last one counts.
     """
-    task, seeds = jobs[0].behaviour.tasks[0], []
-    for job in jobs:
-        result = job.result()
-        acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
-        steps = job.options.updates * job.options.tasks * KEPT_STEPS
-        found = earned["return"], earned["choice"], acting, result["slope"], job.options.init or ""
-        seeds.append(TrainedResponse(job.seed, steps, *found))
-    best = max(seeds, key=lambda one: one.choice)
+    task, seeds = behaviour.tasks[0], {(one.init, one.steps, one.seed): one for one in trainings}
+    best = max(seeds.values(), key=lambda one: one.choice or 0.0)
     return BestResponse(
         layout=task.layout.name,
         family=task.teammate_family,
         split=task.split,
-        tasks=tuple(one.task_id for one in jobs[0].behaviour.tasks),
-        seeds=tuple(seeds),
+        tasks=tuple(one.task_id for one in behaviour.tasks),
+        seeds=tuple(seeds.values()),
         best=best.mean_return,
         agent=f"best response, seed {best.seed}" + (f" from {best.init}" if best.init else ""),
     )
@@ -374,19 +397,42 @@ def write_responses(
 ) -> None:
     """Add the best responses of finished trainings to a file, see `icrl4aht_data.benchmark.best_responses`.
 
-    Those of the same tasks are replaced. The version is a hash of all of them.
+    Trainings that the file has of the same tasks are kept beside the new ones. Entries of other groups of these tasks
+    are dropped. The version is a hash of all entries.
 
     Args:
         jobs: the trainings.
         path: the file.
         models: returns of other models, see `best_with_models`.
     """
-    finished: dict[str, list[ResponseJob]] = defaultdict(list)
+    finished: dict[tuple[str, ...], list[ResponseJob]] = defaultdict(list)
     for job in jobs:
         if job.is_finished():
-            finished[job.behaviour.tasks[0].task_id].append(job)
-    known = {one.tasks[0]: one for one in (read_best_responses(path).behaviours if path.is_file() else ())}
-    known |= {task: best_of(own) for task, own in finished.items()}
-    behaviours = tuple(best_with_models(one, models) for one in known.values())
+            finished[tuple(task.task_id for task in job.behaviour.tasks)].append(job)
+    known = {one.tasks: one for one in (read_best_responses(path).behaviours if path.is_file() else ())}
+    found = {}
+    for ids, own in finished.items():
+        before = known[ids].seeds if ids in known else ()
+        found[ids] = best_of(own[0].behaviour, [*before, *map(trained_response, own)])
+    new = {task for ids in found for task in ids}
+    kept = [one for ids, one in known.items() if new.isdisjoint(ids)]
+    behaviours = tuple(best_with_models(one, models) for one in (*kept, *found.values()))
     card = BestResponseCard(json_hash(to_builtins(behaviours)), PROTOCOL, ABOUT, behaviours)
     write_best_responses(path, card)
+
+
+def responses_table(path: Path) -> str:
+    """Return a Markdown table of a file's best responses: B, the least and most of the trainings, and their rise.
+
+    The rise is that of the last quarter of the best training's steps; one of several points says that it was too short.
+    """
+    body = []
+    for one in read_best_responses(path).behaviours:
+        returns = [seed.mean_return for seed in one.seeds]
+        best = max(one.seeds, key=lambda seed: seed.choice or 0.0)
+        numbers = ", ".join(task.rsplit("_", 3)[1] for task in one.tasks)
+        spread = f"{min(returns):.1f} to {max(returns):.1f}" if len(returns) > 1 else ""
+        training = [str(len(returns)), f"{best.steps:,}", f"{best.slope or 0.0:+.1f}"]
+        body.append([one.layout, one.split, f"{one.family} {numbers}", f"{one.best:.1f}", one.agent, spread, *training])
+    header = ["layout", "split", "teammates", "B", "of", "trainings", "number", "steps", "rise"]
+    return markdown_table(header, body)

@@ -24,6 +24,9 @@ class TrainingStopped(SystemExit):
     def __str__(self) -> str:
         return self.message
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (int(self.code or 128) - 128, self.message)
+
 
 class StopSignals:
     """Context in which SIGTERM and SIGINT are noted instead of ending the process.

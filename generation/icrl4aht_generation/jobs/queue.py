@@ -7,7 +7,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import closing
 from pathlib import Path
@@ -129,32 +129,38 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
     if current_thread() is main_thread():
         # By default SIGTERM would end this process without a word to its workers.
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.workers, context, max_tasks_per_child=1) as pool:
-        attempts = dict.fromkeys((job.name for job in jobs), 1)
-        pending: dict[Future, Job] = {pool.submit(run_in_worker, job, wait): job for job in jobs}
-        try:
-            while pending:
-                ended, _ = wait_for(pending, _POLL_SECONDS, FIRST_COMPLETED)
-                for future in ended:
-                    job, error = pending.pop(future), future.exception()
-                    if error is None:
-                        yield JobOutcome(job, future.result(), attempts[job.name])
-                    elif not isinstance(error, Exception):  # the worker was told to stop
-                        raise error
-                    elif attempts[job.name] <= options.retries:
-                        attempts[job.name] += 1
-                        pending[pool.submit(run_in_worker, job, wait)] = job
-                    else:
-                        yield _failed(job, attempts[job.name], error)
-                for job in (job for future, job in pending.items() if future.running()):
-                    if progress := job.progress():
-                        board.show_running(job.name, *progress)
-        finally:
+    context, waiting, running = multiprocessing.get_context("spawn"), list(jobs), {}
+    attempts = dict.fromkeys((job.name for job in jobs), 0)
+    try:
+        while waiting or running:
+            while waiting and len(running) < (options.workers or 1):
+                job = waiting.pop(0)
+                attempts[job.name] += 1
+                # A pool for each job: a worker that is killed breaks its own pool only.
+                pool = ProcessPoolExecutor(1, context)
+                running[pool.submit(run_in_worker, job, wait)] = job, pool
+            ended, _ = wait_for(running, _POLL_SECONDS, FIRST_COMPLETED)
+            for future in ended:
+                job, pool = running.pop(future)
+                pool.shutdown(wait=False)
+                error = future.exception()
+                if error is None:
+                    yield JobOutcome(job, future.result(), attempts[job.name])
+                elif not isinstance(error, Exception):  # the worker was told to stop
+                    raise error
+                elif attempts[job.name] <= options.retries:
+                    waiting.append(job)
+                else:
+                    yield _failed(job, attempts[job.name], error)
+            for job, _ in running.values():
+                if progress := job.progress():
+                    board.show_running(job.name, *progress)
+    finally:
+        for _, pool in running.values():
             pool.shutdown(wait=False, cancel_futures=True)
-            if pending:
-                for process in multiprocessing.active_children():
-                    process.terminate()
+        if running:
+            for process in multiprocessing.active_children():
+                process.terminate()
 
 
 def _failed(job: Job, attempts: int, error: BaseException) -> JobOutcome:

@@ -271,7 +271,7 @@ def test_commands(tmp_path):
     options += ["--tasks", "1", "--episodes", "4"]
     result = CliRunner().invoke(cli, ["evaluate", "--agent", "stay", *options])
     assert result.exit_code == 0, result.output
-    assert f"1 result in {tmp_path / 'run'}" in result.output
+    assert f"1 result in {tmp_path / 'run'}, 1 program compiled" in result.output
     (path,) = (tmp_path / "run" / "tasks").iterdir()
     assert read_result(path).returns == [[40.0] * 4]
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])

@@ -16,6 +16,8 @@ from icrl4aht_baselines.online.responses import (
     ResponseOptions,
     best_of,
     find_behaviours,
+    responses_table,
+    trained_response,
     with_headroom,
     write_responses,
 )
@@ -58,14 +60,14 @@ def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
     assert not any(job.is_finished() for job in jobs)
     finished(jobs[0], choice=10.0, earned=9.0)
     finished(jobs[1], choice=8.0, earned=20.0)
-    entry = best_of(jobs[:2])
+    entry = best_of(behaviour, map(trained_response, jobs[:2]))
     assert (entry.best, entry.agent) == (9.0, "best response, seed 0")
     assert [one.acting for one in entry.seeds] == ["greedy"] * 2
     path = tmp_path / "responses.json"
     write_responses(jobs[:1], path)
     first = read_best_responses(path)
-    assert first.behaviours == (best_of(jobs[:1]),)
-    write_responses(jobs, path)
+    assert first.behaviours == (best_of(behaviour, [trained_response(jobs[0])]),)
+    write_responses(jobs[1:], path)  # the first training is kept
     second = read_best_responses(path)
     assert second.behaviours == (entry,)
     assert second.version != first.version
@@ -73,6 +75,11 @@ def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
     write_responses(jobs, path, models)
     (third,) = read_best_responses(path).behaviours
     assert (third.best, third.agent, third.seeds) == (9.5, "better", entry.seeds)
+    assert "| demo_wide | test | H1 t0 | 9.5 | better | 9.0 to 20.0 | 2 | 400 | +0.0 |" in responses_table(path)
+    pair = ResponseJob(Behaviour((DEMO[0], DEMO[1])), 0, TINY, tmp_path / "pair")
+    finished(pair, choice=1.0, earned=1.0)
+    write_responses([pair], path)
+    assert [one.tasks for one in read_best_responses(path).behaviours] == [(DEMO[0].task_id, DEMO[1].task_id)]
     other = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
     assert not other.is_finished()  # a result of other settings
 
@@ -88,7 +95,11 @@ def test_table_of_the_adaptation_headroom(tmp_path):
         (tmp_path / job.name / "result.json").write_text(json.dumps(result))
         assert job.is_finished()
     write_adaptation(jobs, tmp_path)
-    assert adaptation_table(tmp_path).splitlines()[-1] == "| demo_wide | 10.5 | 5.5 | +5.0 (-7.7 to +17.7) | 2 | 400 |"
+    row = "| demo_wide | 2 | 10.5 | 5.5 | +5.0 (-7.7 to +17.7) | 2 | 400 |"
+    assert adaptation_table(tmp_path).splitlines()[-1] == row
+    write_adaptation([job for job in jobs if job.seed == 0], tmp_path)
+    assert "| 2 | 400 |" in adaptation_table(tmp_path), "a measurement of fewer seeds replaces none"
+    assert write_adaptation(headroom_jobs({"other": DEMO[2:3]}, 1, TINY, tmp_path), tmp_path).read_text().count("demo")
 
 
 def test_every_task_must_be_played(tmp_path):

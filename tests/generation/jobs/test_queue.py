@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+import pickle
+import signal
+from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
 
 import pytest
+from icrl4aht_baselines.training.stopping import TrainingStopped
 from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.jobs.job import FailedJobsError, OnUpdate
 from icrl4aht_generation.jobs.options import QueueOptions
@@ -28,6 +31,7 @@ class FileJob:
     name: str
     failures: int = 0
     busy: bool = False
+    killed: bool = False
     updates: int = 1
     xla_threads: int | None = 1
 
@@ -51,6 +55,8 @@ class FileJob:
         tries.write_text(tries.read_text() + "x" if tries.exists() else "x")
         if len(tries.read_text()) <= self.failures:
             raise ValueError(f"attempt {len(tries.read_text())}")
+        if self.killed:
+            os.kill(os.getpid(), signal.SIGKILL)
         (self.out / self.name).write_text(str(os.getpid()))
 
 
@@ -61,22 +67,31 @@ def run(jobs, out: Path, **options) -> str:
 
 
 def test_local_processes(tmp_path):
-    """Two workers: every job has a process of its own, one that fails once is tried again, one always fails."""
+    """Two workers: every job has a process of its own, one that fails once is tried again, one always fails, one is
+    killed."""
     jobs = [FileJob(tmp_path, "good"), FileJob(tmp_path, "busy", busy=True), FileJob(tmp_path, "bad", failures=9)]
-    jobs.append(FileJob(tmp_path, "later", failures=1))
-    with pytest.raises(FailedJobsError, match=r"1 of 4 jobs are unfinished: bad; .*failed\.jsonl has the reasons"):
+    jobs += [FileJob(tmp_path, "killed", killed=True), FileJob(tmp_path, "later", failures=1)]
+    with pytest.raises(FailedJobsError, match=r"2 of 5 jobs are unfinished: bad, killed; .*has the reasons"):
         run(jobs, tmp_path, workers=2, retries=1)
     pids = {(tmp_path / name).read_text() for name in ("good", "busy", "later")}
     assert len(pids) == 3
     assert str(os.getpid()) not in pids
-    (line,) = map(json.loads, (tmp_path / "failed.jsonl").read_text().splitlines())
-    assert (line["task_id"], line["attempts"], line["error"]) == ("bad", 2, "ValueError: attempt 2")
-    assert "test_queue.py" in line["traceback"]
+    lines = {line["task_id"]: line for line in map(json.loads, (tmp_path / "failed.jsonl").read_text().splitlines())}
+    assert lines.keys() == {"bad", "killed"}
+    assert (lines["bad"]["attempts"], lines["bad"]["error"]) == (2, "ValueError: attempt 2")
+    assert "test_queue.py" in lines["bad"]["traceback"]
+    assert lines["killed"]["error"].startswith("BrokenProcessPool: ")
     (tmp_path / "bad.tries").write_text("x" * 9)
+    jobs[3] = replace(jobs[3], killed=False)
     printed = run(jobs, tmp_path)
     assert printed.count("finished before") == 3
     assert not (tmp_path / "failed.jsonl").exists()
     assert (tmp_path / "bad").read_text() == str(os.getpid())
+
+
+def test_a_stopped_training_can_be_passed_between_processes():
+    stopped = pickle.loads(pickle.dumps(TrainingStopped(signal.SIGTERM, "saved")))
+    assert (stopped.code, str(stopped)) == (143, "saved")
 
 
 def test_jobs_of_a_rebuild_have_names_and_updates(tmp_path):
