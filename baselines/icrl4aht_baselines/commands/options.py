@@ -329,7 +329,7 @@ def variant_names(command: str) -> Names:
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
 
 
-_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "obs", "labels", "every", "weights", "curriculum", "mirror")
+_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "mirror")
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:
