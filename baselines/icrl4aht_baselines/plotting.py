@@ -33,7 +33,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     labels = list(dict.fromkeys(label for curves in panels.values() for label in curves))
     of_returns = [curve for name, curves in panels.items() if name.startswith(_RETURN) for curve in curves.values()]
     limits = return_limits(float(np.mean(values)) for curve in of_returns for values in curve.values())
-    figure, grid = _panel_grid(
+    figure, grid = panel_grid(
         [name if name.startswith(_RETURN) else name.replace("_", " ") for name in panels],
         min(4 if len(panels) > 9 else 3, len(panels)),
         (4.2, 2.6),
@@ -49,7 +49,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     save_figure(figure, path)
 
 
-def _panel_grid(
+def panel_grid(
     titles: Sequence[str], columns: int, size: tuple[float, float], x_label: str, **sharing: Any
 ) -> tuple[Any, list[Any]]:
     """Return a figure and its axes: a panel of this size in inches for each title, and hidden ones in the last row."""
@@ -126,7 +126,7 @@ def plot_return_curves(
         references: title -> reference ego, stay, random or oracle -> its mean return, drawn as a level line.
     """
     columns = min(4, len(panels))
-    figure, grid = _panel_grid([*panels], columns, (2.7, 1.9), "episode", sharex=True, sharey=True)
+    figure, grid = panel_grid([*panels], columns, (2.7, 1.9), "episode", sharex=True, sharey=True)
     labels = list(dict.fromkeys(label for runs in panels.values() for label in runs))
     limits = []
     for axes, (title, runs) in zip(grid, panels.items(), strict=False):

@@ -296,7 +296,8 @@ class _Steps:
         kinds += [(f"test-{protocol}", protocol, seeds, False) for protocol, seeds in TEST_SEEDS.items()]
         kinds += [("test-seeded-forgets", "seeded", 1, True)] if recipe.forgets else []
         for kind, protocol, seeds, forgets in kinds:
-            tasks, folder = self._tasks(kind), self.out / "results" / f"{name}-{self.track}" / kind
+            tasks = bundled_tasks(self.track, kind if kind in VALIDATION_KINDS else "test")
+            folder = self.out / "results" / f"{name}-{self.track}" / kind
             agent, played = find_agent(run, greedy=recipe.greedy), get_protocol(protocol)
             was_done = len(list((folder / "tasks").glob("*.json"))) >= len(tasks)
             with self.timed(f"results/{name}-{self.track}/{kind}", was_done=was_done):
@@ -314,11 +315,6 @@ class _Steps:
             note_results(folder, run, tasks)
             found[kind] = folder
         return found
-
-    def _tasks(self, kind: str) -> list[Task]:
-        if kind in VALIDATION_KINDS:
-            return bundled_tasks(self.track, kind)
-        return bundled_tasks(self.track, "test")
 
     @contextmanager
     def timed(self, part: str, was_done: bool = False) -> Iterator[None]:

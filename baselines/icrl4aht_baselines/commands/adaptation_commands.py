@@ -9,59 +9,30 @@ from typing import Any
 import click
 from icrl4aht_generation.jobs.command_line import queue_options, read_queue_options
 
+from icrl4aht_baselines.commands import options as shared
 from icrl4aht_data.benchmark.best_responses import best_responses_file
-from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.commands.dataclass_options import TopicCommand, topic
-from icrl4aht_data.commands.options import COUNT, FAMILY, LAYOUT, TRACK, Folder, Names, examples
+from icrl4aht_data.commands.options import COUNT, FAMILY, Folder, Names, examples
 from icrl4aht_data.errors import EmptySelectionError
-from icrl4aht_data.overcooked.layouts import get_layout
 
 _tasks_topic = topic(
     "Tasks",
-    click.option("--track", type=TRACK, multiple=True, help="Only tasks of this track; repeat.", show_default="all"),
+    shared.track_option,
     click.option(
         "--split",
         "splits",
-        type=Names("split", lambda: ("test", "validation", "diverse")),
+        type=shared.EVALUATION_SPLIT,
         multiple=True,
         default=("test",),
         help="test, validation or diverse; repeat for several.",
     ),
-    click.option("--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several."),
+    shared.only_layouts_option,
     click.option("--family", "families", type=FAMILY, multiple=True, help="Only with this family; repeat."),
-    click.option(
-        "--manifest",
-        type=click.Path(path_type=Path, exists=True, dir_okay=False),
-        metavar="FILE",
-        help="Tasks of this file instead.",
-    ),
+    shared.manifest_option,
 )
-
-
-def _chosen_tasks(
-    track: tuple[str, ...],
-    splits: tuple[str, ...],
-    layouts: tuple[str, ...],
-    families: tuple[str, ...],
-    manifest: Path | None,
-) -> list[Task]:
-    from icrl4aht_baselines.evaluate.protocols import bundled_tasks
-
-    given = (
-        read_tasks(manifest)
-        if manifest
-        else [task for split in splits for name in track or TRACKS for task in bundled_tasks(name, split)]
-    )
-    names = {get_layout(name).name for name in layouts}
-    chosen = [
-        task
-        for task in given
-        if (not names or task.layout.name in names) and (not families or task.teammate_family in families)
-    ]
-    if not chosen:
-        raise EmptySelectionError("no task passes --track, --split, --layout and --family; leave one of them out")
-    return chosen
+_seeds_option = click.option("--seeds", type=COUNT, default=3, help="Trainings of each ego, with different seeds.")
+_tasks_option = click.option("--tasks", type=COUNT, default=128, help="Episodes that are played at once.")
 
 
 def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, float]]:
@@ -89,9 +60,9 @@ def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, floa
 @_tasks_topic
 @topic(
     "Training",
-    click.option("--seeds", type=COUNT, default=3, help="Trainings with each behaviour."),
+    _seeds_option,
     click.option("--steps", type=COUNT, default=3_000_000, help="Environment steps of a training."),
-    click.option("--tasks", type=COUNT, default=128, help="Episodes that are played at once."),
+    _tasks_option,
     click.option(
         "--init",
         "inits",
@@ -140,7 +111,7 @@ def best_response_command(
     )
 
     limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
-    chosen = with_headroom(_chosen_tasks(**choice))
+    chosen = with_headroom(shared.chosen_tasks(**choice))
     if not chosen:
         raise EmptySelectionError("none of these tasks has headroom; choose others")
     console, behaviours = Console(soft_wrap=True), find_behaviours(chosen)
@@ -168,9 +139,9 @@ def best_response_command(
 @topic(
     "Training",
     click.option("--together", is_flag=True, help="One ego for all layouts instead of one for each."),
-    click.option("--seeds", type=COUNT, default=3, help="Trainings of each kind of ego."),
+    _seeds_option,
     click.option("--steps", type=COUNT, default=8_000_000, help="Environment steps of a training."),
-    click.option("--tasks", type=COUNT, default=128, help="Episodes that are played at once."),
+    _tasks_option,
 )
 @topic("Machines", queue_options)
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/adaptation", help="Write trainings here.")
@@ -201,7 +172,7 @@ def adaptation_headroom_command(
 
     limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
     sets: dict[str, list[Task]] = defaultdict(list)
-    for task in _chosen_tasks(**choice):
+    for task in shared.chosen_tasks(**choice):
         where = "all" if together else task.layout.name
         sets["-".join((task.track, task.split, where, *choice["families"]))].append(task)
     console, jobs = Console(soft_wrap=True), headroom_jobs(sets, seeds, ResponseOptions(steps, tasks), out)

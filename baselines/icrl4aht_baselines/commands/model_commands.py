@@ -15,7 +15,6 @@ from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue
 from icrl4aht_data.commands.options import (
     COUNT,
-    LAYOUT,
     TRACK,
     Folder,
     NewFile,
@@ -45,7 +44,7 @@ from icrl4aht_data.utils.progress import progress_bars
 )
 @shared.greedy_option
 @shared.root_option
-@click.option("--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several.")
+@shared.only_layouts_option
 @shared.history_filters
 @click.option("--histories", type=COUNT, default=8, help="Histories with each teammate.")
 @click.option("--episodes", type=click.IntRange(min=10), default=60, help="Episodes of each history, of 100 steps.")

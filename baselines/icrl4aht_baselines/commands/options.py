@@ -20,11 +20,12 @@ from icrl4aht_baselines.training.options import (
     PlayOptions,
     TrainOptions,
 )
-from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS
-from icrl4aht_data.benchmark.tasks import read_tasks
+from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS, TRACKS
+from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options, topic
-from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, SEED, Folder, Names, Root
-from icrl4aht_data.errors import UnknownNameError
+from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, SEED, TRACK, Folder, Names, Root
+from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.options import Positive
 
 
@@ -103,9 +104,22 @@ greedy_option = click.option(
     help="Take the most probable actions of a trained model, or draw its actions.",
     show_default="greedy; a bundled model's own, see `models`",
 )
+EVALUATION_SPLIT = Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS"))
+track_option = click.option(
+    "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
+)
+only_layouts_option = click.option(
+    "--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several."
+)
+manifest_option = click.option(
+    "--manifest",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    help="Tasks of this file instead of the tracks' tasks.",
+)
 evaluation_split_option = click.option(
     "--split",
-    type=Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS")),
+    type=EVALUATION_SPLIT,
     help="Which tasks: test, or validation and diverse, by which models are chosen.",
     show_default="test",
 )
@@ -135,6 +149,32 @@ gifs_option = click.option(
 root_option = click.option(
     "--root", type=Root(), metavar="ROOT", help="A release: folder or address.", show_default="the bundled mini release"
 )
+
+
+def chosen_tasks(
+    track: Iterable[str],
+    splits: Iterable[str],
+    layouts: Iterable[str],
+    manifest: Path | None,
+    families: Iterable[str] = (),
+) -> list[Task]:
+    """Return the tasks that options choose: those of a manifest, or of tracks and splits in the package.
+
+    Raises:
+        EmptySelectionError: if there is none on these layouts with these families.
+    """
+    from icrl4aht_baselines.evaluate.protocols import bundled_tasks
+
+    bundled = ((name, split) for split in splits for name in track)
+    given = read_tasks(manifest) if manifest else [task for each in bundled for task in bundled_tasks(*each)]
+    names = {get_layout(name).name for name in layouts}
+    chosen = [task for task in given if not names or task.layout.name in names]
+    chosen = [task for task in chosen if not families or task.teammate_family in families]
+    if not chosen:
+        found = manifest or f"the tasks of split {' and '.join(splits)}"
+        wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in (("on", names), ("with", families)) if of)
+        raise EmptySelectionError(f"no task{wanted} in {found}: choose another --layout or --family, or none")
+    return chosen
 
 
 def add_options(command: Any, options: Iterable[Callable[[Any], Any]]) -> Any:
@@ -329,7 +369,7 @@ def variant_names(command: str) -> Names:
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
 
 
-_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "obs", "labels", "every", "weights", "curriculum", "mirror")
+_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "mirror")
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:

@@ -11,11 +11,8 @@ from icrl4aht_generation.teammates.instances import published_task
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.training.options import HistoryOptions
-from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
-from icrl4aht_data.commands.options import LAYOUT, SEED, TRACK, Folder, NewFile, examples, overwrite_option
-from icrl4aht_data.errors import EmptySelectionError
+from icrl4aht_data.commands.options import LAYOUT, SEED, Folder, NewFile, examples, overwrite_option
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.utils.files import check_output
@@ -46,17 +43,10 @@ from icrl4aht_data.utils.text import counted_noun
 @shared.forget_option
 @shared.controls_option
 @shared.protocol_option
-@click.option(
-    "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
-)
+@shared.track_option
 @shared.evaluation_split_option
-@click.option("--layout", type=LAYOUT, multiple=True, help="Only tasks on this layout; repeat for several.")
-@click.option(
-    "--manifest",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
-    help="Tasks of this file instead of the tracks' tasks; not with --split.",
-)
+@shared.only_layouts_option
+@shared.manifest_option
 @shared.tasks_option
 @shared.episodes_option
 @shared.suite_option
@@ -72,7 +62,7 @@ def evaluate_command(
     protocol: str,
     track: tuple[str, ...],
     split: str | None,
-    layout: tuple[str, ...],
+    layouts: tuple[str, ...],
     manifest: Path | None,
     tasks: int | None,
     episodes: int | None,
@@ -91,7 +81,7 @@ def evaluate_command(
     from icrl4aht_baselines.evaluate.controls import evaluate_controls
     from icrl4aht_baselines.evaluate.evaluator import evaluate
     from icrl4aht_baselines.evaluate.programs import Programs
-    from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
+    from icrl4aht_baselines.evaluate.protocols import get_protocol, limit_tasks
     from icrl4aht_baselines.evaluate.segments import CONTROLS
     from icrl4aht_baselines.report.controls import control_lines
     from icrl4aht_baselines.report.page import summary_lines
@@ -99,16 +89,10 @@ def evaluate_command(
 
     if manifest and split:
         raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
-    split = split or "test"
-    given = read_tasks(manifest) if manifest else [task for name in track for task in bundled_tasks(name, split)]
     if forget and controls:
         raise click.UsageError("--controls: not with --forget, which is one of the controls; leave one of them out")
     ego = find_ego("--agent", agent, acting=acting, greedy=greedy)
-    names = {get_layout(name).name for name in layout}
-    chosen = limit_tasks([task for task in given if not names or task.layout.name in names], tasks)
-    if not chosen:
-        found = manifest or f"the {split} tasks"
-        raise EmptySelectionError(f"no task on {', '.join(sorted(names))} in {found}: choose another --layout, or none")
+    chosen = limit_tasks(shared.chosen_tasks(track, (split or "test",), layouts, manifest), tasks)
     for name in {task.layout.name for task in chosen}:
         ego.make(get_layout(name))  # a model that does not fit fails before any work
     if chosen_seeds:

@@ -37,12 +37,10 @@ class StepOutput(NamedTuple):
     Attributes:
         head: the head's output, float (B, L, ..).
         next_obs: float (B, L, N), predicted observation after taking the action; None without +next_obs.
-        teammate: float (B, L, A), logits of the teammate's action at the same step; None if they are not predicted.
     """
 
     head: Any
     next_obs: Float[Array, "B L N"] | None
-    teammate: Float[Array, "B L A"] | None = None
 
 
 class WindowMemory(NamedTuple):
@@ -71,21 +69,16 @@ class StepModel(nn.Module):
     trunk: nn.Module
     head: nn.Module
     next_obs: nn.Module | None = None
-    teammate: nn.Module | None = None
 
     def __call__(
-        self,
-        steps: StepInput,
-        actions: Int[Array, "B L"] | None = None,
-        deterministic: bool = True,
+        self, steps: StepInput, actions: Int[Array, "B L"] | None = None, deterministic: bool = True
     ) -> StepOutput:
-        """Return the output for windows of steps, with the auxiliary predictions if actions are given."""
+        """Return the output for windows of steps, with the auxiliary prediction if actions are given."""
         trunk: Any = self.trunk
         tokens_BxLxD = self.tokens(steps, deterministic)
         features_BxLxD = trunk(tokens_BxLxD, deterministic=deterministic)
         predicted = None if self.next_obs is None or actions is None else self.next_obs(features_BxLxD, actions)
-        mate = None if self.teammate is None or actions is None else self.teammate(features_BxLxD)
-        return StepOutput(self.head(features_BxLxD), predicted, mate)
+        return StepOutput(self.head(features_BxLxD), predicted)
 
     def start(self, context: int, cached: bool) -> Any:
         """Return the memory of an ego before its first step."""
@@ -135,9 +128,7 @@ def dropped_steps(context: int) -> int:
 
 def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
     """Return a model of steps with the given trunk and head."""
-    teammate = nn.Dense(world.actions) if options.teammate_loss else None
-    next_obs = make_next_obs_head(options, world)
-    return StepModel(make_tokens(StepTokens, options, world), trunk, head, next_obs, teammate)
+    return StepModel(make_tokens(StepTokens, options, world), trunk, head, make_next_obs_head(options, world))
 
 
 def step_method(name: str, label: str, model: StepModel, loss: Loss, world: World, **settings: Any) -> Method:
@@ -155,17 +146,13 @@ def example_step(world: World) -> StepInput:
 
 
 def auxiliary_losses(output: StepOutput, steps: StepInput, batch: ADBatch, world: World) -> dict[str, Array]:
-    """Return the losses of the model's predictions of the next observation and of the teammate's action, by name."""
-    losses, mask = {}, jnp.asarray(batch.attention_mask)
-    if output.next_obs is not None:
-        # Steps count whose successor is in the window and in the same episode.
-        errors = squared_error(output.next_obs[:, :-1], world.observations(steps.obs)[:, 1:])
-        losses["next_obs_loss"] = mean_of_rows(errors, mask[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1])
-    if output.teammate is not None:
-        # A step's successor shows the teammate's action, in the next episode as well.
-        errors = cross_entropy(output.teammate[:, :-1], jnp.asarray(batch.prev_teammate_actions)[:, 1:], 0.0)
-        losses["teammate_loss"] = mean_of_rows(errors, mask[:, 1:])
-    return losses
+    """Return the loss of the model's prediction of the next observation, by name; empty if there is none."""
+    if output.next_obs is None:
+        return {}
+    # Steps count whose successor is in the window and in the same episode.
+    errors = squared_error(output.next_obs[:, :-1], world.observations(steps.obs)[:, 1:])
+    valid = jnp.asarray(batch.attention_mask)[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1]
+    return {"next_obs_loss": mean_of_rows(errors, valid)}
 
 
 def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:

@@ -99,9 +99,6 @@ class ModelOptions:
     )
     reward_scale: Annotated[Positive, Option("Factor of the rewards in tokens; a delivery earns 20.")] = 1.0
     next_obs: Annotated[bool, Option("+next_obs: also learn to predict the next observation.")] = False
-    teammate_loss: Annotated[
-        bool, Option("With --ta: also learn to predict the teammate's action (ad, hybrid_ad).")
-    ] = False
     label_smoothing: Annotated[ShareBelowOne, Option("Label smoothing of the action loss.")] = 0.0
     discounts: Annotated[
         tuple[ShareBelowOne, ...],
@@ -113,8 +110,6 @@ class ModelOptions:
 
     def __post_init__(self) -> None:
         check_options(self)
-        if self.teammate_loss and not self.teammate_actions:
-            raise OptionError("teammate_loss = True: expected teammate_actions as well; give --ta, or leave it out")
         if self.width % (2 * self.heads):
             raise OptionError(f"width = {self.width}: expected a multiple of twice the heads ({2 * self.heads})")
 
@@ -123,12 +118,12 @@ _UNUSED_WITHOUT_TRANSFORMER = {"layers", "heads", "positions", "remat"}
 
 UNUSED_OPTIONS: dict[str, set[str]] = {
     "ad": {"recurrent_layers", "discounts"},
-    "dpt": {"recurrent_layers", "discounts", "teammate_loss"},
+    "dpt": {"recurrent_layers", "discounts"},
     "hybrid_ad": {"discounts", *_UNUSED_WITHOUT_TRANSFORMER},
-    "amago_offline": {"recurrent_layers", "teammate_loss"},
+    "amago_offline": {"recurrent_layers"},
     "rl2": {
         *_UNUSED_WITHOUT_TRANSFORMER,
-        *("discounts", "dropout", "next_obs", "teammate_loss", "label_smoothing", "bfloat16"),
+        *("discounts", "dropout", "next_obs", "label_smoothing", "bfloat16"),
         *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),
     },
 }

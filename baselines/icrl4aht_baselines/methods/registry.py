@@ -13,10 +13,10 @@ from icrl4aht_baselines.methods.amago_offline import amago_offline
 from icrl4aht_baselines.methods.dpt import dpt
 from icrl4aht_baselines.methods.hybrid_ad import hybrid_ad
 from icrl4aht_baselines.methods.method import Method, World
-from icrl4aht_baselines.methods.options import UNUSED_OPTIONS, ModelOptions
+from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.rl2 import rl2
 from icrl4aht_baselines.methods.tokens import FEATURES, BatchView
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.plugins import METHOD_GROUP, Plugins
@@ -43,15 +43,12 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
     Raises:
         UnknownNameError: if there is no such method; lists the valid names and the nearest.
         PluginError: if a registered method cannot be used; also raised by the returned function.
-        OptionError: from the returned function, if `teammate_loss` is set for a method without this prediction.
     """
     if name not in METHODS and name not in METHOD_PLUGINS.names:
         raise unknown("method", name, all_methods())
     make = METHODS.get(name) or METHOD_PLUGINS.load(name, Callable)
 
     def make_checked(options: ModelOptions, world: World) -> Method:
-        if options.teammate_loss and "teammate_loss" in UNUSED_OPTIONS.get(name, ()):
-            raise OptionError(f"teammate_loss = True: {name} does not predict the teammate's action; leave it out")
         method = make(options, world)
         if name in METHODS:
             return method

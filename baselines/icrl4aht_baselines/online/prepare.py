@@ -112,7 +112,7 @@ def prepare_play(
 
 def _check_unused(name: str, histories: HistoryOptions) -> None:
     default = HistoryOptions(histories.layouts)
-    for field in ("order", "queries", "labels", "every", "weights", "curriculum", "held_out", "obs"):
+    for field in ("order", "queries", "labels", "every", "held_out"):
         found = getattr(histories, field)
         if found != getattr(default, field):
             raise OptionError(f"{field} = {found}: {name} learns by playing, not from histories; leave it out")

@@ -312,15 +312,18 @@ class ResponseJob(TrainingJob):
         mates = [build_teammate(task.layout, task.teammate)] * self.options.tasks
         group = TaskGroup([task.layout], task.teammate_kind, mates, False, task.layout.name)
         if self.options.init:
-            params = read_trained(_bundled_run(self.options.init, task.layout)).params
+            models = bundled_models()
+            if self.options.init not in models:
+                raise unknown("bundled model", self.options.init, models)
+            params = read_trained(models[self.options.init].runs[track_of(task.layout.name)]).params
         trainer, params = self.train([task.layout], [group], on_update, params)
         modes = {}
         for mode, greedy in (("greedy", True), ("sampled", False)):
-            policy = learned(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy))
-            policy = with_view(policy, "canonical")
+            policy = with_view(learned(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical")
             choice, report = (self._mean_return(policy, seeds) for seeds in (CHOICE_SEEDS, REPORT_SEEDS))
             modes[mode] = {"choice": choice, "return": report}
-        returns = _logged_returns(self.folder / "run" / METRICS)
+        lines = map(parse_json, read_text(self.folder / "run" / METRICS).splitlines())
+        returns = [value for line in lines for name, value in line.items() if name.startswith("return ")]
         last, before = returns[len(returns) * 3 // 4 :], returns[len(returns) // 2 : len(returns) * 3 // 4]
         slope = float(np.mean(last) - np.mean(before)) if len(before) else 0.0
         return {"modes": modes, "slope": round(slope, 3)}
@@ -331,18 +334,6 @@ class ResponseJob(TrainingJob):
         tasks = list(self.behaviour.tasks)
         results = evaluate("best response", lambda layout: policy, tasks, get_protocol(PROTOCOL), **played)
         return round(float(np.mean([result.returns for result in results])), 3)
-
-
-def _logged_returns(path: Path) -> list[float]:
-    lines = [parse_json(line) for line in read_text(path).splitlines()]
-    return [value for line in lines for name, value in line.items() if name.startswith("return ")]
-
-
-def _bundled_run(name: str, layout: Layout) -> Path:
-    models = bundled_models()
-    if name not in models:
-        raise unknown("bundled model", name, models)
-    return models[name].runs[track_of(layout.name)]
 
 
 def trained_response(job: ResponseJob) -> TrainedResponse:

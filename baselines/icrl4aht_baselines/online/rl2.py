@@ -165,7 +165,9 @@ class _Player:
         self.groups, self._method, self._play, self._mirror = groups, method, play, mirror
         teammates = [mate for group in groups for mate in group.teammates]
         self.tasks = len(teammates)
-        self._hidden = np.repeat([group.hidden for group in groups], [len(group.teammates) for group in groups])
+        sizes = [len(group.teammates) for group in groups]
+        self.ends = np.cumsum(sizes)[:-1]  # number of the first task of each group but the first
+        self._hidden = np.repeat([group.hidden for group in groups], sizes)
         told = [group.partners for group in groups if group.partners is not None]
         self._partners = jnp.asarray(np.concatenate(told), jnp.int32) if told else None
         # A model whose view never changes needs no code for it, which is a part of every step and of its compilation.
@@ -402,8 +404,7 @@ class PlayTrainer:
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
         by_name: dict[str, list[Array]] = defaultdict(list)
         for player, own in zip(self.players, returns, strict=True):
-            ends = np.cumsum([len(group.teammates) for group in player.groups])[:-1]
-            for group, of_group in zip(player.groups, jnp.split(own, ends), strict=True):
+            for group, of_group in zip(player.groups, jnp.split(own, player.ends), strict=True):
                 by_name[group.name].append(of_group)
         log |= {f"return {name}": jnp.concatenate(own).mean() for name, own in by_name.items()}
         return PlayState(params, optimizer, tasks, state.step + 1), log
@@ -423,8 +424,7 @@ class PlayTrainer:
             for step in range(episodes):
                 state, _, own = player.compiled(params, player.mates, state, jax.random.fold_in(key, step + 1))
                 returns.append(np.asarray(own, np.float64))
-            ends = np.cumsum([len(group.teammates) for group in player.groups])[:-1]
-            found += np.split(np.stack(returns, axis=-1), ends)
+            found += np.split(np.stack(returns, axis=-1), player.ends)
         return found
 
     def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.results import (
     CELL_COLUMNS,
     EPISODE_BLOCKS,
@@ -39,7 +40,7 @@ from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_headroom
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import legend_below, new_figure, return_limits, save_figure
+from icrl4aht_data.plotting import legend_below, return_limits, save_figure
 from icrl4aht_data.reading.arrow_tables import import_pyarrow
 from icrl4aht_data.utils.files import atomic_write, write_json
 from icrl4aht_data.utils.templates import card_file, fill_template, markdown_table
@@ -308,8 +309,7 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
     """
     scales, results, headroom = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), read_headroom(SUBMITTED_PROTOCOL)
     layouts = figure_layouts()
-    figure = new_figure(11, 3 * -(-len(layouts) // 3) + 0.6)
-    grid = [*figure.subplots(-(-len(layouts) // 3), 3, squeeze=False).flat]
+    figure, grid = panel_grid(layouts, 3, (3.6, 3), "episode")
     shown = [agent for agent in results if not stored.agents[agent].commit]
     curves = {
         key: of.sort_values("episode")["return"].to_numpy()
@@ -333,11 +333,6 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
         axes.set_xscale("log")
         axes.set_xlim(0.9, 110)
         axes.set_xticks([1, 2, 5, 10, 20, 50, 100], ["1", "2", "5", "10", "20", "50", "100"])
-        axes.set_title(layout, fontsize=9)
-        axes.set_xlabel("episode", fontsize=8)
-        axes.grid(alpha=0.3)
-    for axes in grid[len(layouts) :]:
-        axes.set_axis_off()
     grid[0].set_ylabel("return of an episode", fontsize=8)
     legend_below(figure)
     save_figure(figure, path)

@@ -32,7 +32,6 @@ from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.splitting import choose_histories, choose_teammates
-from icrl4aht_data.sampling.draws import Curriculum
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.hashes import file_hash
 
@@ -79,7 +78,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     parts = {"train": split.train, "histories": split.histories, "teammates": split.teammates}
     samplers = {
         part: number_layouts(
-            _sampler(method, selection, options, model, histories, labels, training=part == "train"),
+            _sampler(method, selection, options, model, histories, labels),
             dataset.layouts,
             histories.mirror,
         )
@@ -138,7 +137,7 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
     """
     every = ALL_LAYOUTS in histories.layouts
     names = None if every else [get_layout(name).name for name in histories.layouts]
-    release = load_icrl4aht(histories.root, obs=histories.obs or "uint8")
+    release = load_icrl4aht(histories.root, obs="uint8")
     found = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
     differ = len({layout.obs_shape for layout in found.layouts}) > 1
     channels = histories.channels or ("canonical" if every or differ else "own")
@@ -148,7 +147,7 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
             f"unequal number: leave out --channels or take canonical, or train on one of them, such as --layout "
             f"{found.layouts[0].name}"
         )
-    options: Any = {"obs": "state" if histories.obs is None and found.has_states else None, "channels": channels}
+    options: Any = {"obs": "state" if found.has_states else None, "channels": channels}
     filters: Any = {FILTERS[name]: list(values) for name, values in histories.filters.items()}
     validation = None
     if histories.split != VALIDATION:
@@ -218,17 +217,10 @@ def _sampler(
     model: ModelOptions,
     histories: HistoryOptions,
     labels: Labels | None,
-    *,
-    training: bool,
 ) -> Any:
-    """Return the sampler of a part of the histories; held-out ones are drawn uniformly and from all their steps."""
-    every, draws = histories.every, {}
+    """Return the sampler of a part of the histories."""
+    every = histories.every
     steps = int(dataset.column("episodes").min()) // every * dataset.info.environment.kept_steps
-    if training and histories.weights == "improvement":  # a history that does not rise counts as one that rises by 1
-        draws["weights"] = np.maximum(dataset.column("return_end") - dataset.column("return_start"), 1.0)
-    if training and histories.curriculum:
-        draws["curriculum"] = Curriculum(max(1, round(histories.curriculum * options.steps)))
-        steps = int(draws["curriculum"].first[1] * steps)  # those of the first batch, which has the fewest
     shared: Any = {
         "batch_size": options.batch_size,
         "seed": options.seed,
@@ -236,7 +228,6 @@ def _sampler(
         "labels": labels,
         "process_index": jax.process_index(),
         "process_count": jax.process_count(),
-        **draws,
     }
     if method.data == "dpt":
         if every > 1:
@@ -251,7 +242,7 @@ def _sampler(
     if options.context > steps:
         raise OptionError(
             f"context = {options.context}: the shortest history of {dataset!r} has {steps} steps for a window, with "
-            f"every = {every} and curriculum = {histories.curriculum:g}; take fewer, or choose longer histories"
+            f"every = {every}; take fewer, or choose longer histories"
         )
     return dataset.ad(length=options.context, every=every, **shared)
 
@@ -382,7 +373,6 @@ def read_trained(folder: Path) -> TrainedModel:
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
-    label += "+teammate" * model.teammate_loss
     label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # words is the network of paper
     names, digest = tuple(layout.name for layout in layouts), json_hash(config)
     hidden = tuple(histories.get("hide_recipe", ()))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.channels import Channels
-from icrl4aht_data.reading.history import Labels, Obs
+from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.options import Count, Natural, NotNegative, Option, Positive, Seed, Share, check_options
 
@@ -118,22 +118,11 @@ class HistoryOptions:
     every: Annotated[
         Count, Option("Windows hold every n-th episode of a history, so that they span more of its learning.")
     ] = 1
-    weights: Annotated[
-        Literal["uniform", "improvement"],
-        Option("Draw histories uniformly, or by how much their returns rise (improvement)."),
-    ] = "uniform"
-    curriculum: Annotated[
-        Share, Option("Share of the steps in which windows move from a history's first quarter to all of it.")
-    ] = 0.0
     held_out: Annotated[
         float,
         Meta(gt=0, lt=1),
         Option("Share of the histories to hold out; also of the tasks, if no validation histories pass the filters."),
     ] = 0.1
-    obs: Annotated[
-        Obs | None,
-        Option("Representation of observations in batches.", default="state, or uint8 if there are no state records"),
-    ] = None
     channels: Annotated[
         Channels | None,
         Option(

@@ -260,27 +260,6 @@ def test_next_observations_are_of_the_same_episode_and_follow_the_actions_taken(
     assert log(batch)["action_loss"] != log(labelled)["action_loss"]
 
 
-def test_teammate_actions_are_predicted_from_earlier_steps():
-    method, params = tiny("ad", layers=1, teammate_actions=True, teammate_loss=True)
-    batch = ad_batch()
-    loss = jax.jit(lambda b: method.loss(params, params, b, None)[1])
-    assert batch.prev_teammate_actions is not None
-    log = {name: float(value) for name, value in loss(batch).items()}
-    assert log["loss"] == pytest.approx(log["action_loss"] + log["next_obs_loss"] + log["teammate_loss"], rel=1e-5)
-    first, last = batch.prev_teammate_actions.copy(), batch.prev_teammate_actions.copy()
-    valid = int(batch.attention_mask[0].sum())
-    last[0, valid - 1] = (last[0, valid - 1] + 1) % 4  # the last action is a target, but no prediction depends on it
-    assert loss(batch._replace(prev_teammate_actions=last))["teammate_loss"] != log["teammate_loss"]
-    beyond = first.copy()
-    beyond[~batch.attention_mask] = 3
-    assert loss(batch._replace(prev_teammate_actions=beyond))["teammate_loss"] == log["teammate_loss"]
-    for name in ("dpt", "amago_offline"):
-        with pytest.raises(OptionError, match=f"teammate_loss = True: {name} does not predict the teammate's action"):
-            tiny(name, layers=1, teammate_actions=True, teammate_loss=True)
-    with pytest.raises(OptionError, match="expected teammate_actions as well; give --ta, or leave it out"):
-        ModelOptions(teammate_loss=True)
-
-
 def ego_inputs(steps: int, episode: int, seed=0) -> EgoInput:
     """Return the inputs of an ego for consecutive steps."""
     rng = np.random.default_rng(seed)
