@@ -125,7 +125,9 @@ class Index:
         """
         if name == "layout":
             return get_layout(str(value)).name
-        known = (*_KNOWN_VALUES.get(name, tuple)(), *self.values(name))
+        if value in (own := self.values(name)):
+            return value  # without reading which other packages are installed
+        known = (*_KNOWN_VALUES.get(name, tuple)(), *own)
         if value not in known:
             raise unknown(given, value, known)
         return value

@@ -48,7 +48,7 @@ def evaluated_run(
     details |= {"variant": dict([variant])} if variant else {}
     details |= {"acting": acting} if acting else {}
     shortened = dataclasses.replace(PROTOCOLS[protocol], episodes=40, steps=steps)
-    settings = {"agent": agent, "seeds": [0], "protocol": dataclasses.asdict(shortened), "code_version": "0"}
+    settings = {"agent": agent, "seeds": [0], "protocol": shortened.settings, "code_version": "0"}
     settings |= {"details": details} if details else {}
     returns = [[value] * 20 + [value + 2.0] * 20]
     return as_run([Result(task.task_id, settings, returns) for task in played], folder or f"runs/{agent}", played)
@@ -86,7 +86,7 @@ def write_results(
         details: further details of the agent, such as `forget`.
         offset: added to the returns with the second teammate of a family, twice with the third, and so on.
     """
-    settings = {"agent": agent, "seeds": [0, 1, 2], "protocol": dataclasses.asdict(get_protocol("seeded"))}
+    settings = {"agent": agent, "seeds": [0, 1, 2], "protocol": get_protocol("seeded").settings}
     details |= {} if trained_on is None else {"trained_on": [*trained_on]}
     for task in TEST_TASKS:
         if task.track == track:

@@ -59,8 +59,9 @@ def segment_lengths(protocol: Protocol, control: Control | None = None) -> tuple
 def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | None = None) -> list[PlannedTask]:
     """Return what tasks play in each segment.
 
-    A task's partner is the next task of its layout, in the order of `tasks` and in turn, with a teammate of another
-    family; if all are of one family, with another teammate. Under the control `swapped` the partner's teammate plays
+    A task's partner is of the next other family on its layout, in the order of `tasks` and in turn: the first task of a
+    family has the first one of the next family, and so on; if all are of one family, it is the next task with another
+    teammate. Under the control `swapped` the partner's teammate plays
     first. Under a protocol that swaps teammates, the task's own is followed by that of its partner, of the partner's
     partner, and so on.
 
@@ -93,8 +94,14 @@ def _partner(task: Task, on_layout: Sequence[Task]) -> Task:
     other_family = [other for other in other_dish if other.teammate_family != task.teammate_family]
     behaviour = teammate_id(task.teammate), task.recipes
     other_teammate = [other for other in following if (teammate_id(other.teammate), other.recipes) != behaviour]
-    for found in (*other_family, *other_teammate):
-        return found
+    if other_family:
+        # Of the next family the task of the same number, so that the tasks of a cell have different partners.
+        family = [other for other in other_family if other.teammate_family == other_family[0].teammate_family]
+        own = [other.task_id for other in on_layout if other.teammate_family == task.teammate_family]
+        ordered = sorted(family, key=on_layout.index)
+        return ordered[own.index(task.task_id) % len(ordered)]
+    if other_teammate:
+        return other_teammate[0]
     raise OptionError(
         f"task {task.task_id}: needs a task on {task.layout.name} with another teammate to swap with, found none among "
         f"the {len(on_layout)} given ones on it: give more tasks, of several families if possible"

@@ -1,7 +1,8 @@
-"""Stored results of agents, `cards/results.csv`, and docs/results.md, which compares them."""
+"""Stored results of agents, `cards/results.csv.gz`, and docs/results.md, which compares them."""
 
 from __future__ import annotations
 
+import gzip
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -55,7 +56,7 @@ _SIGNIFICANT = 0.05
 
 @dataclass(frozen=True)
 class StoredResults:
-    """Results of several agents: `cards/results.csv`, `cards/curves.csv` and `cards/results.json`.
+    """Results of several agents: `cards/results.csv.gz`, `cards/results_curves.csv.gz` and `cards/results.json`.
 
     Attributes:
         table: the results, see `results`.
@@ -82,7 +83,7 @@ def results_file() -> Path:
 
 
 def _table_paths(path: Path) -> tuple[Path, Path]:
-    return path.with_suffix(".csv"), path.with_name(f"{path.stem}_curves.csv")
+    return path.with_suffix(".csv.gz"), path.with_name(f"{path.stem}_curves.csv.gz")
 
 
 def read_stored(path: Path) -> StoredResults:
@@ -109,7 +110,8 @@ def write_stored(path: Path, stored: StoredResults) -> None:
     """Write stored results, rounded to three digits, curves to two."""
     for file, frame, digits in zip(_table_paths(path), (stored.table, stored.curves), (3, 2), strict=True):
         with atomic_write(file) as partial:
-            frame.round(digits).to_csv(partial, index=False, lineterminator="\n")
+            text = frame.round(digits).to_csv(index=False, lineterminator="\n")
+            partial.write_bytes(gzip.compress(text.encode(), mtime=0))  # equal results are equal bytes
     with atomic_write(path) as partial:
         write_json(partial, msgspec.to_builtins(stored.agents))
 

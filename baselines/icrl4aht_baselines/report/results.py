@@ -115,12 +115,14 @@ class CellReturns(NamedTuple):
         tasks, seeds: keys of the tasks, and the seeds.
         blocks: block of episodes -> mean returns, float64 (T, U, S), see `BLOCKS`.
         overlaps: kinds of overlap of the tasks with the training data.
+        trainings: numbers of the trainings.
     """
 
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     blocks: Mapping[str, np.ndarray]
     overlaps: tuple[str, ...] = ()
+    trainings: tuple[int, ...] = (0,)
 
     @property
     def mean(self) -> np.ndarray:
@@ -142,7 +144,11 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
         blocks = {str(name): values[..., number] for number, name in enumerate(axes[3])}
         marked = " ".join(rows["overlap"].unique()).split()
         overlaps = tuple(name for name in OVERLAPS if name in marked)
-        found[ResultCell._make(map(str, key))] = CellReturns(tuple(axes[1]), tuple(map(int, axes[2])), blocks, overlaps)
+        if np.isnan(values).any():
+            raise OptionError(f"results of {' '.join(map(str, key))}: trainings of unequal tasks, seeds or episodes")
+        trainings, seeds = (tuple(map(int, axes[number])) for number in (0, 2))
+        cell = ResultCell._make(map(str, key))
+        found[cell] = CellReturns(tuple(axes[1]), seeds, blocks, overlaps, trainings)
     return {cell: found[cell] for cell in in_order(found)}
 
 

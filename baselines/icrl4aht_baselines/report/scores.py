@@ -73,14 +73,13 @@ CellScales = Mapping[ResultCell, CellScale]
 
 
 def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
-    """Return the scales of the package's cells under a protocol, those with at least one best response."""
+    """Return the scales of the package's cells under a protocol, those of which every task has a best response."""
     measured, stays = best_responses(protocol), stay_returns(protocol)
     names = {task: f"behaviour of {best.tasks[0]}" for task, best in measured.items()}
     found: dict[ResultCell, CellScale] = {}
     for cell, tasks in bundled_cells().items() if measured else ():
-        known = [task for task in tasks if task in measured and task in stays]
-        if known:
-            scales = {task_label(task): TaskScale(stays[task], measured[task].best, names[task]) for task in known}
+        if all(task in measured and task in stays for task in tasks):
+            scales = {task_label(task): TaskScale(stays[task], measured[task].best, names[task]) for task in tasks}
             found[cell] = CellScale(scales)
     return found
 
@@ -221,12 +220,13 @@ def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellRetur
     """Return the results of two agents in a cell on the tasks, seeds and trainings that both have, in one order."""
     tasks = tuple(task for task in one.tasks if task in other.tasks)
     seeds = tuple(seed for seed in one.seeds if seed in other.seeds)
-    trainings = min(len(found.blocks["all"]) for found in (one, other))
+    trainings = tuple(number for number in one.trainings if number in other.trainings)
 
     def chosen(found: CellReturns) -> CellReturns:
         rows, columns = [found.tasks.index(task) for task in tasks], [found.seeds.index(seed) for seed in seeds]
-        blocks = {name: values[:trainings, rows][:, :, columns] for name, values in found.blocks.items()}
-        return CellReturns(tasks, seeds, blocks, found.overlaps)
+        numbers = [found.trainings.index(number) for number in trainings]
+        blocks = {name: values[numbers][:, rows][:, :, columns] for name, values in found.blocks.items()}
+        return CellReturns(tasks, seeds, blocks, found.overlaps, trainings)
 
     return chosen(one), chosen(other)
 

@@ -110,8 +110,8 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "")
     Raises:
         OptionError: see `check_submission`; also if a folder has no results, or results of another version.
     """
-    counts: dict[str, Counter[str]] = defaultdict(Counter)  # control -> task -> trainings so far
-    evaluations, tasks = [], set()
+    counts: Counter[str] = Counter()  # task -> trainings so far
+    evaluations, tasks, training = [], set(), 0
     for folder in folders:
         for control in ("", *CONTROLS):
             source = folder / control
@@ -121,17 +121,13 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "")
             settings = results[0].settings
             if any(result.settings != settings for result in results):
                 raise OptionError(f"{source}: results of different settings in one folder; evaluate again")
-            if settings["code_version"] != version("icrl4aht-data"):
-                raise OptionError(
-                    f"{source}: results of version {settings['code_version']}, expected {version('icrl4aht-data')}, "
-                    f"the installed one: evaluate again, or submit with that version"
-                )
             details = dict(settings.get("details", {}))
             declared = (trained or {}).get("config", {})
             if TRAINED_ON not in details and TRAINED_ON in declared:
                 details[TRAINED_ON] = declared[TRAINED_ON]
-            training = max(counts[control][result.task_id] for result in results)
-            counts[control].update(result.task_id for result in results)
+            if not control:  # controls are of the training of their folder
+                training = max(counts[result.task_id] for result in results)
+                counts.update(result.task_id for result in results)
             returns = {result.task_id: result.returns for result in results}
             tasks |= set() if control else returns.keys()
             evaluations.append(Evaluation(control, training, settings | {"details": details}, returns))
@@ -186,17 +182,19 @@ def check_submission(found: Submission, where: str) -> None:
 def _check_evaluation(one: Evaluation, where: str) -> None:
     rules = get_protocol(SUBMITTED_PROTOCOL)
     try:
-        protocol, seeds = one.settings["protocol"], one.settings["seeds"]
-        own = {name: protocol[name] for name in ("name", "episodes", "steps")}
+        protocol, seeds, code = (one.settings[name] for name in ("protocol", "seeds", "code_version"))
     except (KeyError, TypeError) as error:
         raise OptionError(f"{where}: settings without {error}, expected those of `evaluate`") from error
-    expected = {name: getattr(rules, name) for name in own}
-    if own != expected:
-        raise OptionError(f"{where}: protocol {own}, expected {expected}; evaluate with these rules")
-    if missing := [seed for seed in SUBMITTED_SEEDS if seed not in seeds]:
+    if code != version("icrl4aht-data"):
         raise OptionError(
-            f"{where}: seeds {missing} are missing, found {seeds}, expected {[*SUBMITTED_SEEDS]}; evaluate with "
-            f"`--seeds {len(SUBMITTED_SEEDS)}`"
+            f"{where}: results of version {code}, expected {version('icrl4aht-data')}, the installed one: evaluate "
+            f"again, or submit with that version"
+        )
+    if protocol != rules.settings:
+        raise OptionError(f"{where}: protocol {protocol}, expected {rules.settings}; evaluate with these rules")
+    if seeds != [*SUBMITTED_SEEDS]:
+        raise OptionError(
+            f"{where}: seeds {seeds}, expected {[*SUBMITTED_SEEDS]}; evaluate with `--seeds {len(SUBMITTED_SEEDS)}`"
         )
     for task, returns in one.returns.items():
         shape = len(returns), {len(row) for row in returns}

@@ -189,7 +189,7 @@ class TestPlan:
         for task, played, partners in plan_tasks(tasks, PROTOCOLS["seeded"], "swapped"):
             partner = by_id[partners[0]]
             assert (partner.layout, partner.teammate_family) == (task.layout, after[task.teammate_family])
-            assert partner.teammate["theta_id"] == 0
+            assert partner.teammate["theta_id"] == task.teammate["theta_id"]
             assert [one.teammate for one in played] == [partner.teammate, task.teammate]
             assert {one.task_id for one in played} == {task.task_id}
         families = [by_id[partner].teammate_family for partner in plan_tasks(tasks, PROTOCOLS["swap"])[0].partners]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -141,14 +142,16 @@ def test_damaged_stored_results(texts, tmp_path):
     assert len(read_stored(tmp_path / "none.json").table) == 0
     (tmp_path / "bad.json").write_text(texts)
     (tmp_path / "bad.csv").write_text("agent,protocol\n")
-    with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*restore it, bad\.csv and bad_curves\.csv"):
+    with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*restore it, bad\.csv\.gz and bad_curves"):
         read_stored(tmp_path / "bad.json")
 
 
 def test_bundled_results_are_in_canonical_form(tmp_path):
     write_stored(tmp_path / "results.json", read_stored(results_file()))
-    for name in ("results.json", "results.csv", "results_curves.csv"):
-        assert (tmp_path / name).read_bytes() == results_file().with_name(name).read_bytes()
+    for name in ("results.json", "results.csv.gz", "results_curves.csv.gz"):
+        opened = gzip.open if name.endswith(".gz") else open
+        with opened(tmp_path / name) as written, opened(results_file().with_name(name)) as bundled:
+            assert written.read() == bundled.read()
 
 
 @pytest.mark.slow

@@ -43,7 +43,7 @@ def test_a_file_has_all_results_of_all_folders(submitted):
     found = read_submission(submitted)
     assert (found.agent, found.tracks, found.facts.about) == ("rule", ["layout"], "a rule")
     parts = [(one.control, one.training, len(one.returns)) for one in found.evaluations]
-    assert parts == [("", 0, 40), ("", 1, 40), ("forgets", 0, 40)]
+    assert parts == [("", 0, 40), ("", 1, 40), ("forgets", 1, 40)]
     assert next(iter(found.evaluations[0].returns.values())) == [CURVE] * 3
     schema = json.loads(submission_schema())
     fields = schema["$defs"]["Submission"]
@@ -72,10 +72,12 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one["returns"].pop(task), "1 of the 40 test tasks of layout are missing, such as layout"),
         (lambda c, one, task: rename(one, task, OTHER), f"task {OTHER} is not one of the 40 test tasks of layout"),
         (lambda c, one, task: c.update(tracks=["teammate"]), "is not one of the 120 test tasks of teammate"),
-        (lambda c, one, task: one["settings"].update(seeds=[0, 1]), r"seeds \[2\] are missing, found \[0, 1\]"),
+        (lambda c, one, task: one["settings"].update(seeds=[0, 1]), r"seeds \[0, 1\], expected \[0, 1, 2\]"),
         (lambda c, one, task: one["returns"][task].pop(), r"has 2 lists of \[100\] returns, expected 3 of 100"),
         (lambda c, one, task: one["settings"]["protocol"].update(name="published"), "protocol {'name': 'published'"),
         (lambda c, one, task: one["settings"].pop("protocol"), "settings without 'protocol'"),
+        (lambda c, one, task: one["settings"]["protocol"].update(four_recipes=True), "'four_recipes': True"),
+        (lambda c, one, task: one["settings"].update(code_version="9"), "results of version 9, expected"),
         (lambda c, one, task: one.update(control="swap"), "control 'swap', expected forgets or swapped"),
         (lambda c, one, task: c["evaluations"].append(one), "results of a task twice"),
         (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "only controls"),
