@@ -147,9 +147,7 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                         pending[pool.submit(run_in_worker, job, wait)] = job
                     else:
                         yield _failed(job, attempts[job.name], error)
-                for job in (job for future, job in pending.items() if future.running()):
-                    if progress := job.progress():
-                        board.show_running(job.name, *progress)
+                board.show_stated(job for future, job in pending.items() if future.running())
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             if pending:
