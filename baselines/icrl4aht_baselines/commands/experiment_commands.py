@@ -37,7 +37,7 @@ def _experiment_command(name: str, text: str, *own: Callable[[Any], Any], usage:
 
         experiment, size = f"{name} {what}".strip(), size or "small"
         sizes: Any = {"size": size, "batch_size": shared.default_batch_size(size), "train": train}
-        chosen = ExperimentPlan(root=root and str(root), **sizes, **histories, **plan)
+        chosen = ExperimentPlan(root=root and str(root), histories=histories, **sizes, **plan)
         with progress_bars() as show:
             found = run_experiment(experiment, chosen, out or Path("runs") / experiment.replace(" ", "-"), show)
         for line in [*found.notes, *(f"wrote {path}" for path in found.report)]:

@@ -205,9 +205,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
         help="Training layout, such as demo_wide; repeat for several, or all: those that the release has histories of.",
     ),
     shared.root_option,
-    shared.history_filters,
     dataclass_options(HistoryOptions, "histories"),
-    shared.hide_recipe_option,
 )
 @topic("Model", shared.size_option, shared.model_options)
 @topic(
@@ -233,8 +231,6 @@ def train_command(
     train: dict[str, Any],
     model: dict[str, Any],
     histories: dict[str, Any],
-    hide_recipe: tuple[str, ...],
-    filters: dict[str, Any],
     play: dict[str, Any],
     manifests: tuple[Path, ...],
     save_minutes: float,
@@ -253,8 +249,7 @@ def train_command(
     from icrl4aht_baselines.training.run_folder import RUN_CURVES
     from icrl4aht_baselines.training.trainer import show_steps
 
-    choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
-    choice = replace_options(choice, histories)
+    choice = replace_options(HistoryOptions(layouts, root and str(root)), histories)
     folder = out or Path("runs") / method
     if method in PLAYING and machines["processes"] > 1:
         raise click.UsageError(f"--processes {machines['processes']}: {method} is trained by one process on one device")
