@@ -94,7 +94,7 @@ def test_models_are_evaluated_on_validation_tasks_of_their_own_layout(release, t
 def test_a_sweep_over_contexts_acts_exactly_by_default(release, tmp_path, monkeypatch):
     """Cached acting drops to 4/5 K steps and would blur the comparison of K."""
     chosen = []
-    monkeypatch.setattr(experiments, "train", lambda *arguments, **options: None)
+    monkeypatch.setattr(experiments.TrainingTask, "train", lambda *arguments, **options: None)
 
     def find_agent(folder: Path, *, acting: str) -> None:
         chosen.append(acting)
