@@ -13,7 +13,6 @@ from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.training.options import HistoryOptions
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import LAYOUT, SEED, Folder, NewFile, examples, overwrite_option
-from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.install_hints import install_command
@@ -92,8 +91,6 @@ def evaluate_command(
         raise click.UsageError("--controls: not with --forget, which is one of the controls; leave one of them out")
     ego = find_ego("--agent", agent, acting=acting, greedy=greedy)
     chosen = limit_tasks(shared.chosen_tasks(track, (split or "test",), layouts, manifest), tasks)
-    for name in {task.layout.name for task in chosen}:
-        ego.make(get_layout(name))  # a model that does not fit fails before any work
     if chosen_seeds:
         shared.check_alone("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
