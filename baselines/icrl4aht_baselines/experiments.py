@@ -34,7 +34,6 @@ from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, unknown
 from icrl4aht_data.format.schema import TASKS
-from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import check_output
@@ -128,14 +127,13 @@ class ExperimentPlan:
         methods: to train; "ad" and "dpt" by default.
         layouts: to train on, one model each; by default those of the experiment that the release has. `ALL_LAYOUTS`
             alone for one model of all layouts that the release has, which is tested on the layouts of all of them.
-        channels: channels of the models' observations, see `HistoryOptions`.
         root: folder or address of a release; None for the bundled mini release.
         suite: folder of learned teammates; required for "heldout-rl".
         size: name of the models' size; "sweep size" varies it.
         batch_size: rows of a batch, where an entry has no value; the paper's by default.
         train: values of `TrainOptions` for all entries, such as steps.
         model: values of `ModelOptions` for all entries.
-        filters: filters of the histories to train on, values of `HistoryOptions`, such as teammate_family.
+        histories: values of `HistoryOptions` for all entries: channels, and filters such as teammate_family.
         values: names of the entries to run; all by default.
         split: which tasks to evaluate on, see `EVALUATION_SPLITS`: "test" by default; others are on the training
             layouts.
@@ -150,14 +148,13 @@ class ExperimentPlan:
 
     methods: tuple[str, ...] = ()
     layouts: tuple[str, ...] = ()
-    channels: Channels | None = None
     root: str | None = None
     suite: Path | None = None
     size: str = "small"
     batch_size: int = TrainOptions.batch_size
     train: dict[str, Any] = field(default_factory=dict)
     model: dict[str, Any] = field(default_factory=dict)
-    filters: dict[str, Any] = field(default_factory=dict)
+    histories: dict[str, Any] = field(default_factory=dict)
     values: tuple[str, ...] = ()
     split: str | None = None
     families: tuple[str, ...] = ()
@@ -252,7 +249,7 @@ def _chosen_entries(name: str, plan: ExperimentPlan) -> list[ExperimentEntry]:
 
 def _histories(plan: ExperimentPlan) -> tuple[Dataset, dict[str, tuple[str, ...]]]:
     """Return the training histories that pass the plan's filters, and the filters."""
-    filters = HistoryOptions((), **plan.filters).filters
+    filters = HistoryOptions((), **plan.histories).filters
     return filter_histories(load_icrl4aht(plan.root, split="train"), filters), filters
 
 
@@ -355,7 +352,7 @@ def _prepare_entry(method: str, entry: ExperimentEntry, layout: str, plan: Exper
     size = SIZES[plan.size]
     options = TrainOptions(**{**size.train, "batch_size": plan.batch_size, **entry.train, **plan.train})
     model = ModelOptions(**{**size.model, **entry.model, **plan.model})
-    histories = HistoryOptions((layout,), plan.root, channels=plan.channels, **plan.filters)
+    histories = HistoryOptions((layout,), plan.root, **plan.histories)
     try:
         return prepare(method, model, options, histories)
     except (EmptySelectionError, LabelsMissingError, OptionError) as error:

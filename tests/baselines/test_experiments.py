@@ -94,7 +94,7 @@ def test_models_are_evaluated_on_validation_tasks_of_their_own_layout(release, t
 def test_a_sweep_over_contexts_acts_exactly_by_default(release, tmp_path, monkeypatch):
     """Cached acting drops to 4/5 K steps and would blur the comparison of K."""
     chosen = []
-    monkeypatch.setattr(experiments, "train", lambda *arguments, **options: None)
+    monkeypatch.setattr(experiments.TrainingTask, "train", lambda *arguments, **options: None)
 
     def find_agent(folder: Path, *, acting: str) -> None:
         chosen.append(acting)
@@ -232,7 +232,7 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
         root=str(release),
         layouts=("cramped_up",),
         values=("ta",),
-        filters={"teammate_family": ("rl",), "algorithm": ("fcp", "brdiv")},
+        histories={"teammate_family": ("rl",), "algorithm": ("fcp", "brdiv")},
         batch_size=8,  # the CPU's default; a given value overrides it
         train={"steps": 1, "batch_size": 2, "warmup": 0.5},
         model={"layers": 2},
@@ -330,8 +330,8 @@ def test_invalid_plans(release, tmp_path):
     fails(UnknownNameError, "unknown teammate family of these tasks 'rl'; valid: H1, H2, H3, H4", families=("rl",))
     fails(OptionError, "tasks = 0: expected at least 1", tasks=0)
     absent = "algorithm = fcp: none of .* on .*; these have utility_greedy: choose among them"
-    fails(EmptySelectionError, absent, filters={"algorithm": ("utility_greedy", "fcp")})
-    learned: dict[str, Any] = {"root": None, "filters": {"teammate_family": ("rl",)}, "layouts": ("coord_simple",)}
+    fails(EmptySelectionError, absent, histories={"algorithm": ("utility_greedy", "fcp")})
+    learned: dict[str, Any] = {"root": None, "histories": {"teammate_family": ("rl",)}, "layouts": ("coord_simple",)}
     absent = "no training histories of teammate_family rl on coord_simple; it has asymm_both, coord_ring, cramped_up"
     fails(EmptySelectionError, absent, **learned)
     result = CliRunner().invoke(cli, ["research", "sweep", "context", "--context", "9"])

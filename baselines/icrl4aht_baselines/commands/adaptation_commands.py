@@ -10,11 +10,13 @@ import click
 from icrl4aht_generation.jobs.command_line import queue_options, read_queue_options
 
 from icrl4aht_baselines.commands import options as shared
+from icrl4aht_baselines.training.options import ResponseOptions
 from icrl4aht_data.benchmark.best_responses import best_responses_file
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.commands.dataclass_options import TopicCommand, topic
+from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import COUNT, FAMILY, Folder, Names, examples
 from icrl4aht_data.errors import EmptySelectionError
+from icrl4aht_data.utils.options import replace_options
 
 _tasks_topic = topic(
     "Tasks",
@@ -31,8 +33,8 @@ _tasks_topic = topic(
     click.option("--family", "families", type=FAMILY, multiple=True, help="Only with this family; repeat."),
     shared.manifest_option,
 )
+_STEPS = 8_000_000  # of the training of an informed or episodic ego
 _seeds_option = click.option("--seeds", type=COUNT, default=3, help="Trainings of each ego, with different seeds.")
-_tasks_option = click.option("--tasks", type=COUNT, default=128, help="Episodes that are played at once.")
 
 
 def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, float]]:
@@ -61,8 +63,7 @@ def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, floa
 @topic(
     "Training",
     _seeds_option,
-    click.option("--steps", type=COUNT, default=3_000_000, help="Environment steps of a training."),
-    _tasks_option,
+    dataclass_options(ResponseOptions, "training", exclude=("learning_rate",)),
     click.option(
         "--init",
         "inits",
@@ -78,8 +79,7 @@ def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, floa
 @click.option("--bundle", is_flag=True, help="Also update best_responses.json of the package's cards.")
 def best_response_command(
     seeds: int,
-    steps: int,
-    tasks: int,
+    training: dict[str, Any],
     inits: tuple[str, ...],
     queue: dict[str, Any],
     out: Path,
@@ -103,7 +103,6 @@ def best_response_command(
         PROTOCOL,
         RESPONSES_FILE,
         ResponseJob,
-        ResponseOptions,
         find_behaviours,
         responses_table,
         with_headroom,
@@ -116,7 +115,7 @@ def best_response_command(
         raise EmptySelectionError("none of these tasks has headroom; choose others")
     console, behaviours = Console(soft_wrap=True), find_behaviours(chosen)
     console.print(f"{len(chosen)} tasks with headroom, {len(behaviours)} behaviours")
-    settings = [ResponseOptions(steps, tasks, init=None if init == "oracle" else init) for init in inits]
+    settings = [ResponseOptions(**training, init=None if init == "oracle" else init) for init in inits]
     jobs = [ResponseJob(one, seed, own, out) for seed in range(seeds) for own in settings for one in behaviours]
     try:
         run_jobs(jobs, out, console, options)
@@ -140,8 +139,7 @@ def best_response_command(
     "Training",
     click.option("--together", is_flag=True, help="One ego for all layouts instead of one for each."),
     _seeds_option,
-    click.option("--steps", type=COUNT, default=8_000_000, help="Environment steps of a training."),
-    _tasks_option,
+    dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text={"steps": f"{_STEPS:,}"}),
 )
 @topic("Machines", queue_options)
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/adaptation", help="Write trainings here.")
@@ -149,8 +147,7 @@ def best_response_command(
 def adaptation_headroom_command(
     together: bool,
     seeds: int,
-    steps: int,
-    tasks: int,
+    training: dict[str, Any],
     queue: dict[str, Any],
     out: Path,
     bundle: bool,
@@ -168,14 +165,14 @@ def adaptation_headroom_command(
     from rich.console import Console
 
     from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
-    from icrl4aht_baselines.online.responses import ResponseOptions
 
     limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
     sets: dict[str, list[Task]] = defaultdict(list)
     for task in shared.chosen_tasks(**choice):
         where = "all" if together else task.layout.name
         sets["-".join((task.track, task.split, where, *choice["families"]))].append(task)
-    console, jobs = Console(soft_wrap=True), headroom_jobs(sets, seeds, ResponseOptions(steps, tasks), out)
+    settings = replace_options(ResponseOptions(_STEPS), training)
+    console, jobs = Console(soft_wrap=True), headroom_jobs(sets, seeds, settings, out)
     try:
         run_jobs(jobs, out, console, options)
     finally:

@@ -12,7 +12,7 @@ from icrl4aht_generation.teammates.instances import INSTANCES, published_task
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.commands.options import find_ego
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
 from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, examples
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import check_output
@@ -37,7 +37,7 @@ def _experiment_command(name: str, text: str, *own: Callable[[Any], Any], usage:
 
         experiment, size = f"{name} {what}".strip(), size or "small"
         sizes: Any = {"size": size, "batch_size": shared.default_batch_size(size), "train": train}
-        chosen = ExperimentPlan(root=root and str(root), **sizes, **histories, **plan)
+        chosen = ExperimentPlan(root=root and str(root), histories=histories, **sizes, **plan)
         with progress_bars() as show:
             found = run_experiment(experiment, chosen, out or Path("runs") / experiment.replace(" ", "-"), show)
         for line in [*found.notes, *(f"wrote {path}" for path in found.report)]:
@@ -212,12 +212,8 @@ def unseen_command(
     from icrl4aht_baselines.report.tables import unseen_table
 
     names = {get_layout(name).name for name in layouts}
-    tasks = [
-        task
-        for track in TRACKS
-        for task in bundled_tasks(track, "diverse")
-        if task.layout.name in names and track == track_of(task.layout.name)
-    ]
+    every = (task for track in TRACKS for task in bundled_tasks(track, "diverse"))
+    tasks = [task for task in every if task.layout.name in names]
     if missing := names - {task.layout.name for task in tasks}:
         raise click.UsageError(
             f"--layout {' '.join(sorted(missing))}: no validation tasks; choose layouts that models are trained on"

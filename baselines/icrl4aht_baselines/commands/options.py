@@ -14,13 +14,12 @@ from click.core import ParameterSource
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_OPTIONS, ModelOptions
 from icrl4aht_baselines.training.options import (
     ALL_LAYOUTS,
-    FILTERS,
     SAVE_MINUTES,
     HistoryOptions,
     PlayOptions,
     TrainOptions,
 )
-from icrl4aht_data.benchmark.facts import KIND_FAMILIES, TEAMMATE_PLUGINS, TRACKS
+from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options, topic
 from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, SEED, TRACK, Folder, Names, Root
@@ -182,36 +181,9 @@ def add_options(command: Any, options: Iterable[Callable[[Any], Any]]) -> Any:
     return functools.reduce(lambda decorated, option: option(decorated), reversed([*options]), command)
 
 
-def history_filters(command: Any) -> Any:
-    """Add the options that filter the histories to train on; the command receives them as the dict `filters`."""
-    options = [
-        click.option(
-            "--teammate-family",
-            type=FAMILY,
-            multiple=True,
-            help="Only histories with teammates of this family: rl (learned), H1, H2, H3 or H4; repeat for several.",
-        ),
-        click.option(
-            "--algorithm",
-            type=Names("algorithm", lambda: [*KIND_FAMILIES, *TEAMMATE_PLUGINS.names]),
-            multiple=True,
-            help="Only histories with teammates of this algorithm, such as fcp, or kind of heuristic; repeat.",
-        ),
-        click.option(
-            "--source",
-            metavar="NAME",
-            multiple=True,
-            help="Only histories of this source: ppo, noise or student; repeat for several.",
-        ),
-    ]
-
-    @functools.wraps(command)
-    def collect(*args: Any, **values: Any) -> Any:
-        filters = {name: chosen for name in FILTERS if (chosen := values.pop(name))}
-        return command(*args, filters=filters, **values)
-
-    return add_options(collect, options)
-
+_NO_FILTERS = ("order", "queries", "labels", "every", "held_out", "channels", "mirror", "hide_recipe")
+history_filters = dataclass_options(HistoryOptions, "filters", exclude=_NO_FILTERS)
+"""Options that filter histories; the command receives them as the dict `filters`."""
 
 manifests_option = click.option(
     "--manifest",
@@ -220,12 +192,6 @@ manifests_option = click.option(
     metavar="FILE",
     multiple=True,
     help="Also play with the teammates of this file's tasks, heuristics; repeat for several.",
-)
-hide_recipe_option = click.option(
-    "--hide-recipe",
-    type=LAYOUT,
-    multiple=True,
-    help="The model does not see the recipe indicators of this layout; repeat for several.",
 )
 _SIZE_NAME = Names("size", lambda: SIZES)
 size_option = click.option(
@@ -369,7 +335,7 @@ def variant_names(command: str) -> Names:
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
 
 
-_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "mirror")
+_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "mirror", "hide_recipe")
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:
@@ -412,7 +378,6 @@ def experiment_options(out: str) -> Callable[[Any], Any]:
             help="tiny, for a CPU, or the paper's small, medium or large; not with `sweep size`, which varies it.",
             show_default="small, as in the paper",
         ),
-        history_filters,
         dataclass_options(HistoryOptions, "histories", exclude=_NOT_IN_EXPERIMENTS),
         evaluation_split_option,
         tasks_option,

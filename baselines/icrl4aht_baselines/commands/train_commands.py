@@ -13,7 +13,6 @@ from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.training.options import HistoryOptions
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import LAYOUT, SEED, Folder, NewFile, examples, overwrite_option
-from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.install_hints import install_command
@@ -93,8 +92,6 @@ def evaluate_command(
         raise click.UsageError("--controls: not with --forget, which is one of the controls; leave one of them out")
     ego = find_ego("--agent", agent, acting=acting, greedy=greedy)
     chosen = limit_tasks(shared.chosen_tasks(track, (split or "test",), layouts, manifest), tasks)
-    for name in {task.layout.name for task in chosen}:
-        ego.make(get_layout(name))  # a model that does not fit fails before any work
     if chosen_seeds:
         shared.check_alone("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
@@ -208,9 +205,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
         help="Training layout, such as demo_wide; repeat for several, or all: those that the release has histories of.",
     ),
     shared.root_option,
-    shared.history_filters,
     dataclass_options(HistoryOptions, "histories"),
-    shared.hide_recipe_option,
 )
 @topic("Model", shared.size_option, shared.model_options)
 @topic(
@@ -236,8 +231,6 @@ def train_command(
     train: dict[str, Any],
     model: dict[str, Any],
     histories: dict[str, Any],
-    hide_recipe: tuple[str, ...],
-    filters: dict[str, Any],
     play: dict[str, Any],
     manifests: tuple[Path, ...],
     save_minutes: float,
@@ -256,8 +249,7 @@ def train_command(
     from icrl4aht_baselines.training.run_folder import RUN_CURVES
     from icrl4aht_baselines.training.trainer import show_steps
 
-    choice = HistoryOptions(layouts, root and str(root), hide_recipe=hide_recipe, **filters)
-    choice = replace_options(choice, histories)
+    choice = replace_options(HistoryOptions(layouts, root and str(root)), histories)
     folder = out or Path("runs") / method
     if method in PLAYING and machines["processes"] > 1:
         raise click.UsageError(f"--processes {machines['processes']}: {method} is trained by one process on one device")

@@ -8,12 +8,12 @@ estimate from below: a longer training or another learner may earn more. Practic
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
@@ -32,7 +32,7 @@ from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
 from icrl4aht_baselines.training.histories import read_trained
-from icrl4aht_baselines.training.options import PlayOptions, TrainOptions
+from icrl4aht_baselines.training.options import PlayOptions, ResponseOptions
 from icrl4aht_baselines.training.trainer import TrainingData, train
 from icrl4aht_data.benchmark.best_responses import (
     BestResponse,
@@ -47,7 +47,6 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import unknown
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
-from icrl4aht_data.utils.options import Count, Option, Positive, check_options
 from icrl4aht_data.utils.templates import markdown_table
 
 PROTOCOL = "seeded"
@@ -67,33 +66,6 @@ ABOUT = (
     "before each episode; the oracle is imitated in the first half. The best training is chosen on episodes of seed "
     f"{CHOICE_SEEDS[0]}; returns are means over the tasks and the seeds {', '.join(map(str, REPORT_SEEDS))}."
 )
-
-
-@dataclass(frozen=True)
-class ResponseOptions:
-    """Settings of the training of a best response.
-
-    Attributes:
-        init: name of a bundled model of method rl2 to start from; by default random parameters.
-    """
-
-    steps: Annotated[Count, Option("Environment steps of a training.")] = 3_000_000
-    tasks: Annotated[Count, Option("Episodes that are played at once.")] = 128
-    learning_rate: Annotated[Positive, Option("Highest learning rate.")] = 1e-3
-    init: str | None = None
-
-    def __post_init__(self) -> None:
-        check_options(self)
-
-    @property
-    def updates(self) -> int:
-        """Updates of the parameters' state; each plays one episode of every task."""
-        return max(1, self.steps // (self.tasks * KEPT_STEPS))
-
-    def training(self, seed: int) -> TrainOptions:
-        """Return the options of a training."""
-        settings = {**RL2_SETTINGS["train"], "steps": self.updates, "batch_size": self.tasks, "seed": seed}
-        return replace(TrainOptions(**settings), learning_rate=self.learning_rate, save_every=self.updates)
 
 
 MODEL = ModelOptions(**RL2_SETTINGS["model"])

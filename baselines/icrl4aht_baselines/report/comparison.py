@@ -69,10 +69,10 @@ class StoredResults:
     curves: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=CURVE_COLUMNS))
     agents: dict[str, AgentFacts] = field(default_factory=dict)
 
-    def returns(self, control: str = "", protocol: str = SUBMITTED_PROTOCOL) -> dict[str, AgentReturns]:
-        """Return the results under a protocol by agent, those with test tasks, in the order of `agents`."""
+    def returns(self, control: str = "") -> dict[str, AgentReturns]:
+        """Return the results of the page's protocol by agent, those with test tasks, in the order of `agents`."""
         table = self.table
-        chosen = (table["protocol"] == protocol) & (table["control"] == control) & (table["kind"] == "test")
+        chosen = (table["protocol"] == SUBMITTED_PROTOCOL) & (table["control"] == control) & (table["kind"] == "test")
         found = dict(iter(table[chosen].groupby("agent", sort=False)))
         return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
 

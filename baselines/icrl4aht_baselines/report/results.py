@@ -180,9 +180,9 @@ class ResultSource(NamedTuple):
         """Layouts that were played."""
         return tuple(dict.fromkeys(cell.layout for cell in self.tasks))
 
-    def detail(self, name: str, default: Any = "") -> Any:
-        """Return a detail of the agent, such as `acting` or `encoder` of a trained model; by default an empty text."""
-        return self.settings.get("details", {}).get(name, default)
+    def detail(self, name: str) -> Any:
+        """Return a detail of the agent, such as `acting` or `encoder` of a trained model; otherwise an empty text."""
+        return self.settings.get("details", {}).get(name, "")
 
     @property
     def conditions(self) -> str:

@@ -218,15 +218,9 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
 
 
 def write_submission(path: Path, found: Submission) -> None:
-    """Write a file of results, returns that are integers without a fraction."""
-    content = msgspec.to_builtins(found)
-    for one in content["evaluations"]:
-        one["returns"] = {
-            task: [[int(value) if value == int(value) else value for value in row] for row in returns]
-            for task, returns in one["returns"].items()
-        }
+    """Write a file of results."""
     with atomic_write(path) as partial:
-        partial.write_bytes(msgspec.json.encode(content))
+        partial.write_bytes(msgspec.json.encode(found))
 
 
 def read_submission(path: Path) -> Submission:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from msgspec import Meta
 
+from icrl4aht_baselines.methods.options import RL2_SETTINGS
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.reading.history import Labels
@@ -75,6 +77,33 @@ class PlayOptions:
         check_options(self)
 
 
+@dataclass(frozen=True)
+class ResponseOptions:
+    """Settings of the training of a best response.
+
+    Attributes:
+        init: name of a bundled model of method rl2 to start from; by default random parameters.
+    """
+
+    steps: Annotated[Count, Option("Environment steps of a training.")] = 3_000_000
+    tasks: Annotated[Count, Option("Episodes that are played at once.")] = 128
+    learning_rate: Annotated[Positive, Option("Highest learning rate.")] = 1e-3
+    init: str | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    @property
+    def updates(self) -> int:
+        """Updates of the parameters' state; each plays one episode of every task."""
+        return max(1, self.steps // (self.tasks * KEPT_STEPS))
+
+    def training(self, seed: int) -> TrainOptions:
+        """Return the options of a training."""
+        settings = {**RL2_SETTINGS["train"], "steps": self.updates, "batch_size": self.tasks, "seed": seed}
+        return replace(TrainOptions(**settings), learning_rate=self.learning_rate, save_every=self.updates)
+
+
 SAVE_MINUTES = 5.0
 """Most minutes between checkpoints of a training run. Results do not depend on it, so it is no setting of a run."""
 
@@ -94,18 +123,22 @@ class HistoryOptions:
         layouts: names of training layouts, or `ALL_LAYOUTS` alone.
         root: folder or address of a release; None for the bundled mini release.
         split: split of the release.
-        teammate_family: families of teammates, "rl" or "H1".."H4"; any by default.
-        algorithm: algorithms of learned teammates or kinds of heuristics, such as "fcp"; any by default.
-        source: how histories were made, "ppo", "noise" or "student"; any by default.
-        hide_recipe: names of layouts whose recipe indicators the model does not see, in training and when it acts.
     """
 
     layouts: tuple[str, ...]
     root: str | None = None
     split: str = "train"
-    teammate_family: tuple[str, ...] = ()
-    algorithm: tuple[str, ...] = ()
-    source: tuple[str, ...] = ()
+    teammate_family: Annotated[
+        tuple[str, ...],
+        Option("Only histories with teammates of this family: rl (learned), H1, H2, H3 or H4; repeat for several."),
+    ] = ()
+    algorithm: Annotated[
+        tuple[str, ...],
+        Option("Only histories with teammates of this algorithm, such as fcp, or kind of heuristic; repeat."),
+    ] = ()
+    source: Annotated[
+        tuple[str, ...], Option("Only histories of this source: ppo, noise or student; repeat for several.")
+    ] = ()
     order: Annotated[ContextOrder, Option("Order of the transitions in DPT's contexts.")] = "contiguous"
     queries: Annotated[Count, Option("Queries that DPT answers with each context, posed in turn.")] = 1
     labels: Annotated[
@@ -134,7 +167,9 @@ class HistoryOptions:
     mirror: Annotated[
         bool, Option("Mirror histories at random, up and down or left and right exchanged, to learn of more layouts.")
     ] = False
-    hide_recipe: tuple[str, ...] = ()
+    hide_recipe: Annotated[
+        tuple[str, ...], Option("The model does not see the recipe indicators of this layout; repeat for several.")
+    ] = ()
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -169,6 +169,12 @@ class JobBoard:
         self._running[name] = updates, steps_per_second
         self._show()
 
+    def show_stated(self, jobs: Iterable[Job]) -> None:
+        """Show what the folders of running jobs state."""
+        for job in jobs:
+            if progress := job.progress():
+                self.show_running(job.name, *progress)
+
     def show_ended(self, name: str) -> None:
         """Show that a job is finished or has failed."""
         self._running.pop(name, None)

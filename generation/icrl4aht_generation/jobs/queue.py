@@ -152,9 +152,7 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                     waiting.append(job)
                 else:
                     yield _failed(job, attempts[job.name], error)
-            for job, _ in running.values():
-                if progress := job.progress():
-                    board.show_running(job.name, *progress)
+            board.show_stated(job for job, _ in running.values())
     finally:
         for _, pool in running.values():
             pool.shutdown(wait=False, cancel_futures=True)

@@ -38,7 +38,8 @@ def test_splits_are_disjoint():
     assert any(pair not in dishes["train"] for pair in dishes["test"] if pair[0] in layouts["train"])
     of_dish = defaultdict(set)
     for task in SPLITS["test"]:
-        (dish,) = task.recipes or ()
+        (dish,) = task.recipes or (None,)
+        assert dish is not None
         held_out = dish not in training_dishes(task.layout)
         number = all_dishes(task.layout).index(dish) if held_out else None
         of_dish[number].add((task.teammate_family, task.teammate["theta_id"] == INSTANCES))
