@@ -177,11 +177,11 @@ def read_adaptation(folder: Path) -> list[dict[str, Any]]:
     return parse_json(read_text(path)) if path.is_file() else []
 
 
-def adaptation_table(folder: Path) -> str:
+def adaptation_table(folder: Path, layouts: bool = True) -> str:
     """Return a Markdown table of the measured sets: returns of both egos, and their difference with its 95 % interval.
 
     The interval is Student's over the seeds, which trained both egos; without a second seed there is none. Sets of
-    several layouts are followed by a row for each layout.
+    several layouts are followed by a row for each layout, unless `layouts` is False.
     """
     rows = []
     for entry in read_adaptation(folder):
@@ -193,7 +193,7 @@ def adaptation_table(folder: Path) -> str:
             interval = f" ({differences.mean() - half:+.1f} to {differences.mean() + half:+.1f})"
         cells = [f"{informed.mean():.1f}", f"{episodic.mean():.1f}", f"{differences.mean():+.1f}{interval}"]
         rows.append([entry["tasks"], str(entry["number"]), *cells, str(seeds), f"{entry['steps']:,}"])
-        for layout, of in entry["layouts"].items() if len(entry["layouts"]) > 1 else ():
+        for layout, of in entry["layouts"].items() if layouts and len(entry["layouts"]) > 1 else ():
             one, other = (of[kind] for kind in EGO_KINDS)
             rows.append([layout, "", f"{one:.1f}", f"{other:.1f}", f"{one - other:+.1f}", "", ""])
     return markdown_table(["set", "tasks", *EGO_KINDS, "difference", "seeds", "steps of each"], rows, right=6)

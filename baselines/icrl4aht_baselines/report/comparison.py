@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from icrl4aht_baselines.online.adaptation import adaptation_table
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.results import (
     CELL_COLUMNS,
@@ -186,6 +187,7 @@ def render_comparison(stored: StoredResults) -> str:
         difference=describe_lead(results, scales),
         controls=controls_table(stored, results, scales),
         layouts=layouts_table(results, scales),
+        adaptation=adaptation_table(results_file().parent, layouts=False),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
         earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
         marks="\n".join(f"* {text}" for text in overlap_legend(overlaps)),

@@ -24,6 +24,8 @@ from icrl4aht_baselines.online.responses import (
 
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.templates import card_file
+from tests.helpers.paths import ROOT
 
 TINY = ResponseOptions(steps=400, tasks=4)
 DEMO = tasks_of("teammate", "demo_wide")
@@ -100,6 +102,11 @@ def test_table_of_the_adaptation_headroom(tmp_path):
     write_adaptation([job for job in jobs if job.seed == 0], tmp_path)
     assert "| 2 | 400 |" in adaptation_table(tmp_path), "a measurement of fewer seeds replaces none"
     assert write_adaptation(headroom_jobs({"other": DEMO[2:3]}, 1, TINY, tmp_path), tmp_path).read_text().count("demo")
+
+
+def test_the_documented_headroom_is_the_bundled_one():
+    page = (ROOT / "docs" / "preference.md").read_text(encoding="utf-8")
+    assert adaptation_table(card_file("adaptation.json").parent) in page
 
 
 def test_every_task_must_be_played(tmp_path):
