@@ -119,7 +119,7 @@ def test_sampled_actions_follow_the_distribution_and_greedy_ones_the_mode(suite)
 
 
 def test_checkpoints_of_one_shape_share_their_functions(suite):
-    """Even with different critics, so that they share compilations."""
+    """Policies of two checkpoints with different critics share a compilation."""
     one, other = (learned.build_learned(LAYOUT, suite / name) for name in "ab")
     elsewhere = learned.build_learned(get_layout("test_simple"), suite / "c")
     assert one.init is other.init is elsewhere.init
