@@ -342,9 +342,12 @@ def unseen_table(found: Mapping[str, Mapping[tuple[str, str], np.ndarray]]) -> s
     """
     layouts, body = sorted({layout for cells in found.values() for layout, _ in cells}), []
     for agent, cells in found.items():
-        means = (
-            np.mean([values.mean(axis=1) for (layout, _), values in cells.items() if layout == name], axis=0)
+        of_layout = {
+            name: np.mean([values.mean(axis=1) for (layout, _), values in cells.items() if layout == name], axis=0)
             for name in layouts
+            if any(layout == name for layout, _ in cells)
+        }
+        body.append(
+            [f"`{agent}`", *(mean_interval(of_layout[name]).text() if name in of_layout else "" for name in layouts)]
         )
-        body.append([f"`{agent}`", *(mean_interval(of_layout).text() for of_layout in means)])
     return markdown_table(["agent", *layouts], body)
