@@ -60,18 +60,15 @@ TABLE_COLUMNS = [*AGENT_COLUMNS, *CELL_COLUMNS, "overlap", "task", "seed", "bloc
 
 TASK_KINDS = {
     "test": "",
-    "validation": "Validation tasks (split validation): training layouts with teammates that are drawn from the "
-    "training ranges and are in no training history. They are for choosing models, so the returns of a model that was "
-    "chosen by them are too high, and they are no test results.",
-    "diverse": "Validation tasks with diverse teammates: training layouts with drawn teammates that vary in more than "
-    "the published training ranges, and act unlike all test teammates. They are for choosing models, too.",
+    "validation": "Validation tasks: training layouts with teammates that are drawn from the training ranges and are in "
+    "no training history. Models are chosen by them, so their returns are no test results.",
+    "diverse": "Validation tasks with diverse teammates, which vary in more than the published training ranges. Models "
+    "are chosen by them, too.",
     "training": "Training tasks (split train): the teammates and layouts that models are made to be trained with. "
     "Their returns do not show generalisation.",
-    "held out": "Held-out tasks (split heldout): learned teammates that a suite keeps out of its training tasks. "
-    "Where an agent was trained with one of them or with others of their algorithm, its score is marked. The paper "
-    "gives these as a figure without numbers (App. F).",
-    PREFERENCE: "Tasks of the track preference, which is this project's own: the teammate wants one dish throughout, "
-    "and no observation shows which. The paper has no numbers of them.",
+    "held out": "Held-out tasks: learned teammates that a suite keeps out of its training tasks. Where an agent was "
+    "trained with one of them or with others of their algorithm, its score is marked (paper, App. F).",
+    PREFERENCE: "Tasks of the track preference, which is this project's own, not the paper's.",
     "own": "Own tasks: not among the published test tasks, so the paper has no numbers of them.",
 }
 """Kind of tasks -> explanation; "test" are the published test tasks."""

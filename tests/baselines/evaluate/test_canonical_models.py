@@ -161,7 +161,7 @@ def test_an_experiment_with_one_model_of_all_layouts(lite, tmp_path, monkeypatch
     """The plan trains one model and tests it on every test layout; nothing is executed."""
     found: dict[str, Any] = {}
     monkeypatch.setattr(
-        experiments, "train", lambda method, data, options, folder, about, **rest: found.update(about, folder=folder)
+        experiments.TrainingTask, "train", lambda job, folder, **rest: found.update(job.about, folder=folder)
     )
 
     class PlayedError(Exception):
@@ -200,7 +200,8 @@ def test_the_options_of_the_experiments(monkeypatch, tmp_path):
     for given in (["--layout", "all"], ["--layout", "demo_wide", "--channels", "canonical"]):
         result = CliRunner().invoke(cli, ["research", "tracks", *given, "--out", str(tmp_path)], catch_exceptions=False)
         assert result.exit_code == 0, result.output
-    assert [(plan.layouts, plan.channels) for plan in plans] == [(("all",), None), (("demo_wide",), "canonical")]
+    chosen = [(plan.layouts, plan.histories.get("channels")) for plan in plans]
+    assert chosen == [(("all",), None), (("demo_wide",), "canonical")]
     wrong = CliRunner().invoke(cli, ["research", "tracks", "--layout", "al"])
     assert wrong.exit_code == 2
     assert "unknown layout 'al'; valid: all, coord_simple" in wrong.output
