@@ -60,8 +60,8 @@ TABLE_COLUMNS = [*AGENT_COLUMNS, *CELL_COLUMNS, "overlap", "task", "seed", "bloc
 
 TASK_KINDS = {
     "test": "",
-    "validation": "Validation tasks: training layouts with teammates that are drawn from the training ranges and are in "
-    "no training history. Models are chosen by them, so their returns are no test results.",
+    "validation": "Validation tasks: training layouts with drawn teammates that are in no training history. Models are "
+    "chosen by them, so their returns are no test results.",
     "diverse": "Validation tasks with diverse teammates, which vary in more than the published training ranges. Models "
     "are chosen by them, too.",
     "training": "Training tasks (split train): the teammates and layouts that models are made to be trained with. "
@@ -141,10 +141,10 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
         blocks = {str(name): values[..., number] for number, name in enumerate(axes[3])}
         marked = " ".join(rows["overlap"].unique()).split()
         overlaps = tuple(name for name in OVERLAPS if name in marked)
-        if np.isnan(values).any():
-            raise OptionError(f"results of {' '.join(map(str, key))}: trainings of unequal tasks, seeds or episodes")
-        trainings, seeds = (tuple(map(int, axes[number])) for number in (0, 2))
         cell = ResultCell._make(map(str, key))
+        if np.isnan(values).any():
+            raise OptionError(f"{cell.title}: results of trainings with unequal tasks, seeds or episodes")
+        trainings, seeds = (tuple(map(int, axes[number])) for number in (0, 2))
         found[cell] = CellReturns(tuple(axes[1]), seeds, blocks, overlaps, trainings)
     return {cell: found[cell] for cell in in_order(found)}
 
@@ -408,8 +408,8 @@ def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: s
             return {track: read_trained_on(entries[track], where) if track in entries else None for track in TRACKS}
         if TRAINED_ON in record:
             return {"": read_trained_on(entries, where)}
-    is_reference = settings["agent"] in (*REFERENCES, "search") and not details and trained is None
-    return {"": SeenInTraining() if is_reference else None}
+    untrained = settings["agent"] in (*REFERENCES, "search") and not details and trained is None
+    return {"": SeenInTraining() if untrained else None}
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
@@ -478,12 +478,6 @@ def cell_of(task: Task) -> ResultCell:
 def in_order(cells: Iterable[ResultCell]) -> list[ResultCell]:
     """Return cells in the paper's order, each once."""
     return sorted(set(cells), key=lambda cell: cell.order)
-
-
-def instances_range(numbers: Iterable[int]) -> str:
-    """Return numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
-    found = sorted(set(numbers))
-    return counted_noun(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
 
 
 def family_title(family: str) -> str:

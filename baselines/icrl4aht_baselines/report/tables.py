@@ -16,7 +16,6 @@ from icrl4aht_baselines.report.results import (
     EvaluationRun,
     ResultCell,
     in_order,
-    instances_range,
     published_cells,
     published_instances,
     read_published,
@@ -351,3 +350,9 @@ def unseen_table(found: Mapping[str, Mapping[tuple[str, str], np.ndarray]]) -> s
             [f"`{agent}`", *(mean_interval(of_layout[name]).text() if name in of_layout else "" for name in layouts)]
         )
     return markdown_table(["agent", *layouts], body)
+
+
+def instances_range(numbers: Iterable[int]) -> str:
+    """Return numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
+    found = sorted(set(numbers))
+    return counted_noun(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
