@@ -23,10 +23,9 @@ from icrl4aht_baselines.report.results import (
     EvaluationRun,
     ResultSource,
     as_run,
-    instances_range,
     published_cells,
 )
-from icrl4aht_baselines.report.tables import PAPER_METHODS
+from icrl4aht_baselines.report.tables import PAPER_METHODS, instances_range
 from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
