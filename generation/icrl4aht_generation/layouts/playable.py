@@ -26,19 +26,29 @@ _AT_ONCE = 512  # layouts of one batch; every batch runs the same program
 _STEPS = 100
 
 _BOTH, _EGO, _TEAMMATE = (True, True), (True, False), (False, True)
-_TRIES = ((1, _BOTH, True), (4, _BOTH, True), (4, _EGO, True), (4, _TEAMMATE, True), (4, _BOTH, False))
-"""Hundreds of steps, which of the two agents play while the other stays, and whether they begin on the map's starts
-rather than on drawn cells. Most layouts need only the first."""
+_QUICK = ((1, _BOTH, True), (1, _EGO, True), (1, _TEAMMATE, True))
+_THOROUGH = ((4, _BOTH, True), (4, _EGO, True), (4, _TEAMMATE, True), (4, _BOTH, False))
+"""Tries in order: hundreds of steps, which of the two agents play while the other stays, and whether they begin on the
+map's starts rather than on drawn cells. Few layouts need the thorough ones."""
 
 
-def layouts_delivered(layouts: Sequence[Layout]) -> Bool[np.ndarray, " layouts"]:
-    """Return for each layout whether an oracle, or a pair of them, delivers a soup in an episode of 400 steps."""
+def layouts_delivered(
+    layouts: Sequence[Layout], checked: Callable[[int], None] = lambda count: None
+) -> Bool[np.ndarray, " layouts"]:
+    """Return for each layout whether an oracle, or a pair of them, delivers at least once in an episode of 400 steps.
+
+    Args:
+        layouts: the layouts.
+        checked: called with the number of layouts whose answer was found since the last call, for progress.
+    """
     found, largest = np.zeros(len(layouts), bool), largest_layouts(layouts)
-    for hundreds, playing, at_starts in _TRIES:
+    for tries in (_QUICK, _THOROUGH):
         missing = np.flatnonzero(~found)
         for start in range(0, len(missing), _AT_ONCE):
             numbers = missing[start : start + _AT_ONCE]
-            found[numbers] = _delivered(layouts, largest, numbers, hundreds, playing, at_starts)
+            found[numbers] = _delivered(layouts, largest, numbers, tries)
+            checked(int(found[numbers].sum()))
+    checked(int((~found).sum()))
     return found
 
 
@@ -46,19 +56,22 @@ def _delivered(
     layouts: Sequence[Layout],
     largest: list[Layout],
     numbers: np.ndarray,
-    hundreds: int,
-    playing: tuple[bool, bool],
-    at_starts: bool,
+    tries: Sequence[tuple[int, tuple[bool, bool], bool]],
 ) -> Bool[np.ndarray, " numbers"]:
     # The largest layouts give all batches equal shapes, and short batches repeat layouts, so that all share a program.
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
+    # The oracles' facts take longer than an episode, so that all tries of a batch share them.
     egos = oracle_params(own), oracle_params([_exchanged(layout) for layout in own])
     starts = np.array([layout.agent_cells for layout in own], np.uint8)
-    carry, earned = _begin(tables, egos, keys, starts, at_starts), np.zeros(len(own), bool)
-    for _ in range(hundreds):
-        carry, reward = _play(tables, egos, jnp.array(playing), carry)
-        earned |= np.asarray(reward) >= DELIVERY_REWARD
+    earned = np.zeros(len(own), bool)
+    for hundreds, playing, at_starts in tries:
+        if earned[: len(numbers)].all():
+            break
+        carry = _begin(tables, egos, keys, starts, at_starts)
+        for _ in range(hundreds):
+            carry, reward = _play(tables, egos, jnp.array(playing), carry)
+            earned |= np.asarray(reward) >= DELIVERY_REWARD
     return earned[: len(numbers)]
 
 
