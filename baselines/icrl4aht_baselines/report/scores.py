@@ -73,7 +73,10 @@ CellScales = Mapping[ResultCell, CellScale]
 
 
 def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
-    """Return the scales of the package's cells under a protocol, those of which every task has a best response."""
+    """Return the scales of the package's cells under a protocol, those of which every task has a best response.
+
+    A layout's test cells count once all of its cells in which the oracle earns more than `stay` have best responses.
+    """
     measured, stays = best_responses(protocol), stay_returns(protocol)
     names = {task: f"behaviour of {best.tasks[0]}" for task, best in measured.items()}
     found: dict[ResultCell, CellScale] = {}
@@ -81,7 +84,9 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
         if all(task in measured and task in stays for task in tasks):
             scales = {task_label(task): TaskScale(stays[task], measured[task].best, names[task]) for task in tasks}
             found[cell] = CellScale(scales)
-    return found
+    wanted = (ResultCell(*cell) for cell, egos in read_headroom(protocol).items() if has_headroom(egos))
+    unfinished = {cell.layout for cell in wanted if cell not in found}
+    return {cell: scale for cell, scale in found.items() if cell.kind != "test" or cell.layout not in unfinished}
 
 
 def open_cells(scales: CellScales) -> list[ResultCell]:

@@ -33,7 +33,9 @@ from icrl4aht_baselines.report.tables import (
     table_score,
     unseen_table,
 )
+from msgspec import structs
 
+from icrl4aht_data.benchmark import best_responses
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
@@ -99,6 +101,17 @@ def test_teammates_that_behave_alike_are_one_unit():
     assert scores[0] and scores[1] is None
     single = find_score({WIDE: one}, [WIDE], {WIDE: scale_of((0.0, 20.0, "same"))})
     assert single and single.total == pytest.approx(scores[0].total) and scores[0].total.range()
+
+
+def test_a_layout_counts_once_all_of_its_cells_are_measured(measured, monkeypatch, tmp_path):
+    """Without the best response to one teammate of H1 on demo_wide the other layouts remain."""
+    card = read_best_responses(best_responses.best_responses_file())
+    lacks = next(one for one in card.behaviours if (one.layout, one.family) == ("demo_wide", "H1"))
+    kept = tuple(one for one in card.behaviours if one != lacks)
+    best_responses.write_best_responses(tmp_path / "less.json", structs.replace(card, behaviours=kept))
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: tmp_path / "less.json")
+    found = open_cells(cell_scales("seeded"))
+    assert len(found) == 16 and "demo_wide" not in {cell.layout for cell in found}
 
 
 def test_scales_have_the_tasks_with_a_best_response(measured):
