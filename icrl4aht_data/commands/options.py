@@ -12,9 +12,9 @@ import click
 from click.shell_completion import CompletionItem
 
 from icrl4aht_data.benchmark.facts import ALL_TRACKS, SPLITS, all_families
-from icrl4aht_data.errors import unknown
+from icrl4aht_data.errors import UnknownNameError, unknown
 from icrl4aht_data.fetch import is_address
-from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout_names
+from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout_names, get_layout
 
 
 class Names(click.ParamType):
@@ -41,7 +41,28 @@ class Names(click.ParamType):
         return [CompletionItem(name) for name in self.offered() if name.startswith(incomplete)]
 
 
-LAYOUT = Names("layout", all_layout_names, offered=lambda: [*LAYOUTS, *LAYOUT_PLUGINS.names])
+class LayoutName(Names):
+    """Type of the name of a layout that this package knows."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        try:
+            get_layout(value)
+        except UnknownNameError as error:
+            self.fail(str(error), param, ctx)
+        return value
+
+
+class ReleaseLayoutName(Names):
+    """Type of the name of a layout of a release, which may carry its own: reading it tells which there are."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        return value
+
+
+LAYOUT, RELEASE_LAYOUT = (
+    kind("layout", all_layout_names, offered=lambda: [*LAYOUTS, *LAYOUT_PLUGINS.names])
+    for kind in (LayoutName, ReleaseLayoutName)
+)
 TRACK, SPLIT = Names("track", lambda: ALL_TRACKS), Names("split", lambda: SPLITS)
 FAMILY = Names("family", all_families)
 
@@ -129,7 +150,7 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems 
 
 
 _FILTERS: dict[str, tuple[click.ParamType, str | None, str]] = {
-    "layout": (LAYOUT, None, "Only this layout; repeat it for more."),
+    "layout": (RELEASE_LAYOUT, None, "Only this layout; repeat it for more."),
     "split": (SPLIT, None, "Only this split: train, validation, test or heldout."),
     "track": (TRACK, None, "Only this track: teammate or layout."),
     "teammate-family": (FAMILY, None, "Only this family: rl (learned), H1, H2, H3 or H4."),

@@ -24,7 +24,7 @@ from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, Entry
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import resolve_inside
 from icrl4aht_data.utils.options import check_int
-from icrl4aht_data.utils.text import counted_histories
+from icrl4aht_data.utils.text import counted_histories, listed_names
 
 ALIASES = {"algorithm": "teammate_kind"}
 """Other names of filters: the kind of a learned teammate is its training algorithm."""
@@ -143,7 +143,7 @@ class Index:
             layouts, families = found.setdefault(split, ({}, {}))
             layouts[layout] = families[family] = None
         texts = [
-            f"{split} on {', '.join(layouts)} with {', '.join(families)}"
+            f"{split} on {listed_names([*layouts])} with {', '.join(families)}"
             for split, (layouts, families) in found.items()
         ]
         return "; ".join(texts) or "no histories"

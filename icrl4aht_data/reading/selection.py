@@ -39,7 +39,7 @@ from icrl4aht_data.reading.sources import (
 from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.options import check_int, check_number, check_position
 from icrl4aht_data.utils.system import usable_cores
-from icrl4aht_data.utils.text import counted_histories, counted_noun
+from icrl4aht_data.utils.text import counted_histories, counted_noun, listed_names
 
 if TYPE_CHECKING:
     import pandas
@@ -143,7 +143,7 @@ class Selection:
         shapes = {observation_shape(layout, self.channels == "canonical"): layout for layout in self.layouts}
         if len(shapes) > 1:
             raise OptionError(
-                f"the selection spans layouts {', '.join(layout.name for layout in self.layouts)}, whose own "
+                f"the selection spans layouts {listed_names([layout.name for layout in self.layouts])}, whose own "
                 f"observations are of unequal shape ({', '.join(map(str, shapes))}): take "
                 f'channels="canonical", which all layouts share, or add layout={self.layouts[0].name!r}'
             )
@@ -185,7 +185,7 @@ class Selection:
         canonical = " with canonical channels" if self.channels == "canonical" else ""
         return (
             f"{type(self).__name__}({counted_histories(len(self))} of {counted_noun(tasks, 'task')} on "
-            f"{', '.join(layouts)}; {self.named_counts('split')}; {self.named_counts('source')}; "
+            f"{listed_names(layouts)}; {self.named_counts('split')}; {self.named_counts('source')}; "
             f"{counted_noun(int(self.column('T').sum()), 'transition')}, obs {self.obs}{canonical}; "
             f"{self.info.kind} release {self.info.data_version} at {self.origin})"
         )

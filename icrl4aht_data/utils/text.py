@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 
 
@@ -14,6 +14,16 @@ def counted_noun(number: int, noun: str, plural: str | None = None) -> str:
 def counted_histories(number: int) -> str:
     """Return a number of histories as text, such as "1 history" or "2,000 histories"."""
     return counted_noun(number, "history", "histories")
+
+
+_LISTED = 10  # most names of a list in a text
+
+
+def listed_names(names: Sequence[str]) -> str:
+    """Return names as text, of many the first ones, such as "a, b and 198 others"."""
+    if len(names) <= _LISTED:
+        return ", ".join(names)
+    return f"{', '.join(names[: _LISTED - 1])} and {len(names) - _LISTED + 1} others"
 
 
 _WIDEST = 840  # pixels

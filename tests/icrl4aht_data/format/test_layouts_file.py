@@ -10,16 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click import BadParameter
+from click.testing import CliRunner
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import make_task, parse_task, read_tasks, task_fields, write_tasks
 from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.commands.options import LAYOUT
 from icrl4aht_data.errors import IndexFormatError, TaskFormatError, UnknownNameError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import FORMAT_VERSION, LAYOUTS_FILE, TASKS
 from icrl4aht_data.overcooked import layouts as known_layouts
 from icrl4aht_data.overcooked.layouts import Layout, add_layouts, get_layout
 from icrl4aht_data.overcooked.state import columns
+from icrl4aht_data.utils.text import listed_names
 from tests.helpers.random_releases import make_tasks, random_release
 
 ROWS = ("WPWWW", "0A A1", "W   W", "WBWXW")
@@ -53,6 +58,10 @@ def stored(root: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (root / LAYOUTS_FILE).read_text().splitlines()]
 
 
+def test_long_lists_are_cut():
+    assert listed_names([str(i) for i in range(200)]) == "0, 1, 2, 3, 4, 5, 6, 7, 8 and 191 others"
+
+
 class TestRelease:
     def test_layouts_come_with_it(self, root):
         assert stored(root) == [
@@ -73,6 +82,18 @@ class TestRelease:
         batch = ds.ad(batch_size=4, length=20, seed=0)[0]
         assert batch.obs.shape == (4, 20, 5, 5, 46)
         assert verify_release(root, level="deep").ok
+
+    def test_commands_take_their_names(self, root):
+        """The names of a release's layouts are known once it is read, and those of the package's own tasks always."""
+        result = CliRunner().invoke(cli, ["list", str(root), "--layout", "mine-3-5"])
+        assert result.exit_code == 0, result.output
+        assert "mine-3-5" in result.output and "coord_simple" not in result.output
+        assert isinstance(
+            CliRunner().invoke(cli, ["list", str(root), "--layout", "nowhere"]).exception, UnknownNameError
+        )
+        assert LAYOUT.convert("asymm_both_plain", None, None) == "asymm_both_plain"
+        with pytest.raises(BadParameter, match="unknown layout 'nowhere'"):
+            LAYOUT.convert("nowhere", None, None)
 
     def test_filter_by_family(self, root):
         ds = load_icrl4aht(root, layout_family="mine")
