@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.results import RESULTS, Result
 from icrl4aht_baselines.evaluate.segments import CONTROLS
@@ -146,10 +147,12 @@ def check_submission(found: Submission, where: str) -> None:
     """Check that results are complete, comparable, and declare the training data.
 
     Raises:
-        OptionError: if the version of the best responses is unknown, the training data is not declared, protocol,
-            seeds or episodes are others than those of the page, or the tasks are not exactly those of the tracks;
-            names them.
+        OptionError: if the agent has the name of a reference ego, the version of the best responses is unknown, the
+            training data is not declared, protocol, seeds or episodes are others than those of the page, or the tasks
+            are not exactly those of the tracks; names them.
     """
+    if found.agent in AGENTS:
+        raise OptionError(f"{where}: the agent {found.agent} has the name of a reference ego; give another --name")
     known = read_best_responses().version
     if found.best_responses != known:
         raise OptionError(

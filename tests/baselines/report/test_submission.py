@@ -67,6 +67,7 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda c, one, task: c.update(agent="search"), "search has the name of a reference ego; give another --name"),
         (lambda c, one, task: c.update(best_responses="99"), r"best responses of version '99', expected '0'"),
         (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
         (lambda c, one, task: one["returns"].pop(task), "1 of the 40 test tasks of layout are missing, such as layout"),
