@@ -325,7 +325,13 @@ def _of_manifests() -> dict[str, Layout]:
     path = Path(__file__).parent.parent / "manifests" / "layouts.jsonl"
     lines = map(json.loads, path.read_text(encoding="utf-8").splitlines())
     return {
-        line["name"]: Layout(line["name"], line["name"], tuple(line["map"]), tuple(map(tuple, line["recipes"])))  # type: ignore[arg-type]
+        line["name"]: Layout(
+            line["name"],
+            line["name"],
+            tuple(line["map"]),
+            tuple(map(tuple, line["recipes"])),  # type: ignore[arg-type]
+            line["indicates_delivery"],
+        )
         for line in lines
     }
 
@@ -351,7 +357,8 @@ def add_layouts(layouts: Iterable[Layout]) -> list[Layout]:
     """
     found = []
     for layout in layouts:
-        known = get_layout(layout.name) if layout.name in all_layout_names() else layout
+        is_known = layout.name in all_layout_names() or layout.name in _of_manifests()
+        known = get_layout(layout.name) if is_known else layout
         if (known.rows, known.recipes, known.indicates_delivery) != (
             layout.rows,
             layout.recipes,

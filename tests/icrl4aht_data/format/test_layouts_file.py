@@ -18,7 +18,7 @@ from icrl4aht_data.benchmark.tasks import make_task, parse_task, read_tasks, tas
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import LAYOUT
-from icrl4aht_data.errors import IndexFormatError, TaskFormatError, UnknownNameError
+from icrl4aht_data.errors import IndexFormatError, OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import FORMAT_VERSION, LAYOUTS_FILE, TASKS
 from icrl4aht_data.overcooked import layouts as known_layouts
@@ -185,3 +185,10 @@ class TestRecipesOfATask:
         write_manifest(root)
         with pytest.raises(TaskFormatError, match="does not match the task's content"):
             read_tasks(root / TASKS)
+
+
+def test_a_release_cannot_change_a_layout_of_the_packages_own_tasks():
+    known = get_layout("rooms-0-46")
+    assert add_layouts([known]) == [known]
+    with pytest.raises(OptionError, match="layout 'rooms-0-46': differs from the layout that this name stands for"):
+        add_layouts([dataclasses.replace(known, rows=tuple(row.replace("P", "W", 1) for row in known.rows))])
