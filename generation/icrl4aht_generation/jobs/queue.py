@@ -12,6 +12,7 @@ from concurrent.futures import wait as wait_for
 from contextlib import closing
 from pathlib import Path
 from threading import current_thread, main_thread
+from typing import Any
 
 from rich.console import Console
 
@@ -126,9 +127,10 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
     """Run several jobs at a time, each in a process of its own, so that its memory is released."""
     if not jobs:
         return
+    before: Any = None
     if current_thread() is main_thread():
         # By default SIGTERM would end this process without a word to its workers.
-        signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+        before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     context, waiting, running = multiprocessing.get_context("spawn"), list(jobs), {}
     attempts = dict.fromkeys((job.name for job in jobs), 0)
     try:
@@ -159,6 +161,8 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
         if running:
             for process in multiprocessing.active_children():
                 process.terminate()
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
 
 
 def _failed(job: Job, attempts: int, error: BaseException) -> JobOutcome:
