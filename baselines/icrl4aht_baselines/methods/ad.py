@@ -149,7 +149,7 @@ def auxiliary_losses(output: StepOutput, steps: StepInput, batch: ADBatch, world
     """Return the loss of the model's prediction of the next observation, by name; empty if there is none."""
     if output.next_obs is None:
         return {}
-    # Steps count whose successor is in the window and in the same episode.
+    # The loss is over the steps whose next step is in the window and in the same episode.
     errors = squared_error(output.next_obs[:, :-1], world.observations(steps.obs)[:, 1:])
     valid = jnp.asarray(batch.attention_mask)[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1]
     return {"next_obs_loss": mean_of_rows(errors, valid)}
