@@ -6,6 +6,8 @@ each, or are the return of a model that earns more. Tasks whose teammates behave
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
@@ -75,6 +77,11 @@ class BestResponseCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     protocol: str
     about: str
     behaviours: tuple[BestResponse, ...] = ()
+
+
+def chosen_training(trainings: Iterable[TrainedResponse]) -> TrainedResponse:
+    """Return the training that earns most on the episodes to choose by."""
+    return max(trainings, key=lambda one: -math.inf if one.choice is None else one.choice)
 
 
 def best_responses_file() -> Path:

@@ -64,6 +64,9 @@ PREFERENCE_LAYOUTS: dict[str, tuple[str, ...]] = {
 other half. "plain": a published layout without indicators and buttons. The others are generated layouts without them,
 those among 90 on which the returns of the scripted searcher rise most with drawn training teammates."""
 
+PLAIN = "_plain"
+"""End of the name of a published layout without its indicators and buttons."""
+
 ALL_TRACKS = (*TRACKS, PREFERENCE)
 """The benchmark's tracks and the project's own."""
 
@@ -169,7 +172,7 @@ def track_of(layout: str) -> str:
     Raises:
         UnknownNameError: if no track includes it.
     """
-    name = layout.removesuffix("_plain")
+    name = layout.removesuffix(PLAIN)
     for track, splits in TRACKS.items():
         if any(name in layouts for layouts in splits.values()):
             return track

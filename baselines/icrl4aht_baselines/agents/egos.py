@@ -103,7 +103,7 @@ AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random,
 """Reference egos: name -> function from a layout to the policy."""
 
 SCRIPTED: tuple[Callable[..., Policy], ...] = (oracle, searcher)
-"""Reference egos whose parameters are facts of the layouts; their functions also take several layouts."""
+"""Scripted reference egos. Their functions take one layout or several, since their parameters are tables of these."""
 
 
 def ego_on(make: Callable[[Layout], Policy], layouts: Sequence[Layout]) -> Policy:

@@ -29,7 +29,14 @@ from icrl4aht_baselines.evaluate.programs import EpisodeProgram, Programs
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.evaluate.results import Result, find_results, write_result
 from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutState, task_key
-from icrl4aht_baselines.evaluate.segments import CONTROLS, Control, PlannedTask, plan_tasks, segment_lengths
+from icrl4aht_baselines.evaluate.segments import (
+    CONTROLS,
+    Control,
+    PlannedTask,
+    controlled_name,
+    plan_tasks,
+    segment_lengths,
+)
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, check_choice
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
@@ -92,7 +99,7 @@ def evaluate(
         _check_teammate(task, suite)
     if control is not None:
         check_choice("control", control, CONTROLS)
-        agent, details = f"{agent} ({control})", (details or {}) | {CONTROLS[control]: True}
+        agent, details = controlled_name(agent, control), (details or {}) | {CONTROLS[control]: True}
     settings = {
         "agent": agent,
         "seeds": seeds,
@@ -146,10 +153,9 @@ class _Evaluation:
         groups: dict[Any, list[PlannedTask]] = defaultdict(list)
         for plan in planned:
             groups[tuple(_program(task, egos[task.layout], self.make_ego) for task in plan.played)].append(plan)
-        stopped = Event()
+        stopped, make = Event(), self.make_ego if self.make_ego in SCRIPTED else egos.__getitem__
 
         def run(group: list[PlannedTask]) -> list[Result]:
-            make = self.make_ego if self.make_ego in SCRIPTED else egos.__getitem__
             return self._play_group(group, make, stopped, played)
 
         # Groups run at the same time: one compiles while another plays, and one alone does not use all cores. An ego
@@ -253,8 +259,8 @@ def prepare_rollout(
     Args:
         make_ego, tasks, protocol, seeds, suite: see `evaluate`.
         programs: compiled programs, to use and to add to.
-        earlier: the same tasks with the teammates of earlier episodes, from whose state they continue; by default they
-            start.
+        earlier: the rollout of the same tasks in the episodes before, with other teammates; the new one continues from
+            its state. None for the first episodes.
 
     Raises:
         OptionError: if the ego's action is not one integer for each observation.

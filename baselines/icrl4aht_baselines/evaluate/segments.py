@@ -21,8 +21,10 @@ CONTROLS: dict[Control, str] = {"forgets": "forget", "swapped": "swapped"}
 """Control of an evaluation -> its mark in the details of results. `forgets`: the ego's memory is cleared before each
 episode. `swapped`: the teammate of another task plays all episodes but the last ones, see `Protocol.last_episodes`."""
 
-FORGETS = " (forgets)"
-"""End of the name of an agent whose memory is cleared before each episode."""
+
+def controlled_name(agent: str, control: Control) -> str:
+    """Return the name that the results of an agent's control have, such as "mine (forgets)"."""
+    return f"{agent} ({control})"
 
 
 class PlannedTask(NamedTuple):
@@ -61,9 +63,8 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
 
     A task's partner is of the next other family on its layout, in the order of `tasks` and in turn: the first task of a
     family has the first one of the next family, and so on; if all are of one family, it is the next task with another
-    teammate. Under the control `swapped` the partner's teammate plays
-    first. Under a protocol that swaps teammates, the task's own is followed by that of its partner, of the partner's
-    partner, and so on.
+    teammate. Under the control `swapped` the partner's teammate plays first. Under a protocol that swaps teammates, the
+    task's own is followed by that of its partner, of the partner's partner, and so on.
 
     Raises:
         OptionError: if a task has no partner; names the task. See also `segment_lengths`.
@@ -87,21 +88,22 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
 
 
 def _partner(task: Task, on_layout: Sequence[Task]) -> Task:
-    number = [other.task_id for other in on_layout].index(task.task_id)
-    following = [*on_layout[number + 1 :], *on_layout[:number]]
-    # A task with recipes of its own hides them from the ego, so that its partner has to want others, too.
-    other_dish = [other for other in following if task.recipes is None or other.recipes != task.recipes]
-    other_family = [other for other in other_dish if other.teammate_family != task.teammate_family]
-    behaviour = teammate_id(task.teammate), task.recipes
-    other_teammate = [other for other in following if (teammate_id(other.teammate), other.recipes) != behaviour]
-    if other_family:
+    def other_dish(other: Task) -> bool:
+        # A task with recipes of its own hides them from the ego, so that its partner has to want others, too.
+        return task.recipes is None or other.recipes != task.recipes
+
+    ids = [other.task_id for other in on_layout]
+    following = [*on_layout[ids.index(task.task_id) + 1 :], *on_layout[: ids.index(task.task_id)]]
+    families = [other.teammate_family for other in following if other_dish(other)]
+    if other_families := [family for family in families if family != task.teammate_family]:
         # Of the next family the task of the same number, so that the tasks of a cell have different partners.
-        family = [other for other in other_family if other.teammate_family == other_family[0].teammate_family]
-        own = [other.task_id for other in on_layout if other.teammate_family == task.teammate_family]
-        ordered = sorted(family, key=on_layout.index)
-        return ordered[own.index(task.task_id) % len(ordered)]
-    if other_teammate:
-        return other_teammate[0]
+        partners = [one for one in on_layout if one.teammate_family == other_families[0] and other_dish(one)]
+        own = [one.task_id for one in on_layout if one.teammate_family == task.teammate_family]
+        return partners[own.index(task.task_id) % len(partners)]
+    behaviour = teammate_id(task.teammate), task.recipes
+    for other in following:
+        if (teammate_id(other.teammate), other.recipes) != behaviour:
+            return other
     raise OptionError(
         f"task {task.task_id}: needs a task on {task.layout.name} with another teammate to swap with, found none among "
         f"the {len(on_layout)} given ones on it: give more tasks, of several families if possible"

@@ -38,6 +38,7 @@ from icrl4aht_data.benchmark.best_responses import (
     BestResponse,
     BestResponseCard,
     TrainedResponse,
+    chosen_training,
     read_best_responses,
     write_best_responses,
 )
@@ -91,8 +92,9 @@ class Behaviour(NamedTuple):
 
 
 def find_behaviours(tasks: Iterable[Task]) -> list[Behaviour]:
-    """Group tasks with teammates that act alike: those of one split, layout, recipes and family whose distance on the
-    states of all test instances, see `teammates.distances`, is below `SAME_BEHAVIOUR`.
+    """Group the tasks of one split, layout, dish and family whose teammates act alike.
+
+    Teammates act alike if their distance on the states of `teammates.distances` is below `SAME_BEHAVIOUR`.
 
     Teammates on layouts without test instances, such as generated ones, are not compared.
     """
@@ -325,7 +327,7 @@ def best_of(behaviour: Behaviour, trainings: Iterable[TrainedResponse]) -> BestR
     trainings with the same seed, start and steps the last one counts.
     """
     task, seeds = behaviour.tasks[0], {(one.init, one.steps, one.seed): one for one in trainings}
-    best = max(seeds.values(), key=lambda one: one.choice or 0.0)
+    best = chosen_training(seeds.values())
     return BestResponse(
         layout=task.layout.name,
         family=task.teammate_family,
@@ -360,8 +362,8 @@ def write_responses(
 ) -> None:
     """Add the best responses of finished trainings to a file, see `icrl4aht_data.benchmark.best_responses`.
 
-    Trainings that the file has of the same tasks are kept beside the new ones. Entries of other groups of these tasks
-    are dropped. The version is a hash of all entries.
+    Earlier trainings of a behaviour in the file are kept. An entry that shares only some tasks with a new one is
+    removed. The version is a hash of all entries.
 
     Args:
         jobs: the trainings.
@@ -391,8 +393,7 @@ def responses_table(path: Path) -> str:
     """
     body = []
     for one in read_best_responses(path).behaviours:
-        returns = [seed.mean_return for seed in one.seeds]
-        best = max(one.seeds, key=lambda seed: seed.choice or 0.0)
+        returns, best = [seed.mean_return for seed in one.seeds], chosen_training(one.seeds)
         numbers = ", ".join(task.rsplit("_", 3)[1] for task in one.tasks)
         spread = f"{min(returns):.1f} to {max(returns):.1f}" if len(returns) > 1 else ""
         training = [str(len(returns)), f"{best.steps:,}", f"{best.slope or 0.0:+.1f}"]

@@ -14,7 +14,7 @@ from icrl4aht_generation.policy import Policy
 from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent
 from icrl4aht_baselines.evaluate.evaluator import play_tasks
 from icrl4aht_baselines.evaluate.protocols import Protocol
-from icrl4aht_baselines.evaluate.segments import FORGETS
+from icrl4aht_baselines.evaluate.segments import controlled_name
 from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, ResultSource
 from icrl4aht_baselines.report.scores import known_headroom
 from icrl4aht_baselines.training.seen import describe_overlap
@@ -148,7 +148,7 @@ def restore_ego(source: ResultSource) -> JaxEgoMaker:
         OptionError: if the ego is neither a reference ego nor trained, or its run folder is missing or has changed.
     """
     name, details = source.settings["agent"], dict(source.settings.get("details", {}))
-    name = name.removesuffix(FORGETS) if details.pop("forget", None) else name
+    name = name.removesuffix(controlled_name("", "forgets")) if details.pop("forget", None) else name
     if name in AGENTS:
         return AGENTS[name]
     folder = details.get("model") or (source.trained or {}).get("run")

@@ -27,12 +27,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks
 from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import OVERLAPS, TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE, TRACKS, family_order, layout_order, track_of
-from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
@@ -49,7 +49,7 @@ PUBLISHED_PROTOCOL = "published"
 """Name of the protocol that the paper's numbers belong to."""
 
 BLOCKS = {"all": (0, None), "1": (0, 1), "2-5": (1, 5), "6-20": (5, 20), "21-100": (20, 100), "last 20": (-20, None)}
-"""Block of episodes -> slice of a task's episodes. Shorter evaluations have the blocks whose first episode exists."""
+"""Block of episodes -> its slice of a task's episodes. An evaluation has the blocks whose first episode it played."""
 
 EPISODE_BLOCKS = ("1", "2-5", "6-20", "21-100")
 """The blocks that tables show side by side."""
@@ -408,7 +408,7 @@ def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: s
             return {track: read_trained_on(entries[track], where) if track in entries else None for track in TRACKS}
         if TRAINED_ON in record:
             return {"": read_trained_on(entries, where)}
-    untrained = settings["agent"] in (*REFERENCES, "search") and not details and trained is None
+    untrained = settings["agent"] in AGENTS and not details and trained is None
     return {"": SeenInTraining() if untrained else None}
 
 

@@ -35,7 +35,7 @@ class TaskScale(NamedTuple):
 
     Attributes:
         stay, best: mean returns of `stay` and of the best response.
-        behaviour: name of the teammate's behaviour; equal for tasks whose teammates behave alike.
+        behaviour: name of the teammate's behaviour; tasks whose teammates act alike have the same name.
     """
 
     stay: float
@@ -44,7 +44,7 @@ class TaskScale(NamedTuple):
 
 
 class CellScale(NamedTuple):
-    """Scales of the tasks of a cell that have a best response.
+    """Scales of the tasks of a cell.
 
     Attributes:
         tasks: key of a task -> its scale, see `results.task_label`.
@@ -69,7 +69,7 @@ class CellScale(NamedTuple):
 
 
 CellScales = Mapping[ResultCell, CellScale]
-"""Scales of the cells that have any."""
+"""Scales of the cells whose tasks have best responses."""
 
 
 def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from itertools import combinations_with_replacement
 from typing import Any
 
-from icrl4aht_data.benchmark.facts import PREFERENCE, PREFERENCE_LAYOUTS
+from icrl4aht_data.benchmark.facts import PLAIN, PREFERENCE, PREFERENCE_LAYOUTS
 from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_generation.teammates.heuristics.territory import LAZY, TERRITORY
@@ -81,7 +81,8 @@ def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
     for instance in range(INSTANCES):
         for family in TESTED_FAMILIES:
             if split == "test":
-                published = layout.name.removesuffix("_plain")
+                # All layouts but cramped_down have the same published parameters.
+                published = layout.name.removesuffix(PLAIN)
                 found.append(published_teammate(published if published in LAYOUTS else "demo_wide", family, instance))
             else:
                 found.append(sample_teammate(family, instance, "diverse", _DRAWS[split]))
