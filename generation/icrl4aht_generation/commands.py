@@ -264,23 +264,6 @@ def check(a: Path, b: Path, as_json: bool) -> None:
 
 
 @click.command()
-@_profile_option
-@click.option("--layout", type=LAYOUT, default="demo_wide", help="Layout to measure on.")
-@_ego_options
-def speed(profile_name: str, layout: str, ego: dict[str, Any]) -> None:
-    """Measure how fast a profile's ego learns.
-
-    Prints one JSON line: steps/s, and the shares of environment, forward pass and update. Writes nothing.
-    """
-    from icrl4aht_generation.planning.plan import learner_speed
-
-    name = get_layout(layout).name
-    profile = _profile_with_threads(profile_name, None).with_ego(ego)
-    measured = learner_speed(profile, name)
-    click.echo(json.dumps({"profile": profile_name, "layout": name, **measured}))
-
-
-@click.command()
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 if the files differ.")
 @click.option(
     "--out", type=Folder(), metavar="FOLDER", help="Write the manifests here.", show_default="the package's folder"

@@ -14,5 +14,4 @@ VERBS = (
     Verb("research draws", f"{_CLI}:draws", _TASKS, "Measure the heuristic teammates that tasks may draw."),
     Verb("research manifests", f"{_CLI}:manifests", _TASKS, "Write the manifests of all tasks in the package."),
     Verb("research diversity", f"{_CLI}:diversity", _TASKS, "Report how much the teammates of a suite differ."),
-    Verb("research speed", f"{_CLI}:speed", _TASKS, "Measure how fast a profile's ego learns."),
 )

@@ -64,7 +64,6 @@ upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<
 generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, small, smoke.
 generate --out g --seed -1 | -1 is not in the range 0<=x<=4294967295
 generate --out g --address there:1 | --address needs --executor ray
-research speed --layout x | unknown layout 'x'; valid: coord_simple,
 teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
 train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline, rl2.
 train ad --layout demo_wide --order rnd | unknown order 'rnd'; valid: contiguous, random.
@@ -117,7 +116,6 @@ submit empty --out r.json --about a --data b --labels c | empty: no results in e
 train ad --layout all --channels own | channels = own: the layouts coord_simple,
 report empty | empty: no results in empty/tasks; run `icrl4aht-data evaluate --out empty`
 evaluate --agent stay --out e --layout cramped_up | no task on cramped_up in
-research drift empty | empty: not a run
 """
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -104,28 +104,6 @@ AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random,
 
 SCRIPTED: tuple[Callable[..., Policy], ...] = (oracle, searcher)
 """Scripted reference egos. Their functions take one layout or several, since their parameters are tables of these."""
-
-
-def ego_on(make: Callable[[Layout], Policy], layouts: Sequence[Layout]) -> Policy:
-    """Return one policy of an ego for several layouts.
-
-    Args:
-        make: function from a layout to its policy.
-        layouts: the layouts, in the order of their numbers in the environment.
-
-    Raises:
-        OptionError: if the ego has different policies on these layouts, or sees their own channels or state records.
-    """
-    if make in SCRIPTED:
-        return make(layouts)  # type: ignore[arg-type]
-    egos = [make(layout) for layout in layouts]
-    same = len({(one.init, one.act, id(one.params)) for one in egos}) == 1
-    if not same or egos[0].sees not in ("situation", "canonical_input"):
-        raise OptionError(
-            f"an ego that sees {egos[0].sees} cannot play {len(layouts)} layouts at once: expected a model of "
-            f"canonical channels, or a reference ego"
-        )
-    return egos[0]
 
 
 def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None) -> NamedEgo:

@@ -1,4 +1,4 @@
-"""Commands of the paper's experiments and of checks: the positive control, drift, headroom and unseen layouts."""
+"""Commands of the paper's experiments, of the positive control and of the benchmark's headroom."""
 
 from __future__ import annotations
 
@@ -8,13 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import click
-from icrl4aht_generation.teammates.instances import INSTANCES, published_task
 
 from icrl4aht_baselines.commands import options as shared
-from icrl4aht_baselines.commands.options import find_ego
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS
-from icrl4aht_data.commands.options import COUNT, LAYOUT, Folder, Names, examples
-from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.commands.options import Folder, examples
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
@@ -135,97 +131,3 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
         runs = measure_headroom(out, protocol, show)
     for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
         click.echo(f"wrote {path}")
-
-
-@click.command("drift")
-@click.argument("run", type=Folder())
-@click.option("--layout", type=LAYOUT, help="Layout to play.", show_default="the first that the model was trained on")
-@click.option(
-    "--family", type=Names("family", HEURISTIC_KINDS.values), default="H4", help="Teammates: H1, H2, H3 or H4."
-)
-@shared.protocol_option
-@click.option("--episodes", type=COUNT, help="Episodes to play.", show_default="as many as fill the window three times")
-def drift_command(run: Path, layout: str | None, family: str, protocol: str, episodes: int | None) -> None:
-    """Measure the difference between cached and exact acting.
-
-    RUN is a folder that `train` made. Prints one line per episode: the share of equal actions, and the total variation
-    between both policies. Writes nothing.
-    """
-    from icrl4aht_baselines.agents.egos import find_agent
-    from icrl4aht_baselines.evaluate.drift import measure_drift
-    from icrl4aht_baselines.evaluate.protocols import get_protocol
-    from icrl4aht_baselines.training.histories import read_trained
-
-    trained = read_trained(run)
-    fill_window = -(-trained.context // get_protocol(protocol).steps)
-    played = get_protocol(protocol, episodes or 3 * fill_window)
-    name = get_layout(layout or trained.layouts[0]).name
-    find_agent(run).make(get_layout(name))  # a model that does not fit fails before any work
-    tasks = [published_task(name, f"{family}/t{theta}") for theta in range(INSTANCES)]
-    with progress_bars(unit="episodes") as show:
-        found = []
-        model = trained.method, trained.params, trained.context
-        for episode in measure_drift(*model, tasks, played, trained.channels):
-            found.append(episode)
-            show(f"{trained.label}, {family} on {name}", len(found), played.episodes)
-    click.echo(f"{trained.label} on {name} with {len(tasks)} teammates of {family}, K = {trained.context}")
-    click.echo("episode  same action  total variation: mean     largest")
-    for number, (distance, same) in enumerate(found):
-        click.echo(f"{number:>7}  {same.mean():>11.1%}  {distance.mean():>21.6f}  {distance.max():>10.6f}")
-
-
-@click.command(
-    "unseen",
-    epilog=examples(
-        "icrl4aht-data research unseen --agent rl2-reference", "icrl4aht-data research unseen --agent runs/rl2"
-    ),
-)
-@click.option(
-    "--agent",
-    "agents",
-    type=shared.EGO_NAME,
-    multiple=True,
-    help="A bundled model such as ad-reference, or a folder that `train` made; stay and oracle always play. Repeat.",
-)
-@shared.greedy_option
-@click.option(
-    "--layout",
-    "layouts",
-    type=LAYOUT,
-    multiple=True,
-    default=TRACKS["layout"]["train"],
-    help="Layout to rearrange; repeat for several.",
-)
-@click.option("--versions", type=COUNT, default=16, help="Number of rearranged versions of each layout.")
-@click.option("--episodes", type=COUNT, default=40, help="Episodes on each version with each family of teammates.")
-def unseen_command(
-    agents: tuple[str, ...], greedy: bool | None, layouts: tuple[str, ...], versions: int, episodes: int
-) -> None:
-    """Evaluate on rearranged layouts that no model was trained on.
-
-    This shows whether a model learned the game or only its training layouts, and needs no test task. The versions have
-    pots, piles and counters in other places; the teammates are the diverse validation ones. Prints mean returns on each
-    layout, with 95 % intervals over the versions.
-    """
-    from icrl4aht_baselines.evaluate.protocols import bundled_tasks
-    from icrl4aht_baselines.online.unseen import unseen_returns
-    from icrl4aht_baselines.report.tables import unseen_table
-
-    names = {get_layout(name).name for name in layouts}
-    every = (task for track in TRACKS for task in bundled_tasks(track, "diverse"))
-    tasks = [task for task in every if task.layout.name in names]
-    if missing := names - {task.layout.name for task in tasks}:
-        raise click.UsageError(
-            f"--layout {' '.join(sorted(missing))}: no validation tasks; choose layouts that models are trained on"
-        )
-    egos = [find_ego("--agent", name, greedy=greedy) for name in dict.fromkeys(("stay", "oracle", *agents))]
-    for ego in egos:
-        for task in {task.layout.name: task for task in tasks}.values():
-            ego.make(task.layout)  # a model that does not fit fails before any work
-    with progress_bars(unit="episodes") as show:
-
-        def played(what: str, done: int, total: int) -> None:
-            show("unseen layouts", done, total, what)
-
-        found = unseen_returns({ego.name: ego.make for ego in egos}, tasks, versions, episodes, played)
-    click.echo(unseen_table(found))

@@ -36,11 +36,4 @@ VERBS = (
         "Make reference models, with everything that they need.",
     ),
     Verb("research headroom", f"{_LAB}:headroom_command", _CHECKS, "Measure the reference egos on every test task."),
-    Verb("research drift", f"{_LAB}:drift_command", _CHECKS, "Measure the difference between cached and exact acting."),
-    Verb(
-        "research unseen",
-        f"{_LAB}:unseen_command",
-        _CHECKS,
-        "Evaluate on rearranged layouts that no model was trained on.",
-    ),
 )

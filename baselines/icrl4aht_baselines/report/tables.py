@@ -34,7 +34,6 @@ from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM, TRACKS, family_order
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
-from icrl4aht_data.utils.templates import markdown_table
 from icrl4aht_data.utils.text import counted_noun
 
 PAPER_METHODS = ("AD", "DPT")
@@ -329,27 +328,6 @@ def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCe
     texts = [f"{' and '.join(names)} under {text}" if several else f"under {text}" for text, names in labels.items()]
     instances = instances_range(len(run.cells[cell]) for run, cell in shown)
     return f"Evaluated {'; '.join(texts)}; {instances} in a cell."
-
-
-def unseen_table(found: Mapping[str, Mapping[tuple[str, str], np.ndarray]]) -> str:
-    """Return a table with a row for each agent that played on unseen layouts, and a column for each layout's versions.
-
-    Returns are means over families, with intervals over the versions.
-
-    Args:
-        found: agent -> layout and family -> returns, (versions, episodes).
-    """
-    layouts, body = sorted({layout for cells in found.values() for layout, _ in cells}), []
-    for agent, cells in found.items():
-        of_layout = {
-            name: np.mean([values.mean(axis=1) for (layout, _), values in cells.items() if layout == name], axis=0)
-            for name in layouts
-            if any(layout == name for layout, _ in cells)
-        }
-        body.append(
-            [f"`{agent}`", *(mean_interval(of_layout[name]).text() if name in of_layout else "" for name in layouts)]
-        )
-    return markdown_table(["agent", *layouts], body)
 
 
 def instances_range(numbers: Iterable[int]) -> str:

@@ -16,7 +16,7 @@ from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.options import Count, Natural, NotNegative, Option, Positive, Seed, Share, check_options
 
 MOST_REARRANGED = 256
-"""Most rearranged versions of a layout to train on; the next ones are for validation."""
+"""Most rearranged versions of a layout to train on."""
 
 
 @dataclass(frozen=True)

@@ -20,22 +20,16 @@ from rich import filesize
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.format.schema import KINDS, Kind
-from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_generation.collection.noise import noise_bytes
 from icrl4aht_generation.collection.record import array_shapes
-from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.config import PPOConfig
-from icrl4aht_generation.learners.ego import Learner
 from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.learners.network import ActorCritic
-from icrl4aht_generation.learners.rollout import init_rollout, random_player, roll_out
 from icrl4aht_generation.populations.build import population_runs
 from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.teammates.learned import build_untrained
-from icrl4aht_generation.teammates.registry import build_teammate
 
 BYTES: dict[tuple[Kind, str], float] = {
     ("lite", "ppo"): 1.85,
@@ -204,38 +198,6 @@ def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
     """Return the uncompressed size of the histories of egos."""
     shapes = (array_shapes(layout, ego.environments, ego.episodes).values() for layout, ego in egos)
     return sum(math.prod(shape) * np.dtype(dtype).itemsize for arrays in shapes for shape, dtype in arrays)
-
-
-def learner_speed(profile: Profile, layout_name: str) -> dict[str, float]:
-    """Measure the ego of a profile's task on a layout, with a teammate of the profile's kind.
-
-    Returns steps/s of complete updates, and the share of each part, after compiling.
-
-    Three programs are timed: roll-outs of the environment with the teammate and a random ego, roll-outs with the ego's
-    network, complete updates; each share is the difference to the program before.
-    """
-    layout, config = get_layout(layout_name), profile.ego_on(layout_name)
-    heuristics = [work.task.teammate for work in profile.works() if work.source == "ppo"]
-    if profile.algorithms or not heuristics:
-        teammate = build_untrained(layout, profile.teammates.ppo.widths)
-    else:
-        teammate = build_teammate(layout, heuristics[0])
-    learner = Learner(Environment(layout), teammate, config)
-    state, key = jax.jit(learner.init)(jax.random.key(0)), jax.random.key(1)
-    players = learner.players(state.params, state.teammate)
-    random_players = [random_player(EGO, config.environments), players[TEAMMATE]]
-    start = init_rollout(learner.env, random_players, jax.random.split(key, config.environments))
-    env_only = jax.jit(lambda carry: roll_out(learner.env, random_players, carry, config.rollout, key)[0])
-    with_forward = jax.jit(lambda carry: roll_out(learner.env, players, carry, config.rollout, key))
-    environment = _seconds(env_only, start)
-    forward = _seconds(with_forward, state.carry)
-    update = _seconds(jax.jit(learner.update), state)
-    return {
-        "steps_per_second": round(config.steps_per_update / update, 1),
-        "environment_share": round(environment / update, 4),
-        "forward_share": round((forward - environment) / update, 4),
-        "update_share": round((update - forward) / update, 4),
-    }
 
 
 def _seconds(function: Any, *arguments: Any) -> float:

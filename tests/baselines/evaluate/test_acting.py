@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import find_agent
-from icrl4aht_baselines.evaluate.drift import Drift, measure_drift
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions, ModelSize
-from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions, open_run
@@ -61,41 +59,6 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path, name, label, acting)
     assert result.settings["details"] == settings
     with pytest.raises(OptionError, match=r"of other settings \(details.acting: it has .*; details.step: it has 2"):
         evaluate(agent.name, agent.make, WIDE[:1], SHORT, details={"step": 3}, out=tmp_path)
-
-
-@pytest.mark.slow
-def test_drift_begins_when_the_window_is_full(runs, monkeypatch):
-    """With one layer, drift is zero: each cached entry depends on one step only."""
-    two_layer_ad = get_method("ad")(dataclasses.replace(MODEL, layers=2), overcooked_world([WIDE[0].layout]))
-    params, found, protocol = random_parameters(two_layer_ad), [], dataclasses.replace(SHORT, episodes=1, steps=60)
-
-    def on_two_layers(method, params_of_run, context, tasks, planned, channels):
-        assert (context, len(tasks), planned.episodes, channels) == (30, 5, 3, "own")
-        found.extend(measure_drift(two_layer_ad, params, context, WIDE[:1], protocol))
-        return found
-
-    monkeypatch.setattr("icrl4aht_baselines.evaluate.drift.measure_drift", on_two_layers)
-    result = CliRunner().invoke(cli, ["research", "drift", str(runs / "ad")], catch_exceptions=False)
-    assert "AD+TA on demo_wide with 5 teammates of H4, K = 30" in result.output
-    (episode,) = found
-    assert f"{episode.distance.max():>10.6f}" in result.output
-    assert episode.distance.shape == (1, 60)
-    np.testing.assert_allclose(episode.distance[:, :30], 0, atol=1e-6)
-    assert episode.distance[:, 30:].max() > 1e-5
-
-
-def test_the_drift_command(runs, monkeypatch):
-    """Check the plan and table of the command; no episode is played."""
-
-    def play(method, params, context, tasks, planned, channels):
-        assert (context, len(tasks), planned.episodes, channels) == (30, 5, 2, "own")
-        yield Drift(np.full((5, 100), 0.25), np.ones((5, 100), bool))
-
-    monkeypatch.setattr("icrl4aht_baselines.evaluate.drift.measure_drift", play)
-    command = ["research", "drift", str(runs / "ad"), "--episodes", "2", "--family", "H1"]
-    result = CliRunner().invoke(cli, command, catch_exceptions=False)
-    assert "AD+TA on demo_wide with 5 teammates of H1, K = 30" in result.output
-    assert result.output.splitlines()[-1].split() == ["0", "100.0%", "0.250000", "0.250000"]
 
 
 class TestBadRuns:

@@ -31,7 +31,6 @@ from icrl4aht_baselines.report.tables import (
     published_score,
     returns_tables,
     table_score,
-    unseen_table,
 )
 from msgspec import structs
 
@@ -241,11 +240,3 @@ def test_csv_and_markdown_have_the_numbers_of_each_cell(measured):
     assert text.count("\n## Test tasks, ") == 2 and "| H1 | AD, K = 250 | 11.0 ± 0.0<br>score 0.55<br>" in text
     assert "* ? unknown training data: nothing says what the agent was trained on" in text
     assert "Evaluated under protocol published, 1 seed (0), 40 episodes of 100 steps; 5 instances in a cell." in text
-
-
-def test_unseen_layouts():
-    """Check means of hand-made returns on four versions of two layouts."""
-    wide, both, other = ("demo_wide", "H1"), ("asymm_both", "H1"), ("asymm_both", "H3")
-    steady = {wide: np.full((4, 40), 10.0), both: np.full((4, 40), 0.0), other: np.full((4, 40), 5.0)}
-    rows = unseen_table({"stay": steady, "mine": {wide: steady[wide]}}).splitlines()
-    assert rows[2:] == ["| `stay` | 2.5 (2.5 to 2.5) | 10.0 (10.0 to 10.0) |", "| `mine` |  | 10.0 (10.0 to 10.0) |"]
