@@ -5,7 +5,7 @@ layouts' tasks:
 
     OUT/<method>-<entry>/<layout>/run          run folder, as of `train`; <layout> is "all" for a model of all layouts
     OUT/<method>-<entry>/<layout>/results      results, as of `evaluate`
-    OUT/report/                                report of all entries, with report.html and a card of each model
+    OUT/report/                                report of all entries, with report.html
 
 Everything resumes: finished parts are kept, stopped ones continue, and folders of other settings are refused.
 """
@@ -23,8 +23,7 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
 from icrl4aht_baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
-from icrl4aht_baselines.report.cards import write_model_cards
-from icrl4aht_baselines.report.page import report_files, write_page_with_episodes, write_report
+from icrl4aht_baselines.report.page import REPORT_FILES, write_page_with_episodes, write_report
 from icrl4aht_baselines.report.results import merge, note_results, read_run
 from icrl4aht_baselines.training.histories import filter_histories, prepare
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, TrainOptions
@@ -213,7 +212,7 @@ def run_experiment(
     chosen = [_prepare_entry(*model, plan).about["histories"] for model in models]  # impossible ones fail early
     if any(histories["channels"] == "canonical" for histories in chosen):
         notes = [*notes, f"models take canonical channels, {chosen[0]['obs_shape'][-1]} on every layout"]
-    check_output(out / "report", overwrite=True, names=[*report_files(), "report.html"])  # of a stopped run
+    check_output(out / "report", overwrite=True, names=[*REPORT_FILES, "report.html"])  # of a stopped run
     results = []
     for method, entry, layout in models:
         folder = out / f"{method}-{entry.name}" / layout
@@ -226,7 +225,6 @@ def run_experiment(
     page = out / "report" / "report.html"
     options: dict[str, Any] = {"episodes": plan.gifs, "notes": notes, "suite": plan.suite, "progress": progress}
     report.append(write_page_with_episodes(runs, page, **options))
-    report += write_model_cards(runs, out / "report")
     return ExperimentOutcome(report, notes)
 
 

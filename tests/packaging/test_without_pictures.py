@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from icrl4aht_baselines.demo import run_demo
 from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
-from icrl4aht_baselines.report import write_report
 from icrl4aht_generation.plotting import plot_matrix
 from icrl4aht_generation.populations.build import build_suite, report_diversity
 from icrl4aht_generation.profiles import load_profile
@@ -38,12 +37,11 @@ def missing(request, monkeypatch) -> str:
     [
         lambda out: run_demo(out, CONSOLE),
         lambda out: run_experiment("tracks", ExperimentPlan(), out),
-        lambda out: write_report([], out),
         lambda out: build_releases(SMOKE, out, ("lite",), CONSOLE),
         lambda out: build_suite(SMOKE, out, {"demo_wide": ["fcp"]}, 0, CONSOLE),
         lambda out: report_diversity(out, ["demo_wide"], ["fcp"], False, CONSOLE),
     ],
-    ids=["demo", "experiment", "report", "releases", "suite", "diversity"],
+    ids=["demo", "experiment", "releases", "suite", "diversity"],
 )
 def test_work_with_pictures_is_refused_at_once(missing, work, tmp_path):
     with pytest.raises(OptionError, match=f"drawing needs matplotlib and Pillow: {HINT}"):

@@ -132,22 +132,20 @@ def report_command(
 
     RESULTS are folders that `evaluate` made. Prints a summary of each agent, and a table for each agent and track with
     the paper's numbers next to results of protocol published; marks scores with teammates or on layouts that were in
-    training. Writes them as Markdown, CSV and curves, with a card for each trained model. Results of one agent on
-    different layouts are merged.
+    training. Writes them as report.md, and all numbers as report.csv. Results of one agent on different layouts are
+    merged.
     """
     from icrl4aht_baselines.report import page
-    from icrl4aht_baselines.report.cards import card_name, write_model_cards
     from icrl4aht_baselines.report.results import merge, read_run
 
     loaded, folder = merge([read_run(run) for run in runs]), out or runs[0] / "report"
-    check_output(folder, overwrite, [*page.report_files(loaded), *map(card_name, loaded)])
+    check_output(folder, overwrite, page.REPORT_FILES)
     if html:
         check_output(html, overwrite)
     paths = page.write_report(loaded, folder)
     if html:
         with progress_bars() as show:
             paths.append(page.write_page_with_episodes(loaded, html, episodes=gifs, suite=suite, progress=show))
-    paths += write_model_cards(loaded, paths[0].parent)
     click.echo(page.markdown(loaded))
     for path in paths:
         click.echo(f"wrote {path}")

@@ -1,4 +1,4 @@
-"""Reports of evaluation results: Markdown, CSV, figures, a page."""
+"""Reports of evaluation results: Markdown, CSV, a page."""
 
 import sys
 from collections.abc import Sequence
@@ -7,9 +7,8 @@ from icrl4aht_baselines import CallablePackage
 from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.report.page import markdown, write_report
 from icrl4aht_baselines.report.results import as_run, merge, read_run
-from icrl4aht_baselines.report.tables import rows
 
-__all__ = ["as_run", "markdown", "merge", "read_run", "report", "rows", "write_report"]
+__all__ = ["as_run", "markdown", "merge", "read_run", "report", "write_report"]
 
 
 def report(*results: Sequence[Result]) -> str:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from html import escape
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -29,13 +26,11 @@ from icrl4aht_baselines.report.tables import PAPER_METHODS, instances_range
 from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
-from icrl4aht_data.fetch import is_address
 from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.templates import fill_template, markdown_table
 
 HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json")
 
-_HUB = re.compile(r"hf://datasets/([^/@]+/[^/@]+)")
 _NOT_LISTED = ("layouts", "root", "groups", "selections", "sizes", "manifest_sha256", "data_version", "obs_shape")
 
 HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
@@ -44,20 +39,19 @@ HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
 
 def model_card(
     run: EvaluationRun,
-    title: str = "",
-    command: str = "",
-    validation: Sequence[EvaluationRun] = (),
-    pictures: Mapping[str, str] = MappingProxyType({}),
+    title: str,
+    command: str,
+    validation: Sequence[EvaluationRun],
+    pictures: Mapping[str, str],
 ) -> str:
-    """Return README.md of a model, to publish with its run folder.
+    """Return README.md of a bundled model, which has a model for each track.
 
     Args:
-        run: results of a model that was trained here. A run that was merged from models of several layouts has one
-            card, with a row of the table of models for each, and settings for each that differ. Several results of
-            one model are one row.
-        title: name of the model; by default the agent's.
-        command: command that makes the model.
-        validation: further results of the model, on validation tasks under the same protocol, which get tables, too.
+        run: results of all of its models on test tasks. The card's table of models has a row for each, and there are
+            settings for each that differ.
+        title: name of the bundled model.
+        command: command that makes it.
+        validation: further results, on validation tasks under the same protocol, which get tables, too.
         pictures: path of a picture with curves, relative to the card -> what it shows.
     """
     models: dict[str, list[ResultSource]] = defaultdict(list)
@@ -67,23 +61,19 @@ def model_card(
             models[source.trained["run_hash"]].append(source)
             settings[_settings(source.trained["config"])] += source.layouts
     configs: list[dict[str, Any]] = [(sources[0].trained or {})["config"] for sources in models.values()]
-    config, roots = configs[0], [one["histories"]["root"] for one in configs]
-    on_hub = dict.fromkeys(found[1] for root in roots if (found := _HUB.match(root)))
+    config = configs[0]
     seeds = ", ".join(dict.fromkeys(str(config["train"]["seed"]) for config in configs))
     overlaps = {name for one in (run, *validation) for name in one.overlaps(one.cells)}
     limits = [
-        f"{'It' if len(models) == 1 else 'Each model'} is one run, of seed {seeds}: the variation between seeds is not "
-        "known.",
+        f"Each model is one run, of seed {seeds}: the variation between seeds is not known.",
         "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
         *overlap_legend(overlaps),
     ]
-    name = escape(title or run.agent, quote=False)
-    method = config["method"] if title else name
     properties = {
-        "method": method,
+        "method": config["method"],
         "data": "; ".join(dict.fromkeys(_release(one["histories"]) for one in configs)),
         "created with": f"icrl4aht-data {config['package_version']}",
-        "made by": command and f"`{command}`",
+        "made by": f"`{command}`",
     }
     sections = [section for one in (run, *validation) for section in markdown_sections([one], one.protocol)]
     shown = [f"{text}:\n\n![{Path(at).stem}]({at})" for at, text in pictures.items()]
@@ -93,26 +83,22 @@ def model_card(
     ]
     return fill_template(
         "baseline.md",
-        title=name,
-        method=method,
-        datasets="datasets:\n" * bool(on_hub) + "".join(f"- {dataset}\n" for dataset in on_hub),
+        title=title,
+        method=config["method"],
         training=" ".join(dict.fromkeys(map(training_sentence, configs))),
-        properties="\n".join(f"| {name} | {value} |" for name, value in properties.items() if value),
+        properties="\n".join(f"| {name} | {value} |" for name, value in properties.items()),
         models="\n".join(_model_row(run, sources) for sources in models.values()),
         settings="\n\n".join(listed),
         protocol=run.protocol,
         results="\n\n".join(f"#{section}" for section in sections),
-        curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
+        curves="\n\n".join(["## Curves", *shown, ""]),
         limits="\n".join(f"* {limit}" for limit in limits),
     )
 
 
 def _release(histories: Mapping[str, Any]) -> str:
     """Return the name and the data version of the release that a model was trained with."""
-    root = histories["root"]
-    on_hub = _HUB.match(root)
-    name = on_hub[1] if on_hub else root if is_address(root) else f"the local release `{Path(root).name}`"
-    return f"{name}, data version {histories['data_version']}"
+    return f"the local release `{Path(histories['root']).name}`, data version {histories['data_version']}"
 
 
 def training_sentence(config: Mapping[str, Any]) -> str:
@@ -164,19 +150,6 @@ def _settings(config: Mapping[str, Any]) -> str:
     parts.append({"started from run": (config.get("init") or {}).get("run")})
     shown = {name: value for part in parts for name, value in part.items() if name not in unused}
     return "\n".join(f"* {name.replace('_', ' ')}: {value}" for name, value in shown.items() if value not in (None, []))
-
-
-def write_model_cards(runs: Iterable[EvaluationRun], folder: Path) -> list[Path]:
-    """Write the card of every model that was trained here into a folder. Return their paths, NAME.md by run's name."""
-    trained = {folder / card_name(run): run for run in runs if any(source.trained for source in run.sources)}
-    for path, run in trained.items():
-        path.write_text(model_card(run), encoding="utf-8")
-    return [*trained]
-
-
-def card_name(run: EvaluationRun) -> str:
-    """Return the file name of a model's card."""
-    return f"{re.sub(r'[^A-Za-z0-9+]+', '-', run.name).strip('-')}.md"
 
 
 def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:

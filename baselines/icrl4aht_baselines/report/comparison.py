@@ -15,7 +15,6 @@ import pandas as pd
 from icrl4aht_baselines.online.adaptation import adaptation_table
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.results import (
-    CELL_COLUMNS,
     EPISODE_BLOCKS,
     TABLE_COLUMNS,
     TEST_LAYOUTS,
@@ -26,6 +25,7 @@ from icrl4aht_baselines.report.results import (
 )
 from icrl4aht_baselines.report.scores import (
     CellScales,
+    add_scales,
     block_difference,
     cell_scales,
     find_score,
@@ -161,18 +161,6 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
             partial, index=False
         )
     return paths
-
-
-def add_scales(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of results with columns `stay` and `best`, the returns that scores are relative to."""
-    rows = [
-        (protocol, *cell[:2], cell.kind, task, scale.stay, scale.best)
-        for protocol in table["protocol"].unique()
-        for cell, of_cell in cell_scales(protocol).items()
-        for task, scale in of_cell.tasks.items()
-    ]
-    keys = ["protocol", *CELL_COLUMNS, "task"]
-    return table.merge(pd.DataFrame(rows, columns=[*keys, "stay", "best"]), how="left", on=keys)
 
 
 def render_comparison(stored: StoredResults) -> str:

@@ -1,4 +1,4 @@
-"""Reports of results: Markdown, CSV and curves, and one self-contained HTML page.
+"""Reports of results: Markdown, CSV, and one self-contained HTML page.
 
 The page has inline CSS and SVG and GIFs as data URIs, no script and no external files.
 """
@@ -18,57 +18,40 @@ from typing import Any
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from icrl4aht_baselines.plotting import SMOOTHING, plot_return_curves
-from icrl4aht_baselines.report.figures import bar_charts, curve_charts, split_cells
+from icrl4aht_baselines.plotting import SMOOTHING
+from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, family_gifs
 from icrl4aht_baselines.report.results import (
     PUBLISHED_PROTOCOL,
     TASK_KINDS,
     EvaluationRun,
-    ResultCell,
     family_title,
     read_published,
 )
-from icrl4aht_baselines.report.tables import find_headlines, returns_tables, rows
+from icrl4aht_baselines.report.scores import add_scales
+from icrl4aht_baselines.report.tables import find_headlines, returns_tables
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import atomic_write, json_hash
 from icrl4aht_data.utils.templates import markdown_table
+
+REPORT_FILES = ("report.md", "report.csv")
+"""Files that `write_report` writes."""
 
 _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
 _REFERENCE_RANK = {"oracle": 1, "random": 2, "stay": 3}
 
 
-def report_files(runs: Sequence[EvaluationRun] = ()) -> list[str]:
-    """Return the names of the files of a report; without runs the only picture is curves.png."""
-    return ["report.md", "report.csv", *(_curve_pictures(runs) or ["curves.png"])]
-
-
-def _curve_pictures(runs: Sequence[EvaluationRun]) -> dict[str, list[ResultCell]]:
-    """Return the names of the pictures of curves and the cells in each: curves.png, curves-2.png and so on."""
-    parts = split_cells(cell for run in runs for cell in run.cells)
-    return {"curves.png" if n == 1 else f"curves-{n}.png": cells for n, cells in enumerate(parts, start=1)}
-
-
-def write_report(runs: list[EvaluationRun], out: Path) -> list[Path]:
-    """Write report.md, report.csv and the curves of some runs into the folder `out`. Return their paths.
-
-    Raises:
-        OptionError: if matplotlib is not installed; nothing is written then.
-    """
-    check_can_draw()
+def write_report(runs: Sequence[EvaluationRun], out: Path) -> list[Path]:
+    """Write report.md and report.csv of some runs into the folder `out`. Return their paths."""
     out.mkdir(parents=True, exist_ok=True)
-    paths = [out / name for name in report_files(runs)]
-    paths[0].write_text(markdown(runs), encoding="utf-8")
-    paths[1].write_text(csv_text(runs), encoding="utf-8")
-    for name, cells in _curve_pictures(runs).items():
-        panels = {cell.title: {run.name: run.cells[cell] for run in runs if cell in run.cells} for cell in cells}
-        plot_return_curves(panels, out / name)
+    text, table = paths = [out / name for name in REPORT_FILES]
+    text.write_text(markdown(runs), encoding="utf-8")
+    table.write_text(csv_text(runs), encoding="utf-8")
     return paths
 
 
-def markdown(runs: list[EvaluationRun]) -> str:
+def markdown(runs: Sequence[EvaluationRun]) -> str:
     """Return a Markdown report: a summary, and a table of returns per protocol and kind of tasks."""
     lines = [
         "# Returns per layout and teammate family",
@@ -84,7 +67,7 @@ def markdown(runs: list[EvaluationRun]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def markdown_sections(runs: list[EvaluationRun], protocol: str) -> list[str]:
+def markdown_sections(runs: Sequence[EvaluationRun], protocol: str) -> list[str]:
     """Return a section of Markdown for each kind of tasks that was played: a table, and the meaning of its marks."""
     sections = []
     for table in returns_tables(runs, protocol):
@@ -107,10 +90,13 @@ def summary_lines(runs: Sequence[EvaluationRun]) -> list[str]:
     return [*(headline.text for headline in headlines), *legend]
 
 
-def csv_text(runs: list[EvaluationRun]) -> str:
-    """Return the rows of all runs as CSV with a header, see `tables.rows`."""
-    body = pd.DataFrame([row for run in runs for row in rows(run)], dtype=object)
-    return body.to_csv(index=False, lineterminator="\n")
+def csv_text(runs: Sequence[EvaluationRun]) -> str:
+    """Return the results of all runs as CSV, with the columns of docs/results.csv, see `results`.
+
+    The column `agent` has the runs' labels, which distinguish the entries of a sweep.
+    """
+    table = pd.concat([run.table.assign(agent=run.label) for run in runs], ignore_index=True)
+    return add_scales(table).round(3).to_csv(index=False, lineterminator="\n")
 
 
 def write_page(

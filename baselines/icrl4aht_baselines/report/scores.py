@@ -14,8 +14,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from icrl4aht_baselines.report.results import (
+    CELL_COLUMNS,
     AgentReturns,
     CellReturns,
     EvaluationRun,
@@ -87,6 +89,18 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
     wanted = (ResultCell(*cell) for cell, egos in read_headroom(protocol).items() if has_headroom(egos))
     unfinished = {cell.layout for cell in wanted if cell not in found}
     return {cell: scale for cell, scale in found.items() if cell.kind != "test" or cell.layout not in unfinished}
+
+
+def add_scales(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table of results with columns `stay` and `best`, the returns that scores are relative to."""
+    rows = [
+        (protocol, *cell[:2], cell.kind, task, scale.stay, scale.best)
+        for protocol in table["protocol"].unique()
+        for cell, of_cell in cell_scales(protocol).items()
+        for task, scale in of_cell.tasks.items()
+    ]
+    keys = ["protocol", *CELL_COLUMNS, "task"]
+    return table.merge(pd.DataFrame(rows, columns=[*keys, "stay", "best"]), how="left", on=keys)
 
 
 def open_cells(scales: CellScales) -> list[ResultCell]:

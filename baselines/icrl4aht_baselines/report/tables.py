@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from icrl4aht_baselines.report.scores import (
     CellScales,
     Score,
     cell_scales,
-    cell_scores,
     find_score,
     known_headroom,
     scored_cells,
@@ -49,53 +48,6 @@ Published = tuple[float, float | None]
 def mean_of(cells: Iterable[np.ndarray]) -> float:
     """Return the mean of the cells' means."""
     return float(np.mean([values.mean() for values in cells]))
-
-
-def rows(run: EvaluationRun) -> list[dict[str, Any]]:
-    """Return one row per cell of a run.
-
-    A row has the agent, the conditions of the evaluation, mean return, std and 95 % interval over the instances (None
-    for a single instance), the paper's numbers (None unless the protocol is `published`), the mean return in blocks of
-    episodes, mean returns of `stay` and of the best responses, headroom and score (None where it was not measured; no
-    score without headroom and of incomplete cells), and `overlap`: the ways in which training data and
-    tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
-    """
-    scales = cell_scales(run.protocol)
-    scores, headroom, found = cell_scores(run, scales), known_headroom(run.protocol), []
-    for cell, returns in run.returns.items():
-        source, interval, several = run.source(cell), mean_interval(returns.mean), len(returns.mean) > 1
-        like_paper = run.variant is None and run.protocol == PUBLISHED_PROTOCOL and run.is_comparable(cell)
-        paper = (published_score(run, [cell]) if like_paper else None) or (None, None)
-        scale = scales.get(cell)
-        found.append(
-            {
-                "agent": run.agent,
-                "protocol": run.protocol,
-                "layout": cell.layout,
-                "family": cell.family,
-                "instances": len(returns.mean),
-                "episodes": run.cells[cell].shape[1],
-                "mean": interval.mean,
-                "std": float(returns.mean.mean(axis=1).std()) if several else None,
-                "low": interval.low if interval.range() else None,
-                "high": interval.high if interval.range() else None,
-                "published_mean": paper[0],
-                "published_std": paper[1],
-                **{f"episodes {name}": value for name, value in _block_means([returns]).items()},
-                "stay": scale and scale.stay,
-                "best": scale and scale.best,
-                "headroom": headroom.get(cell),
-                "score": scores[cell].mean if cell in scores else None,
-                "tasks": cell.kind,
-                "seeds": len(source.settings["seeds"]),
-                "steps": source.settings["protocol"]["steps"],
-                "overlap": " ".join(returns.overlaps),
-                "acting": source.detail("acting"),
-                "encoder": source.detail("encoder"),
-                "variant": "" if run.variant is None else "{} = {}".format(*run.variant),
-            }
-        )
-    return found
 
 
 def _block_means(cells: Sequence[CellReturns]) -> dict[str, float]:

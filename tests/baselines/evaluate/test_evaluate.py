@@ -277,7 +277,7 @@ def test_commands(tmp_path):
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])
     assert result.exit_code == 0, result.output
     assert "| H4 | stay | 40.0<br>1 of 5 instances<br>episodes 1: 40.0, 2-5: 40.0<br>no headroom |" in result.output
-    assert {path.name for path in (tmp_path / "run" / "report").iterdir()} == {"report.md", "report.csv", "curves.png"}
+    assert {path.name for path in (tmp_path / "run" / "report").iterdir()} == {"report.md", "report.csv"}
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])
     assert "report: exists" in str(result.exception)
     assert CliRunner().invoke(cli, ["report", str(tmp_path / "run"), "--overwrite"]).exit_code == 0

@@ -8,17 +8,16 @@ import re
 from html import unescape
 from html.parser import HTMLParser
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines import report
 from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.report import gifs, merge, write_report
-from icrl4aht_baselines.report.cards import model_card, training_sentence, write_headroom_cards, write_model_cards
+from icrl4aht_baselines.report.cards import model_card, training_sentence, write_headroom_cards
 from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
-from icrl4aht_baselines.report.page import markdown, report_files, write_page, write_page_with_episodes
+from icrl4aht_baselines.report.page import REPORT_FILES, markdown, write_page, write_page_with_episodes
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultCell
 
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -83,9 +82,9 @@ def test_names_are_escaped_in_all_reports(tmp_path):
     run = trained(evaluated_run(EVIL, folder=EVIL), layers=2)
     text = write_page([run], tmp_path / "report.html").read_text()
     assert Elements(text).outside == [] and EVIL not in text and EVIL in unescape(text)
-    for text in (markdown([run]), model_card(run)):
-        assert "<img" not in text and '&lt;img src=x onerror="alert(1)"&gt;&amp;co' in text
-        assert "<br>episodes 1: 10.0, " in text, "line breaks in cells stay"
+    text = markdown([run])
+    assert "<img" not in text and '&lt;img src=x onerror="alert(1)"&gt;&amp;co' in text
+    assert "<br>episodes 1: 10.0, " in text, "line breaks in cells stay"
 
 
 def test_figures_name_conditions_and_mark_overlaps(tmp_path):
@@ -145,35 +144,30 @@ def trained(run: EvaluationRun, **model) -> EvaluationRun:
     return dataclasses.replace(run, sources=tuple(source._replace(trained=content) for source in run.sources))
 
 
-def test_trained_models_have_cards(tmp_path):
+def test_the_card_of_a_bundled_model():
     greedy = {"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}
     first = trained(evaluated_run("AD", trained_on=[greedy], acting="cached"), layers=4, recurrent_layers=2)
-    (path,) = write_model_cards([evaluated_run("stay"), first], tmp_path)
-    assert path.name == "AD-seeded.md"
-    card = path.read_text()
-    parts = [
-        "| data | you/icrl4aht, data version 1.0.0 |",
-        "| demo_wide | 14 of demo_wide; the release's manifest has SHA-256 `ab12` | demo_wide; with utility_greedy (1) "
-        "| 3 | protocol seeded, 1 seed (0), 40 episodes of 100 steps, cached acting, 5 instances in a cell |",
-        "* layers: 4\n* seed: 3\n* queries: 201\n* every: 1\n* labels: oracle\n",
-        "| H4 | AD | 11.0 ± 0.0 †<br>",
-        "It is one run, of seed 3",
-    ]
-    assert [part for part in parts if part not in card] == []
-    assert card.count("* † the agent was trained with other teammates of this family") == 2, "at the table, in limits"
+    other = trained(evaluated_run("AD", ("asymm_right",), trained_on=None, acting="cached"), layers=2)
     own = [make_task("teammate", "validation", "demo_wide", TEST_TASKS[0].teammate, number) for number in (1, 2)]
-    card = model_card(first, "dpt-reference", "python -m x", [evaluated_run("AD", tasks=own)], {"a/b.png": "A curve"})
+    (both,) = merge([first, other])
+    card = model_card(both, "dpt-reference", "python -m x", [evaluated_run("AD", tasks=own)], {"a/b.png": "A curve"})
     parts = [
         "\n# dpt-reference, a model for the ICRL4AHT benchmark\n",
         "| method | dpt |\n",
+        "| data | the local release `icrl4aht@v1`, data version 1.0.0 |",
         "| made by | `python -m x` |",
+        "| demo_wide | 14 of demo_wide; the release's manifest has SHA-256 `ab12` | demo_wide; with utility_greedy (1) "
+        "| 3 | protocol seeded, 1 seed (0), 40 episodes of 100 steps, cached acting, 5 instances in a cell |",
+        "| asymm_right | 14 of asymm_right; ",
+        "Tested on demo_wide:\n\n* layers: 4\n* seed: 3\n* queries: 201\n* every: 1\n* labels: oracle\n",
+        "Tested on asymm_right:\n\n* layers: 2",
+        "| H4 | AD | 11.0 ± 0.0 †<br>",
+        "Each model is one run, of seed 3",
+        "### Validation tasks, seeded\n",
+        "## Curves\n\nA curve:\n\n![b](a/b.png)\n",
     ]
     assert [part for part in parts if part not in card] == []
-    assert "### Validation tasks, seeded\n" in card and "## Curves\n\nA curve:\n\n![b](a/b.png)\n" in card
-    (both,) = merge([first, trained(evaluated_run("AD", ("asymm_right",), trained_on=None, acting="cached"), layers=2)])
-    card = model_card(both)
-    assert "Each model is one run" in card and "| asymm_right | 14 of asymm_right; " in card
-    assert "Tested on demo_wide:\n\n* layers: 4" in card and "Tested on asymm_right:\n\n* layers: 2" in card
+    assert card.count("* † the agent was trained with other teammates of this family") == 2, "at the table, in limits"
 
 
 def test_cards_say_what_a_model_was_trained_on():
@@ -184,15 +178,10 @@ def test_cards_say_what_a_model_was_trained_on():
         assert all(training_sentence(config) in card for config in configs)
         assert "datasets:" not in card
     assert "playing with teammates, not on learning histories. In the first 50% of its steps it also imitated" in card
-    greedy = {"layout": "demo_wide", "family": "H4", "source": "student", "labels": "expert"}
-    run = trained(evaluated_run("AD", trained_on=[greedy], acting="cached"))
-    assert "datasets:\n- you/icrl4aht\n---\n" in model_card(run)
-    config = (run.sources[0].trained or {})["config"] | {"trained_on": [greedy]}
-    assert training_sentence(config) == (
+    cells = [{"layout": "demo_wide", "family": "H4", "source": "student", "labels": "expert"}]
+    assert training_sentence({"histories": {}, "trained_on": cells}) == (
         "It was trained on learning histories of source `student`, with `expert` labels."
     )
-    config["histories"]["root"] = "/data/mine"
-    assert "| data | the local release `mine`, data version 1.0.0 |" in model_card(run)
 
 
 def test_headroom_cards_name_cells_without_headroom(tmp_path):
@@ -263,9 +252,7 @@ def test_commands_with_a_custom_manifest(tmp_path, monkeypatch):
         CliRunner().invoke(cli, ["report", str(tmp_path / "run")], catch_exceptions=False)
 
 
-def test_a_report_is_written_with_all_its_pictures(tmp_path):
-    run = evaluated_run("AD", ("coord_ring", "test_wide", "demo_simple", "demo_wide"))
-    names = [path.name for path in write_report([run], tmp_path / "report")]
-    assert names == ["report.md", "report.csv", "curves.png", "curves-2.png"] == report_files([run])
-    assert np.all([(tmp_path / "report" / name).stat().st_size > 0 for name in names])
+def test_a_report_without_a_page(tmp_path):
+    paths = write_report([evaluated_run("AD")], tmp_path / "report")
+    assert [path.name for path in paths] == [*REPORT_FILES] and all(path.stat().st_size for path in paths)
     assert callable(report)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.results import Result
-from icrl4aht_baselines.report import merge, rows
+from icrl4aht_baselines.report import merge
 from icrl4aht_baselines.report.figures import split_cells
 from icrl4aht_baselines.report.results import BLOCKS, ResultCell, as_run, cell_of, episode_blocks, task_label
 from icrl4aht_baselines.training.seen import OVERLAPS
@@ -75,7 +75,7 @@ def test_kinds_of_tasks_never_share_a_cell(kind):
     assert cell.kind == kind and cell.group == task.teammate_family + ("" if kind == "test" else f" ({kind})")
     run = evaluated_run("AD", protocol="published", tasks=[task, *TASKS["test" if kind != "test" else "own"]])
     assert len(run.cells) == 2
-    assert [row["published_mean"] is None for row in rows(run)] == [row["tasks"] != "test" for row in rows(run)]
+    assert [run.is_comparable(cell) for cell in run.cells] == [cell.kind == "test" for cell in run.cells]
 
 
 @pytest.mark.parametrize(
@@ -95,13 +95,12 @@ def test_overlaps_of_training_and_tasks(tasks, record, expected):
     """Training on a test layout is an overlap only in the layout track."""
     entries = None if record is None else [{"layout": "demo_wide", **entry} for entry in record]
     run = evaluated_run("AD", tasks=tasks, trained_on=entries)
-    assert rows(run)[0]["overlap"].split() == expected
     assert set(run.table["overlap"]) == {" ".join(expected)}
     assert set(expected) <= set(OVERLAPS)
 
 
 def test_only_reference_egos_may_have_no_training_record():
-    assert rows(evaluated_run("stay", trained_on=None))[0]["overlap"] == ""
+    assert set(evaluated_run("stay", trained_on=None).table["overlap"]) == {""}
     with pytest.raises(OptionError, match=r"runs/mine: trained_on: expected a layout, a family"):
         evaluated_run("mine", trained_on=[{"layout": "demo_wide"}])
 
@@ -142,6 +141,5 @@ def test_results_are_kept_for_each_track(tmp_path):
     record = {"teammate": [{"layout": "demo_wide", "family": "H4"}], "layout": []}
     run = evaluated_run("ad-reference", ("demo_wide", "cramped_down"), details={"trained_on": record}, trained_on=None)
     assert [source.layouts for source in run.sources] == [("demo_wide",), ("cramped_down",)]
-    marked = {(row["layout"], row["family"]) for row in rows(run) if row["overlap"]}
-    assert marked == {("demo_wide", "H4")}
+    assert [cell[:2] for cell in run.cells if run.overlaps([cell])] == [("demo_wide", "H4")]
     assert dataclasses.replace(run, note="x").label == "ad-reference [x]"
