@@ -8,24 +8,19 @@
     OUT/NAME-TRACK-first        its first training, before it was labelled on histories of its own
     OUT/NAME-TRACK-own          these histories, and OUT/NAME-TRACK-mixed with the others
     OUT/results/NAME-TRACK/...  results on validation tasks and on test tasks
-    OUT/times.jsonl             wall seconds of each part that was made, and the number of cores
 
 Everything resumes: finished parts are kept, stopped ones continue.
 """
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS
@@ -41,16 +36,14 @@ from icrl4aht_baselines.report.results import merge, note_results, read_run
 from icrl4aht_baselines.report.scores import known_headroom
 from icrl4aht_baselines.training.histories import prepare, start_from
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
-from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES
+from icrl4aht_baselines.training.run_folder import RUN_CURVES
 from icrl4aht_baselines.training.trainer import show_steps
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError, unknown
-from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.progress import counted
-from icrl4aht_data.utils.system import usable_cores
 from icrl4aht_data.writing.combine import combine_releases
 
 PROFILE = "noise"
@@ -74,9 +67,6 @@ TEST_SEEDS = {"seeded": 3, "published": 1}
 
 VALIDATION_KINDS = ("validation", "diverse")
 """Kinds of tasks that models are chosen by."""
-
-TIMES = "times.jsonl"
-"""File name of the times of parts, see this module's docstring."""
 
 RETURNS = "returns.png"
 """File name of the curves of a bundled model's returns, in the folder of a track."""
@@ -224,8 +214,7 @@ class _Steps:
         folder = self.out / "noise"
         if not (folder / "lite").is_dir():
             command = ["-m", "icrl4aht_data", "generate", "--profile", PROFILE, "--out", str(folder)]
-            with self.timed(folder.name):
-                failed = subprocess.run([sys.executable, *command], check=False).returncode
+            failed = subprocess.run([sys.executable, *command], check=False).returncode
             if failed:
                 raise OptionError(f"{folder}: `python {' '.join(command)}` failed; its messages are above")
         return folder / "lite"
@@ -249,10 +238,9 @@ class _Steps:
         options = TrainOptions(**recipe.train)
         root = str(self.noise_release())
         choice = HistoryOptions(TRACKS[self.track]["train"], root, **TRACK_VIEWS[self.track])
-        with self.timed(folder.name, was_done=_is_trained(folder, options)):
-            model, play = ModelOptions(**recipe.model), PlayOptions(**TRACK_PLAY[self.track])
-            job = prepare_play(recipe.method, model, options, play, choice, self.diverse_tasks())
-            job.train(folder, done=show_steps(self.show, folder.name, options.steps))
+        model, play = ModelOptions(**recipe.model), PlayOptions(**TRACK_PLAY[self.track])
+        job = prepare_play(recipe.method, model, options, play, choice, self.diverse_tasks())
+        job.train(folder, done=show_steps(self.show, folder.name, options.steps))
         return folder
 
     def teacher_histories(self, kind: str) -> Path:
@@ -260,9 +248,7 @@ class _Steps:
         folder = self.out / f"{kind}-{self.track}"
         if not folder.is_dir():
             agent = find_agent(self.teacher or self.play(), greedy=False)
-            teammates = self.teammates()
-            with self.timed(folder.name):
-                collect_release(agent, teammates, RL2_HISTORIES[kind], folder, progress=self.show)
+            collect_release(agent, self.teammates(), RL2_HISTORIES[kind], folder, progress=self.show)
         return folder
 
     def train(self, recipe: Recipe, root: Path, folder: Path, before: Path | None = None) -> None:
@@ -272,10 +258,9 @@ class _Steps:
             options = replace(options, learning_rate=OWN_SHARE * options.learning_rate)
         views = {**recipe.histories, **TRACK_VIEWS[self.track]}
         histories = HistoryOptions(TRACKS[self.track]["train"], str(root), channels="canonical", **views)
-        with self.timed(folder.name, was_done=_is_trained(folder, options)):
-            job = prepare(recipe.method, ModelOptions(**recipe.model), options, histories)
-            params = start_from(before, job.method, job.about) if before else None
-            job.train(folder, params=params, done=show_steps(self.show, folder.name, options.steps))
+        job = prepare(recipe.method, ModelOptions(**recipe.model), options, histories)
+        params = start_from(before, job.method, job.about) if before else None
+        job.train(folder, params=params, done=show_steps(self.show, folder.name, options.steps))
 
     def add_own_histories(self, histories: Path, first: Path, run: Path) -> Path:
         """Record histories of a model that the teacher labels. Return the release of these and the given ones."""
@@ -284,8 +269,7 @@ class _Steps:
             if not own.is_dir():
                 labeller = find_agent(self.teacher or self.play())
                 teammates, agent = self.teammates(number=1), find_agent(first, greedy=False)
-                with self.timed(own.name):
-                    collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
+                collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
             combine_releases(mixed, [histories, own])
         return mixed
 
@@ -299,49 +283,20 @@ class _Steps:
             tasks = bundled_tasks(self.track, kind if kind in VALIDATION_KINDS else "test")
             folder = self.out / "results" / f"{name}-{self.track}" / kind
             agent, played = find_agent(run, greedy=recipe.greedy), get_protocol(protocol)
-            was_done = len(list((folder / "tasks").glob("*.json"))) >= len(tasks)
-            with self.timed(f"results/{name}-{self.track}/{kind}", was_done=was_done):
-                evaluate(
-                    name,
-                    agent.make,
-                    tasks,
-                    played,
-                    seeds=range(seeds),
-                    control="forgets" if forgets else None,
-                    out=folder,
-                    details=agent.details,
-                    played=counted(self.show, f"{name}-{self.track}, {kind}", len(tasks) * seeds * played.episodes),
-                )
+            evaluate(
+                name,
+                agent.make,
+                tasks,
+                played,
+                seeds=range(seeds),
+                control="forgets" if forgets else None,
+                out=folder,
+                details=agent.details,
+                played=counted(self.show, f"{name}-{self.track}, {kind}", len(tasks) * seeds * played.episodes),
+            )
             note_results(folder, run, tasks)
             found[kind] = folder
         return found
-
-    @contextmanager
-    def timed(self, part: str, was_done: bool = False) -> Iterator[None]:
-        """Add the wall time of a part to the file of times; nothing for a part that was done before."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:  # a part that was stopped has a line for each time that it ran
-            if not was_done:
-                self.out.mkdir(parents=True, exist_ok=True)
-                line = {"part": part, "seconds": round(time.perf_counter() - start, 1), "cores": usable_cores()}
-                with (self.out / TIMES).open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(line) + "\n")
-
-
-def _is_trained(folder: Path, options: TrainOptions) -> bool:
-    """Return whether the training in a run folder has reached its last step."""
-    return Checkpoints(folder / CHECKPOINTS).latest == options.steps
-
-
-def describe_times(out: Path) -> str:
-    """Return a sentence on the total time of the parts in a folder; empty if none was timed."""
-    path = out / TIMES
-    lines = [parse_json(line) for line in read_text(path).splitlines()] if path.exists() else []
-    hours = sum(line["seconds"] for line in lines) / 3600
-    cores = " or ".join(map(str, sorted({line["cores"] for line in lines})))
-    return f"everything in {out} took {hours:.2f} hours on {cores} cores; see {path}" if lines else ""
 
 
 def write_bundled_card(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +20,6 @@ from icrl4aht_baselines.reference import (
     RL2_HISTORIES,
     TRACK_VIEWS,
     ReferenceOutcome,
-    describe_times,
     make_reference,
     write_bundled_card,
 )
@@ -136,23 +134,6 @@ def test_a_teacher_or_a_finished_run_saves_trainings(steps, tmp_path):
     run = MODELS / "rl2-reference" / "layout"
     found = make_reference("rl2", "layout", tmp_path, print, evaluates=False, finished=run)
     assert found == ReferenceOutcome("rl2", "layout", run, {}) and len(steps) == 2, "a finished run is not made again"
-
-
-def test_times_of_parts(tmp_path):
-    made = reference._Steps(tmp_path / "out", "teammate", print)
-    assert describe_times(made.out) == ""
-    with made.timed("one"):
-        pass
-    with made.timed("there before", was_done=True):
-        pass
-    with pytest.raises(KeyboardInterrupt), made.timed("stopped"):
-        raise KeyboardInterrupt
-    lines = [json.loads(line) for line in (made.out / "times.jsonl").read_text().splitlines()]
-    assert [line["part"] for line in lines] == ["one", "stopped"]
-    assert all(line["seconds"] >= 0 and line["cores"] >= 1 for line in lines)
-    assert re.fullmatch(
-        r"everything in .*out took 0\.00 hours on \d+ cores; see .*times\.jsonl", describe_times(made.out)
-    )
 
 
 def test_one_track_of_a_bundled_model_is_replaced(tmp_path, monkeypatch):

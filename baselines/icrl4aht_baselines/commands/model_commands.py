@@ -155,7 +155,7 @@ def reference_command(
     begin at random, imitated with their noise.
     """
     from icrl4aht_baselines.agents.bundled import bundle_run, bundled_models, check_bundle_name
-    from icrl4aht_baselines.reference import RECIPES, check_taught, describe_times, make_reference, write_bundled_card
+    from icrl4aht_baselines.reference import RECIPES, check_taught, make_reference, write_bundled_card
     from icrl4aht_baselines.training.run_folder import read_config
 
     kept: dict[str, Path] = {}  # tracks of the bundled model that stay
@@ -198,8 +198,6 @@ def reference_command(
             click.echo(f"bundled: {target}")
         in_order = sorted([*others, *outcomes], key=lambda found: list(TRACKS).index(found.track))
         click.echo(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}")
-    if times := describe_times(out):
-        click.echo(times)
 
 
 @click.command(

@@ -133,9 +133,6 @@ seed_option = click.option(
 suite_option = click.option(
     "--suite", type=Folder("`icrl4aht-data teammates`"), metavar="FOLDER", help="Folder of learned teammates."
 )
-tensorboard_option = click.option(
-    "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
-)
 save_minutes_option = click.option(
     "--save-minutes",
     type=OptionValue(Positive),
