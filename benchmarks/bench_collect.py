@@ -26,8 +26,9 @@ from typing import Any
 import click
 import h5py
 import jax
+from icrl4aht_generation.collection.job import run_task
 from icrl4aht_generation.collection.noise import run_noise
-from icrl4aht_generation.collection.task import make_learner, run_task
+from icrl4aht_generation.collection.task import make_learner
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.profiles import Profile, load_profile

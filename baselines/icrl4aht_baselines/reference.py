@@ -150,7 +150,6 @@ def make_reference(
     show: Callable[..., None],
     evaluates: bool = True,
     teacher: str | None = None,
-    finished: Path | None = None,
 ) -> ReferenceOutcome:
     """Make a reference model of a track, with everything that it needs, or resume it.
 
@@ -162,7 +161,6 @@ def make_reference(
         evaluates: whether to evaluate it as well.
         teacher: agent whose histories are recorded and who labels them, such as the bundled `rl2-reference`; without
             it, RL^2 is trained first. Existing releases and runs are kept, even if they were made with another teacher.
-        finished: run folder of the model, such as that of a bundled one, which is then only evaluated.
 
     Raises:
         UnknownNameError: for an unknown recipe or track.
@@ -176,10 +174,10 @@ def make_reference(
     if teacher is not None:
         check_taught(name)
     steps, recipe = _Steps(out, track, show, teacher), RECIPES[name]
-    run = finished or out / f"{name}-{track}"
-    if finished is None and not recipe.data:
+    run = out / f"{name}-{track}"
+    if not recipe.data:
         run = steps.play()
-    elif finished is None:
+    else:
         histories, first = steps.teacher_histories(recipe.data), None
         if recipe.own_round:
             first = run.with_name(f"{run.name}-first")

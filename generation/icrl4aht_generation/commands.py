@@ -167,16 +167,11 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
     type=Names("split of layouts", lambda: LAYOUT_SPLITS),
     help="Only layouts of this split: train, validation or test.",
 )
-@click.option(
-    "--check",
-    is_flag=True,
-    help="Play each: exit with 1 if the oracle, or a pair of them, delivers no soup in 400 steps.",
-)
 @click.option("--out", type=NewFile(".png"), metavar="FILE", help="Draw a sheet of pictures here.")
 @overwrite_option
 @json_option
 def layouts(
-    family: str, count: int, seed: int, split: str | None, check: bool, out: Path | None, overwrite: bool, as_json: bool
+    family: str, count: int, seed: int, split: str | None, out: Path | None, overwrite: bool, as_json: bool
 ) -> None:
     """List generated layouts, and draw them.
 
@@ -189,11 +184,6 @@ def layouts(
     found = generate_layouts(family, seed, count, split=split)
     if out:
         save_sheet(out, found)
-    delivered = [None] * count
-    if check:
-        from icrl4aht_generation.layouts.playable import layouts_delivered
-
-        delivered = layouts_delivered(found).tolist()
     rows = [
         {
             "name": layout.name,
@@ -202,19 +192,16 @@ def layouts(
             "recipes": layout.recipes,
             "indicates_delivery": layout.indicates_delivery,
         }
-        | ({"delivered": one} if check else {})
-        for layout, one in zip(found, delivered, strict=True)
+        for layout in found
     ]
     if as_json:
         click.echo(json.dumps(rows))
     else:
         for layout, row in zip(found, rows, strict=True):
             size = f"{layout.width}x{layout.height}"
-            fault = "  no soup delivered" if row.get("delivered") is False else ""
-            click.echo(f"{layout.name:<20} {row['split']:<10} {size:<5} {len(layout.recipes):>2} recipes{fault}")
+            click.echo(f"{layout.name:<20} {row['split']:<10} {size:<5} {len(layout.recipes):>2} recipes")
     if out:
         click.echo(f"wrote {out}", err=as_json)
-    sys.exit(int(False in delivered))
 
 
 @click.command()
@@ -399,16 +386,12 @@ def teammates(
     help="Folder that `teammates` wrote.",
 )
 @click.option("--greedy", is_flag=True, help="Let the teammate act greedily, as in the dataset.")
-@click.option("--out", type=Folder(), metavar="FOLDER", help="Draw the pictures here.", show_default="SUITE")
-@overwrite_option
-def diversity(
-    layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool, out: Path | None, overwrite: bool
-) -> None:
+def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:
     """Report how much the teammates of a suite differ.
 
-    Prints self-play and cross-play returns of each population and the Hamming distances of all teammates, and draws
-    them into OUT/LAYOUT.
+    Prints self-play and cross-play returns of each population and the Hamming distances of all teammates. Writes
+    nothing.
     """
     from icrl4aht_generation.populations.build import report_diversity
 
-    report_diversity(suite, layouts, algorithms, greedy, console, out, overwrite)
+    report_diversity(suite, layouts, algorithms, greedy, console)

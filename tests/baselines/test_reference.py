@@ -125,41 +125,29 @@ def test_steps_of_building_ad_reference(steps, tmp_path):
     ]
 
 
-def test_a_teacher_or_a_finished_run_saves_trainings(steps, tmp_path):
+def test_a_teacher_saves_a_training(steps, tmp_path):
     make_reference("ad-rising", "teammate", tmp_path, print, evaluates=False, teacher="rl2-reference")
     assert steps == [
         ("collect", "rl2-reference", "40", "rising-teammate", "None"),
         ("train", "ad-rising-teammate", "0.002", "None"),
     ]
-    run = MODELS / "rl2-reference" / "layout"
-    found = make_reference("rl2", "layout", tmp_path, print, evaluates=False, finished=run)
-    assert found == ReferenceOutcome("rl2", "layout", run, {}) and len(steps) == 2, "a finished run is not made again"
 
 
-def test_one_track_of_a_bundled_model_is_replaced(tmp_path, monkeypatch):
-    """The other track is kept and evaluated again for the card; a new model needs all tracks."""
-    made, copied, cards = [], [], []
+def test_a_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
+    copied, cards = [], []
 
-    def make(name: str, track: str, *given: Any, **options: Any) -> ReferenceOutcome:
-        made.append((track, options.get("finished")))
+    def make(name: str, track: str, *given: Any) -> ReferenceOutcome:
         return ReferenceOutcome(name, track, tmp_path / track, {})
 
     monkeypatch.setattr(reference, "make_reference", make)
     monkeypatch.setattr(bundled, "bundle_run", lambda run, name, track, **way: copied.append((name, track)))
     monkeypatch.setattr(reference, "write_bundled_card", lambda name, found, **way: cards.append(found))
-    command = ["research", "reference", "--name", "rl2", "--track", "layout", "--out", str(tmp_path), "--bundle-as"]
-    result = CliRunner().invoke(cli, [*command, "rl2-reference"], catch_exceptions=False)
-    assert result.exit_code == 0
-    assert made == [("layout", None), ("teammate", MODELS / "rl2-reference" / "teammate")]
-    assert copied == [("rl2-reference", "layout")]
+    command = ["research", "reference", "--name", "rl2", "--out", str(tmp_path), "--bundle-as", "rl2-reference"]
+    result = CliRunner().invoke(cli, [*command, "--track", "layout", "--track", "teammate"], catch_exceptions=False)
+    assert result.exit_code == 0 and copied == [("rl2-reference", "layout"), ("rl2-reference", "teammate")]
     assert [found.track for found in cards[0]] == ["teammate", "layout"]
-    result = CliRunner().invoke(cli, [*command, "rl2-other"])
-    assert result.exit_code == 2
-    assert "of all tracks or of those that are to be replaced" in " ".join(result.output.split())
-    result = CliRunner().invoke(cli, [*command, "ad-reference"])
-    assert result.exit_code == 2
-    assert "track teammate of ad-reference has a model of ad, expected one of rl2" in " ".join(result.output.split())
-    assert len(made) == 2
+    result = CliRunner().invoke(cli, [*command, "--track", "layout"])
+    assert result.exit_code == 2 and "expected one --name of all tracks" in " ".join(result.output.split())
 
 
 def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):

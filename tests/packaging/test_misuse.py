@@ -79,7 +79,7 @@ research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl
 research reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states its results
 research reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 results | Missing option '--out'
-submit empty --out r.json --about a | missing --data, --labels
+submit empty --out r.json --about a | Missing option '--data'
 research tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid: ad, dpt, hybrid_ad, amago_offline.
 evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent none --out e | A trained model is named by its folder

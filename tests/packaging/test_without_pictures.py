@@ -5,18 +5,16 @@ from __future__ import annotations
 import re
 import sys
 
-import numpy as np
 import pytest
 from icrl4aht_baselines.demo import run_demo
 from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
-from icrl4aht_generation.plotting import plot_matrix
-from icrl4aht_generation.populations.build import build_suite, report_diversity
+from icrl4aht_generation.populations.build import build_suite
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.build import build_releases
 from rich.console import Console
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.plotting import can_draw
+from icrl4aht_data.plotting import can_draw, new_figure
 from icrl4aht_data.utils.install_hints import install_command
 
 CONSOLE = Console(quiet=True)
@@ -39,9 +37,8 @@ def missing(request, monkeypatch) -> str:
         lambda out: run_experiment("tracks", ExperimentPlan(), out),
         lambda out: build_releases(SMOKE, out, ("lite",), CONSOLE),
         lambda out: build_suite(SMOKE, out, {"demo_wide": ["fcp"]}, 0, CONSOLE),
-        lambda out: report_diversity(out, ["demo_wide"], ["fcp"], False, CONSOLE),
     ],
-    ids=["demo", "experiment", "releases", "suite", "diversity"],
+    ids=["demo", "experiment", "releases", "suite"],
 )
 def test_work_with_pictures_is_refused_at_once(missing, work, tmp_path):
     with pytest.raises(OptionError, match=f"drawing needs matplotlib and Pillow: {HINT}"):
@@ -49,7 +46,7 @@ def test_work_with_pictures_is_refused_at_once(missing, work, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_figure_without_matplotlib(monkeypatch, tmp_path):
+def test_a_figure_without_matplotlib(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(OptionError, match=f"drawing needs matplotlib: {HINT}"):
-        plot_matrix(np.eye(2), "ab", tmp_path / "a.png", "title", ("rows", "columns"))
+        new_figure(1, 1)

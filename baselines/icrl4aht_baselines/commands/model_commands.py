@@ -140,8 +140,7 @@ def collect_command(
     "--bundle-as",
     "bundle",
     metavar="NAME",
-    help="Also bundle the model with the package, under this name; see `models`. With --track, the bundled model's "
-    "other track stays and is evaluated again.",
+    help="Also bundle the model with the package, under this name; see `models`.",
 )
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
 def reference_command(
@@ -154,30 +153,18 @@ def reference_command(
     teammates. ad-student, dpt-student: histories of rl2, labelled with its choices. ad-rising: histories of rl2 that
     begin at random, imitated with their noise.
     """
-    from icrl4aht_baselines.agents.bundled import bundle_run, bundled_models, check_bundle_name
+    from icrl4aht_baselines.agents.bundled import bundle_run, check_bundle_name
     from icrl4aht_baselines.reference import RECIPES, check_taught, make_reference, write_bundled_card
-    from icrl4aht_baselines.training.run_folder import read_config
 
-    kept: dict[str, Path] = {}  # tracks of the bundled model that stay
     if bundle:
         try:
             check_bundle_name(bundle)
         except OptionError as error:
             raise click.UsageError(f"--bundle-as: {error}") from error
-        runs = bundled_models()[bundle].runs if bundle in bundled_models() else {}
-        kept = {one: run for one, run in runs.items() if one not in track}
-        if len(names) != 1 or {*track, *kept} != set(TRACKS) or not evaluates:
+        if len(names) != 1 or {*track} != set(TRACKS) or not evaluates:
             raise click.UsageError(
-                "--bundle-as: expected one --name, evaluated, of all tracks or of those that are to be replaced in a "
-                "bundled model: its card states its results"
+                "--bundle-as: expected one --name of all tracks, evaluated: its card states its results"
             )
-        for one, run in kept.items():
-            method, expected = read_config(run)["method"], RECIPES[names[0]].method
-            if method != expected:
-                raise click.UsageError(
-                    f"--bundle-as: track {one} of {bundle} has a model of {method}, expected one of {expected}, as "
-                    f"{names[0]} is: make both tracks, or choose another name"
-                )
     if teacher:  # before hours of work
         find_ego("--teacher", teacher)
         for name in names:
@@ -186,7 +173,6 @@ def reference_command(
     with progress_bars() as show:
         for name, of_track in product(names, track):
             outcomes.append(make_reference(name, of_track, out, show, evaluates, teacher))
-        others = [make_reference(names[0], one, out, show, finished=run) for one, run in kept.items()]
     for found in outcomes:
         click.echo(f"{found.name}, {found.track}: {found.run}")
         for kind, folder in found.results.items():
@@ -194,9 +180,8 @@ def reference_command(
     if bundle:
         for found in outcomes:
             sampled = not RECIPES[found.name].greedy
-            target = bundle_run(found.run, bundle, found.track, sampled=sampled)
-            click.echo(f"bundled: {target}")
-        in_order = sorted([*others, *outcomes], key=lambda found: list(TRACKS).index(found.track))
+            click.echo(f"bundled: {bundle_run(found.run, bundle, found.track, sampled=sampled)}")
+        in_order = sorted(outcomes, key=lambda found: list(TRACKS).index(found.track))
         click.echo(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}")
 
 
@@ -206,25 +191,17 @@ def reference_command(
         "icrl4aht-data submit runs/results --about 'AD, own encoder' --data noise --labels oracle --out mine.json"
     ),
 )
-@click.argument("folders", nargs=-1, type=Folder(), metavar="FOLDER...")
-@click.option("--about", default="", help="One sentence on how the agent was made.")
-@click.option("--data", default="", help="Its training data in a few words; none if it was not trained.")
-@click.option("--labels", default="", help="The targets of its training in a few words; none without any.")
+@click.argument("folders", nargs=-1, required=True, type=Folder(), metavar="FOLDER...")
+@click.option("--about", required=True, help="One sentence on how the agent was made.")
+@click.option("--data", required=True, help="Its training data in a few words; none if it was not trained.")
+@click.option("--labels", required=True, help="The targets of its training in a few words; none without any.")
 @click.option("--steps", default="", help="Length of the training, such as '4,000 updates'.")
 @click.option("--core-hours", type=click.FloatRange(min=0), help="Core-hours of the training and all it needs.")
 @click.option("--link", default="", help="Address of a paper or repository.")
 @click.option("--name", default="", help="Name of the agent in tables.", show_default="that in the results")
-@click.option("--schema", is_flag=True, help="Only print the JSON schema of the file.")
-@click.option("--out", type=NewFile(".json"), metavar="FILE", help="Write this file.")
+@click.option("--out", type=NewFile(".json"), metavar="FILE", required=True, help="Write this file.")
 @overwrite_option
-def submit_command(
-    folders: tuple[Path, ...],
-    name: str,
-    schema: bool,
-    out: Path | None,
-    overwrite: bool,
-    **facts: Any,
-) -> None:
+def submit_command(folders: tuple[Path, ...], name: str, out: Path, overwrite: bool, **facts: Any) -> None:
     """Make a file of results for the page of `results`.
 
     Checks that FOLDERs of `evaluate` have all test tasks of a track, or of both, under protocol seeded with seeds 0, 1
@@ -234,13 +211,6 @@ def submit_command(
     """
     from icrl4aht_baselines.report import submission
 
-    if schema:
-        click.echo(submission.submission_schema())
-        return
-    required = {"FOLDER": folders, "--out": out, **{f"--{of}": facts[of] for of in ("about", "data", "labels")}}
-    if missing := [option for option, value in required.items() if not value]:
-        raise click.UsageError(f"missing {', '.join(missing)}")
-    assert out is not None
     check_output(out, overwrite)
     found = submission.make_submission(folders, submission.AgentFacts(**facts), name)
     submission.write_submission(out, found)

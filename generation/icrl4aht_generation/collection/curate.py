@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,7 +16,6 @@ from icrl4aht_data.format.schema import curve_ends, stream_score
 from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.plotting import plot_curves
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.oracle import oracle
 from icrl4aht_generation.learners.config import Widths
@@ -87,12 +85,6 @@ def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: floa
         start, end = (round(float(values.mean()), 3) for values in curve_ends(part))
         sides.append(StreamReturns(len(part), start, end))
     return StreamFilter(before=sides[0], after=sides[1], least_improvement=least_improvement)
-
-
-def plot_filter(path: Path, title: str, before: np.ndarray, after: np.ndarray) -> None:
-    """Draw the learning curves of all streams, returns (N, E), and of the selected ones, (n, E), into a PNG."""
-    sides = {f"before: {len(before)} streams": before, f"after: {len(after)} streams": after}
-    plot_curves(path, [(title, {label: returns for label, returns in sides.items() if len(returns)})])
 
 
 def relabel(layout: Layout, network: ActorCritic, params: Any, states: np.ndarray) -> np.ndarray:

@@ -2,21 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from icrl4aht_generation.collection.noise import is_noise_finished, run_noise
-from icrl4aht_generation.collection.task import run_task
-from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing
+from icrl4aht_generation.collection.noise import play_histories
+from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, UpdateCallback, learn_histories
+from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing, partial_folder, publish_artefact
 from icrl4aht_generation.jobs.job import OnUpdate
+from icrl4aht_generation.learners.resume import run_lock
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
 
+_MAKERS = {"ppo": learn_histories, "noise": play_histories}
+"""Source -> function that makes an artefact in its partial folder, or resumes it there."""
 
-def _functions(source: str) -> tuple[Callable[..., bool], Callable[..., bool]]:
-    """Return the functions that record the histories of a source, and that check whether they are complete."""
-    return {"ppo": (run_task, is_task_finished), "noise": (run_noise, is_noise_finished)}[source]
+
+def run_task(
+    work: Work,
+    profile: Profile,
+    folder: Path,
+    on_update: UpdateCallback = lambda update, metrics: None,
+    *,
+    suite: Path | None = None,
+    wait: bool = False,
+    save_seconds: float = TASK_SAVE_SECONDS,
+) -> bool:
+    """Make an artefact, resuming from its last save, unless it is finished.
+
+    Args:
+        work: the unit of work.
+        profile: hyper-parameters, sizes and schedules.
+        folder: the artefact.
+        on_update: called after each update, or each noise history.
+        suite: folder of the learned teammates, if the task's is one.
+        wait: whether to wait for another process that works on it.
+        save_seconds: least time between two saves.
+
+    Returns:
+        False if the artefact was already finished, otherwise True.
+
+    Raises:
+        BusyError: if another process works on it.
+        DiskFullError: if the disk has no room.
+    """
+    with run_lock(folder, wait=wait):
+        if is_task_finished(folder, work, profile):
+            return False
+        partial = partial_folder(folder)
+        if not is_task_finished(partial, work, profile):  # otherwise a run was killed just before the renaming
+            _MAKERS[work.source](work, profile, partial, on_update, suite, save_seconds)
+        publish_artefact(partial, folder)
+        return True
 
 
 @dataclass(frozen=True)
@@ -64,7 +100,7 @@ class CollectionJob:
 
     def is_finished(self) -> bool:
         """Return whether the artefact is complete and unchanged."""
-        return _functions(self.work.source)[1](self.folder, self.work, self.profile)
+        return is_task_finished(self.folder, self.work, self.profile)
 
     def progress(self) -> tuple[int, float] | None:
         """Return what the artefact's timing states, see `jobs.job.Job`."""
@@ -77,8 +113,7 @@ class CollectionJob:
         def on_metrics(update: int, metrics: dict[str, float]) -> None:
             on_update(update + 1, metrics["steps_per_second"])
 
-        run, _ = _functions(self.work.source)
-        run(self.work, self.profile, self.folder, on_metrics, suite=self.suite, wait=wait)
+        run_task(self.work, self.profile, self.folder, on_metrics, suite=self.suite, wait=wait)
 
     def finished_text(self) -> str:
         """Return the text on the finished artefact."""

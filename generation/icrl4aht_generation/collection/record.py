@@ -12,6 +12,9 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_generation.learners.rollout import Rollout
 
+NOISE_ARRAYS = ("oracle_actions", "noise")
+"""Further arrays of artefacts of the source `noise`, see `collection.noise`."""
+
 
 class HistoryArrays(NamedTuple):
     """N histories of E episodes and T = 100 E steps; NumPy arrays or memory maps.

@@ -1,4 +1,4 @@
-"""One task -> one finished artefact.
+"""One task of the source `ppo` -> the files of its artefact.
 
 The learner's state is saved at intervals, always after the histories that it led to. A killed task resumes from there,
 and since an update is a pure function of the state, the artefact has the bits of an uninterrupted run.
@@ -25,14 +25,11 @@ from icrl4aht_generation.collection.task_folder import (
     check_room,
     disk_full,
     finish_artefact,
-    is_task_finished,
     needed_bytes,
-    partial_folder,
-    publish_artefact,
 )
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.ego import Learner, compiled_update
-from icrl4aht_generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, run_lock, software_versions
+from icrl4aht_generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, software_versions
 from icrl4aht_generation.policy import Noise
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
@@ -54,70 +51,10 @@ def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Lea
     return Learner(Environment(task.layout), teammate, profile.ego_on(task.layout.name))
 
 
-def run_task(
-    work: Work,
-    profile: Profile,
-    folder: Path,
-    on_update: UpdateCallback = lambda update, metrics: None,
-    *,
-    suite: Path | None = None,
-    wait: bool = False,
-    save_seconds: float = TASK_SAVE_SECONDS,
-) -> bool:
-    """Train the ego of a task and record its histories into `folder`, resuming from the last saved update.
-
-    Args:
-        work: the task, and which of its learners.
-        profile: the ego's hyper-parameters.
-        folder: the artefact.
-        on_update: called after each update.
-        suite: folder of the learned teammates, if the task's is one.
-        wait: whether to wait for another process that works on this task.
-        save_seconds: least time between two saves of the learner's state.
-
-    Returns:
-        False if the artefact was already finished, otherwise True.
-
-    Raises:
-        BusyError: if another process works on this task.
-        DiskFullError: if the disk has no room.
-    """
-    return make_artefact(
-        folder,
-        wait,
-        lambda found: is_task_finished(found, work, profile),
-        lambda partial: _learn(work, profile, partial, on_update, suite, save_seconds),
-    )
-
-
-def make_artefact(folder: Path, wait: bool, is_finished: Callable[[Path], bool], make: Callable[[Path], None]) -> bool:
-    """Make an artefact in its partial folder and rename it, unless it is finished.
-
-    Args:
-        folder: the artefact.
-        wait: whether to wait for another process that works on it.
-        is_finished: whether a folder has the complete artefact.
-        make: makes it in a folder, or resumes it there.
-
-    Returns:
-        False if the artefact was already finished, otherwise True.
-
-    Raises:
-        BusyError: if another process works on it.
-    """
-    with run_lock(folder, wait=wait):
-        if is_finished(folder):
-            return False
-        partial = partial_folder(folder)
-        if not is_finished(partial):  # otherwise a run was killed just before the renaming
-            make(partial)
-        publish_artefact(partial, folder)
-        return True
-
-
-def _learn(
+def learn_histories(
     work: Work, profile: Profile, partial: Path, on_update: UpdateCallback, suite: Path | None, save_seconds: float
 ) -> None:
+    """Train the ego of a task and record its histories into a partial artefact, see `collection.job.run_task`."""
     task, saved = work.task, StateFile(partial / LEARNER, artefact_settings(work, profile) | software_versions())
     learner = make_learner(task, profile, suite)
     first, init, key = saved_progress(saved), jax.jit(learner.init), learner_key(work)

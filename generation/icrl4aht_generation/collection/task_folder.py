@@ -6,17 +6,18 @@
   metrics.jsonl       one line per update
   checkpoints/c<k>/   policy.safetensors policy.json, the ego at evenly spaced moments; the last one is the final ego
   timing.jsonl        wall-clock figures, not hashed
-  filter.png labeller_returns.json   added by packing, not hashed
+  labeller_returns.json   added by packing, not hashed
 <task_id>.partial/    the same files while the task runs, and the last saved state, `learner.safetensors`
 .<task_id>.lock       held by the collector that works on it
 """
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -30,7 +31,7 @@ from icrl4aht_data.errors import DiskFullError, IndexFormatError
 from icrl4aht_data.format.cached_arrays import new_mapped_array
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
-from icrl4aht_generation.collection.record import HistoryArrays, array_shapes, record_rollout
+from icrl4aht_generation.collection.record import NOISE_ARRAYS, HistoryArrays, array_shapes, record_rollout
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
@@ -39,8 +40,8 @@ from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
-FILTER_CURVES, LABELLER_RETURNS = "filter.png", "labeller_returns.json"
-"""Files that packing adds: a picture of the stream filter, and what the ego's checkpoints earn as labellers."""
+LABELLER_RETURNS = "labeller_returns.json"
+"""File that packing adds: what the ego's checkpoints earn as labellers."""
 
 _LINE_BYTES = 600  # field of an update's number, in metrics and timing
 
@@ -55,50 +56,38 @@ def checkpoint_path(folder: Path, number: int) -> Path:
     return folder / "checkpoints" / f"c{number}"
 
 
-def _hashed_files(config: PPOConfig) -> list[str]:
-    checkpoints = (checkpoint_path(Path(), number) for number in range(len(checkpoint_updates(config))))
-    policies = {(path / name).as_posix() for path in checkpoints for name in (POLICY_WEIGHTS, POLICY_CARD)}
-    return sorted({f"{name}.npy" for name in HistoryArrays._fields} | {METRICS} | policies)
-
-
 def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
     """Return the settings that an artefact depends on; if any of them changes, it is made again."""
-    ego = profile.ego_on(work.task.layout.name)
-    return common_settings(work) | {
-        "ego_hash": json_hash(asdict(ego)),
-        "checkpoint_updates": list(checkpoint_updates(ego)),
-    }
-
-
-def common_settings(work: Work) -> dict[str, Any]:
-    """Return the settings that artefacts of every source depend on."""
-    return {
+    common = {
         "task": asdict(work.task),
         "source": work.source,
         "learner": work.learner,
         "code_version": version("icrl4aht-data"),
     }
+    if work.source == "noise":
+        return common | {"noise": json.loads(json.dumps(asdict(profile.noise)))}  # lists, as in the file, not tuples
+    ego = profile.ego_on(work.task.layout.name)
+    return common | {"ego_hash": json_hash(asdict(ego)), "checkpoint_updates": list(checkpoint_updates(ego))}
+
+
+def hashed_files(work: Work, profile: Profile) -> list[str]:
+    """Return the files whose hashes an artefact's metadata has, sorted."""
+    files = {METRICS, *(f"{name}.npy" for name in HistoryArrays._fields)}
+    if work.source == "noise":
+        return sorted(files | {f"{name}.npy" for name in NOISE_ARRAYS})
+    count = len(checkpoint_updates(profile.ego_on(work.task.layout.name)))
+    checkpoints = [checkpoint_path(Path(), number) for number in range(count)]
+    return sorted(files | {(path / name).as_posix() for path in checkpoints for name in (POLICY_WEIGHTS, POLICY_CARD)})
 
 
 def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
-    """Return whether a folder has this learner's artefact under these settings, with all its files unchanged."""
-    return is_artefact_finished(
-        folder, artefact_settings(work, profile), _hashed_files(profile.ego_on(work.task.layout.name))
-    )
-
-
-def is_artefact_finished(folder: Path, settings: dict[str, Any], files: list[str]) -> bool:
-    """Return whether a folder has an artefact of these settings and files, all of them unchanged.
-
-    Args:
-        folder: the folder.
-        settings: settings that the artefact depends on.
-        files: its hashed files, sorted.
-    """
+    """Return whether a folder has this artefact under these settings, with all its files unchanged."""
+    settings = artefact_settings(work, profile)
     try:
         metadata = parse_json(read_text(folder / METADATA))
         same = {name: metadata[name] for name in settings} == settings
-        return same and sorted(metadata["files"]) == files and hashes_hold(folder, metadata["files"])
+        listed = sorted(metadata["files"]) == hashed_files(work, profile)
+        return same and listed and hashes_hold(folder, metadata["files"])
     except (IndexFormatError, OSError, KeyError, TypeError):
         return False
 
@@ -140,25 +129,15 @@ def disk_full(partial: Path, needed: int) -> DiskFullError:
 
 
 def finish_artefact(partial: Path, work: Work, profile: Profile) -> None:
-    """Write the metadata of a learner's artefact, see `write_metadata`."""
-    ego = profile.ego_on(work.task.layout.name)
-    settings = artefact_settings(work, profile) | {"profile": profile.name, "ego": asdict(ego)}
-    write_metadata(partial, settings, _hashed_files(ego))
-
-
-def write_metadata(partial: Path, settings: dict[str, Any], files: list[str]) -> None:
-    """Write the metadata, the last file; the artefact is complete, and `publish_artefact` renames it.
-
-    Args:
-        partial: the artefact.
-        settings: settings that it depends on, and further facts about its origin.
-        files: its hashed files, sorted.
-    """
+    """Write the metadata, the last file; the artefact is complete, and `publish_artefact` renames it."""
+    settings = artefact_settings(work, profile) | {"profile": profile.name}
+    if work.source == "ppo":
+        settings |= {"ego": asdict(profile.ego_on(work.task.layout.name))}
     metadata = settings | {
         "jax_version": jax.__version__,
         "platform": jax.default_backend(),
         "xla_threads": xla_threads(),
-        "files": {name: file_hash(partial / name) for name in files},
+        "files": {name: file_hash(partial / name) for name in hashed_files(work, profile)},
     }
     with atomic_write(partial / METADATA) as unnamed:
         write_json(unnamed, metadata)
@@ -171,11 +150,71 @@ def publish_artefact(partial: Path, folder: Path) -> None:
     partial.rename(folder)
 
 
-class ArtefactWriter:
-    """Fills an artefact's histories, metrics and timing, update by update.
+class ArrayWriter:
+    """Fills the arrays and the log of a partial artefact, piece by piece.
 
     The arrays are memory maps of files whose space on the disk is allocated at the start. `sync` writes them out and
     maps them again, so that memory holds only what came since the last `sync`.
+
+    Args:
+        partial: an existing folder.
+        shapes: name of an array -> its shape and dtype.
+        is_new: whether to create the files.
+        kept: lines of the log with an `update` from this number on are cut off.
+
+    Raises:
+        OSError: if the disk is full.
+    """
+
+    def __init__(
+        self, partial: Path, shapes: Mapping[str, tuple[tuple[int, ...], str]], is_new: bool, kept: int
+    ) -> None:
+        self._partial, self._names = partial, tuple(shapes)
+        self._started, self._steps, self._recording, self._has_written = time.perf_counter(), 0, 0.0, False
+        if is_new:
+            for name, (shape, dtype) in shapes.items():
+                new_mapped_array(partial / f"{name}.npy", shape, np.dtype(dtype))
+        self._log = RunLog(partial, keep=lambda line: line["update"] < kept)
+        self._arrays = self._mapped()
+
+    def _mapped(self) -> dict[str, Any]:
+        return {name: np.lib.format.open_memmap(self._partial / f"{name}.npy", "r+") for name in self._names}
+
+    def _timing(self, steps: int, began: float) -> dict[str, float]:
+        """Return the timing after a piece of some steps that has been recorded since `began`.
+
+        Timing counts from the end of the first piece, which includes compiling: `steps_per_second`, `seconds`, and how
+        many of these were spent on `recording`.
+        """
+        now = time.perf_counter()
+        self._steps, self._recording, seconds = self._steps + steps, self._recording + now - began, now - self._started
+        timing = {
+            "steps_per_second": round(self._steps / seconds, 1),
+            "seconds": round(seconds, 6),
+            "recording": round(self._recording, 6),
+        }
+        if not self._has_written:
+            self._started, self._steps, self._recording, self._has_written = now, 0, 0.0, True
+        return timing
+
+    def sync(self, save: Callable[[], None]) -> None:
+        """Force everything written so far to the disk, and out of memory; then save the state that led to it."""
+        began = time.perf_counter()
+        for array in self._arrays.values():
+            array.flush()
+        self._arrays = self._mapped()
+        self._log.sync()
+        save()
+        self._recording += time.perf_counter() - began
+
+    def close(self) -> None:
+        """Close the log and unmap the arrays."""
+        self._log.close()
+        self._arrays.clear()
+
+
+class ArtefactWriter(ArrayWriter):
+    """Fills an artefact's histories, metrics and timing, update by update.
 
     Args:
         partial: an existing folder.
@@ -188,47 +227,19 @@ class ArtefactWriter:
     """
 
     def __init__(self, partial: Path, task: Task, config: PPOConfig, first: int) -> None:
-        self._partial, self._task, self._config, self._first = partial, task, config, first
-        self._started = time.perf_counter()
-        self._recording = 0.0
-        if not first:
-            for name, (shape, dtype) in array_shapes(task.layout, config.environments, config.episodes).items():
-                new_mapped_array(self._array(name), shape, np.dtype(dtype))
-        self._log = RunLog(partial, keep=lambda line: line["update"] < first)
-        self._histories = self._mapped()
-
-    def _array(self, name: str) -> Path:
-        return self._partial / f"{name}.npy"
-
-    def _mapped(self) -> HistoryArrays:
-        return HistoryArrays(
-            **{name: np.lib.format.open_memmap(self._array(name), "r+") for name in HistoryArrays._fields}
-        )
+        super().__init__(partial, array_shapes(task.layout, config.environments, config.episodes), not first, first)
+        self._task, self._config = task, config
 
     def write(self, number: int, rollout: Any, metrics: dict[str, Any]) -> dict[str, float]:
-        """Record one update; returns its metrics and timing.
-
-        Timing counts from the end of this writer's first update, which includes compiling: `steps_per_second`,
-        `seconds`, and how many of these were spent on `recording`.
-        """
+        """Record one update; returns its metrics and timing."""
         jax.block_until_ready((rollout, metrics))
         began = time.perf_counter()
-        record_rollout(self._histories, number, rollout)
+        record_rollout(HistoryArrays(**self._arrays), number, rollout)
         line = {"update": number, "step": (number + 1) * self._config.steps_per_update}
         line |= {name: float(value) for name, value in metrics.items()}
         if not line.get("episodes", 1):
             line.pop("return", None)  # no episode ended, so there is no mean return
-        now = time.perf_counter()
-        self._recording += now - began
-        seconds = now - self._started
-        speed = max(1, number - self._first) * self._config.steps_per_update / seconds
-        if number == self._first:
-            self._started, self._recording = now, 0.0
-        timing = {
-            "steps_per_second": round(speed, 1),
-            "seconds": round(seconds, 6),
-            "recording": round(self._recording, 6),
-        }
+        timing = self._timing(self._config.steps_per_update, began)
         self._log.write(line, timing={"update": number} | timing)
         return line | timing
 
@@ -243,21 +254,6 @@ class ArtefactWriter:
             card = {"task_id": self._task.task_id, "steps": updates * self._config.steps_per_update}
             save_policy(checkpoint_path(self._partial, moments.index(updates)), network, params, card)
             self._recording += time.perf_counter() - began
-
-    def sync(self, save: Callable[[], None]) -> None:
-        """Force everything written so far to the disk, and out of memory; then save the state that led to it."""
-        began = time.perf_counter()
-        for array in self._histories:
-            array.flush()  # type: ignore[attr-defined]
-        self._histories = self._mapped()
-        self._log.sync()
-        save()
-        self._recording += time.perf_counter() - began
-
-    def close(self) -> None:
-        """Close the log and unmap the arrays."""
-        self._log.close()
-        del self._histories
 
 
 def last_timing(folder: Path) -> dict[str, Any] | None:

@@ -21,10 +21,8 @@ from icrl4aht_data.benchmark.facts import (
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.plotting import check_can_draw
-from icrl4aht_data.utils.files import check_output
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
-from icrl4aht_generation.plotting import plot_matrix
 from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR
 from icrl4aht_generation.populations.diversity import actions_on_common_states, family_distances, hamming_distances
 from icrl4aht_generation.populations.select import TeammateSelection, select_teammates, write_manifests
@@ -116,15 +114,9 @@ def training_layouts() -> list[str]:
 
 
 def report_diversity(
-    suite: Path,
-    layouts: Sequence[str],
-    algorithms: Sequence[str],
-    greedy: bool,
-    console: Console,
-    out: Path | None = None,
-    overwrite: bool = False,
+    suite: Path, layouts: Sequence[str], algorithms: Sequence[str], greedy: bool, console: Console
 ) -> None:
-    """Print and draw, for each layout, self-play and cross-play of every population and the distances of families.
+    """Print, for each layout, self-play and cross-play of every population and the distances of families.
 
     Args:
         suite: the suite's folder.
@@ -132,15 +124,10 @@ def report_diversity(
         algorithms: the populations.
         greedy: whether teammates take their most probable actions.
         console: where to print.
-        out: folder of the pictures; by default the suite's.
-        overwrite: replace pictures.
 
     Raises:
-        OptionError: if a population is not finished, or no layout has all of them; if a picture may not be written, see
-            `utils.files.check_output`; if matplotlib is not installed.
+        OptionError: if a population is not finished, or no layout has all of them.
     """
-    check_can_draw()
-    out = out or suite
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or [
         name for name in training_layouts() if all(is_trained(suite, name, algorithm) for algorithm in ALGORITHMS)
     ]
@@ -150,27 +137,23 @@ def report_diversity(
             f"trains them, or name a --layout"
         )
     for name in names:
-        for picture in (_distances_picture(out, name), *(_cross_play_picture(out, name, each) for each in algorithms)):
-            check_output(picture, overwrite)
-    for name in names:
         layout = get_layout(name)
         for algorithm in algorithms:
-            _report_population(suite, layout, algorithm, greedy, out, console)
-        _report_distances(suite, layout, algorithms, out, console)
+            _report_population(suite, layout, algorithm, greedy, console)
+        _report_distances(suite, layout, algorithms, console)
 
 
-def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, out: Path, console: Console) -> None:
+def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:
     returns = play_matrix(suite, layout, algorithm, greedy)
     diagonal = np.eye(len(returns), dtype=bool)
     title = f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps"
-    path, members = _cross_play_picture(out, layout.name, algorithm), [f"m{k}" for k in range(len(returns))]
-    _show_matrix(console, path, title, members, ("ego", "teammate"), returns)
+    _show_matrix(console, title, [f"m{k}" for k in range(len(returns))], ("ego", "teammate"), returns)
     self_play = returns[diagonal].mean()
     cross_play = returns[~diagonal].mean() if len(returns) > 1 else float("nan")
     console.print(f"self-play {self_play:.1f}, cross-play {cross_play:.1f}, gap {self_play - cross_play:.1f}")
 
 
-def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], out: Path, console: Console) -> None:
+def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], console: Console) -> None:
     policies, families = [], {}
     for algorithm in algorithms:
         points = list(suite_checkpoints(suite, layout.name, algorithm))
@@ -182,21 +165,11 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], ou
         policies += [build_teammate(layout, {"family": kind, "theta": theta}) for theta in thetas]
     distances = family_distances(hamming_distances(actions_on_common_states(layout, policies)), families)
     title = f"{layout.name}: mean Hamming distance of families"
-    _show_matrix(console, _distances_picture(out, layout.name), title, list(families), ("family", "family"), distances)
+    _show_matrix(console, title, list(families), ("family", "family"), distances)
 
 
-def _cross_play_picture(out: Path, layout: str, algorithm: str) -> Path:
-    return out / layout / algorithm / "cross_play.png"
-
-
-def _distances_picture(out: Path, layout: str) -> Path:
-    return out / layout / "distances.png"
-
-
-def _show_matrix(
-    console: Console, path: Path, title: str, names: Sequence[str], axes: tuple[str, str], values: np.ndarray
-) -> None:
-    """Print a square matrix with the same names for rows and columns, and draw it into a picture."""
+def _show_matrix(console: Console, title: str, names: Sequence[str], axes: tuple[str, str], values: np.ndarray) -> None:
+    """Print a square matrix with the same names for rows and columns."""
     table = Table(title=title)
     table.add_column(" \\ ".join(axes))
     for name in names:
@@ -204,6 +177,3 @@ def _show_matrix(
     for name, row in zip(names, values, strict=True):
         table.add_row(name, *(f"{value:.2f}" for value in row))
     console.print(table)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_matrix(values, names, path, title, axes)
-    console.print(f"wrote {path}")

@@ -12,12 +12,12 @@ import numpy as np
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_generation.collection.task_folder import FILTER_CURVES, LABELLER_RETURNS, METADATA
+from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA
 from icrl4aht_generation.jobs.job import FAILED
 from icrl4aht_generation.learners.resume import TIMING
 from icrl4aht_generation.populations.train import POPULATION
 
-_IGNORED = {TIMING, FAILED, FILTER_CURVES, LABELLER_RETURNS}
+_IGNORED = {TIMING, FAILED, LABELLER_RETURNS}
 """Files about the course of a rebuild, and those that packing adds to artefacts."""
 
 _TEXT = {".json", ".jsonl", ".md", ".sha256"}

@@ -25,10 +25,10 @@ from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
 from icrl4aht_data.writing.card import CURVES_FIGURE
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
-from icrl4aht_generation.collection.curate import filter_report, oracle_labels, plot_filter, relabel
+from icrl4aht_generation.collection.curate import filter_report, oracle_labels, relabel
 from icrl4aht_generation.collection.record import HistoryArrays
 from icrl4aht_generation.collection.task import TEAMMATE_NOISE
-from icrl4aht_generation.collection.task_folder import FILTER_CURVES, METADATA
+from icrl4aht_generation.collection.task_folder import METADATA
 from icrl4aht_generation.learners.checkpoint import load_policy
 from icrl4aht_generation.populations.select import THRESHOLD
 from icrl4aht_generation.populations.train import population_threads
@@ -201,9 +201,6 @@ def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files:
 def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: Path, files: dict[str, Path]) -> NewTask:
     """Return a task of the source "ppo", whose labels are the greedy actions of a checkpoint."""
     task = found.task
-    for number, folder in enumerate(found.folders):
-        title = f"{task.layout.name} with {task.teammate_kind}" + f", learner {number}" * (len(found.folders) > 1)
-        plot_filter(folder / FILTER_CURVES, title, found.returns[number], found.returns[number][found.streams[number]])
     labeller = choose_labeller(found.folders, task, suite)
     expert = ExpertLabels(
         policy_sha256=labeller.sha256,

@@ -51,13 +51,6 @@ def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Po
     return Policy({"params": jax.tree.map(jnp.asarray, weights)}, init, act, "observation")
 
 
-def build_untrained(layout: Layout, widths: Widths) -> Policy:
-    """Return a policy with initial parameters, for measuring speed."""
-    init, act = _functions(widths, "greedy")
-    params = ActorCritic(widths, critic=False).untrained(jax.random.key(0), layout.channels)
-    return Policy(params, init, act, "observation")
-
-
 def build_learned_entry(layout: Layout, teammate: dict[str, Any], suite: Path | None) -> Policy:
     """Return the policy of a task's teammate entry of kind "rl".
 

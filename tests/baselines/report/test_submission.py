@@ -13,10 +13,8 @@ from icrl4aht_baselines.evaluate.results import read_result
 from icrl4aht_baselines.report import comparison
 from icrl4aht_baselines.report.submission import (
     AgentFacts,
-    Submission,
     make_submission,
     read_submission,
-    submission_schema,
     write_submission,
 )
 
@@ -45,9 +43,6 @@ def test_a_file_has_all_results_of_all_folders(submitted):
     parts = [(one.control, one.training, len(one.returns)) for one in found.evaluations]
     assert parts == [("", 0, 40), ("", 1, 40), ("forgets", 1, 40)]
     assert next(iter(found.evaluations[0].returns.values())) == [CURVE] * 3
-    schema = json.loads(submission_schema())
-    fields = schema["$defs"]["Submission"]
-    assert set(fields["required"]) == {*Submission.__struct_fields__} and not fields["additionalProperties"]
 
 
 def changed(path: Path, target: Path, change: Any) -> Path:
@@ -122,8 +117,7 @@ def test_the_commands(submitted, tmp_path, monkeypatch):
     assert result.exit_code == 0 and "mine.json: my rule, layout;" in result.output
     assert read_submission(tmp_path / "mine.json").facts.core_hours == 1.5
     result = runner.invoke(cli, ["submit", folder, "--about", "a rule", "--out", str(tmp_path / "other.json")])
-    assert result.exit_code == 2 and "missing --data, --labels" in result.output
-    assert json.loads(runner.invoke(cli, ["submit", "--schema"]).output)["$defs"]["AgentFacts"]
+    assert result.exit_code == 2 and "Missing option '--data'" in result.output
     page = ["results", str(submitted), str(tmp_path / "mine.json"), "--out", str(tmp_path / "page")]
     result = runner.invoke(cli, page, catch_exceptions=False)
     assert result.exit_code == 0, result.output

@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 import pytest
+from icrl4aht_generation.collection import job
 from icrl4aht_generation.collection import task as collect
 from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, METRICS, partial_folder
 from icrl4aht_generation.learners.resume import StateFile
@@ -20,7 +21,7 @@ from tests.helpers.tiny import TINY, artefact, start
 COLLECT = """
 import sys, time
 from pathlib import Path
-from icrl4aht_generation.collection.task import run_task
+from icrl4aht_generation.collection.job import run_task
 from icrl4aht_generation.profiles import Profile, load_profile
 
 def report(update, metrics):
@@ -39,7 +40,7 @@ def task(built):
 
 
 def run_task(task: tuple[Work, Profile], *arguments, **options) -> bool:
-    return collect.run_task(task[0], task[1], *arguments, **options)
+    return job.run_task(task[0], task[1], *arguments, **options)
 
 
 def stop_after(update: int):

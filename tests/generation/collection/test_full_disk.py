@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from icrl4aht_generation.collection.job import run_task
 from icrl4aht_generation.collection.record import array_shapes
-from icrl4aht_generation.collection.task import run_task
 from icrl4aht_generation.collection.task_folder import LEARNER, ArtefactWriter, DiskFullError, partial_folder
 from icrl4aht_generation.jobs import job
 from icrl4aht_generation.jobs.job import FailureLog, JobOutcome

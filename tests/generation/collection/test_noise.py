@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from icrl4aht_generation.collection import noise
 from icrl4aht_generation.collection.curate import oracle_labels
-from icrl4aht_generation.collection.noise import noise_bytes, run_noise
+from icrl4aht_generation.collection.job import run_task
+from icrl4aht_generation.collection.noise import noise_bytes
 from icrl4aht_generation.collection.noise_rollout import noise_schedules, play_noisy_episodes
 from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, TIMING, last_timing, partial_folder
 from icrl4aht_generation.learners.resume import StateFile
@@ -61,7 +62,7 @@ def profile(tmp_path_factory) -> Profile:
 def made(profile, short_pieces, tmp_path_factory) -> Path:
     """Return a finished artefact."""
     folder = tmp_path_factory.mktemp("noise") / WORK.name
-    assert run_noise(WORK, profile, folder)
+    assert run_task(WORK, profile, folder)
     return folder
 
 
@@ -135,7 +136,7 @@ def test_an_episode_is_a_function_of_its_numbers(arrays):
 @pytest.mark.slow
 def test_the_bits_do_not_depend_on_the_piece(made, profile, tmp_path, monkeypatch):
     monkeypatch.setattr(noise, "EPISODES_AT_ONCE", 23)
-    run_noise(WORK, profile, tmp_path / "task")
+    run_task(WORK, profile, tmp_path / "task")
     assert not compare_rebuilds(tmp_path / "task", made).differences
 
 
@@ -164,8 +165,8 @@ def test_schedules():
 def test_stopped_and_resumed(made, profile, tmp_path, history):
     folder, seen = tmp_path / WORK.name, []
     with pytest.raises(KeyboardInterrupt):
-        run_noise(WORK, profile, folder, stop_after(history), save_seconds=0)
-    assert run_noise(WORK, profile, folder, lambda number, metrics: seen.append(number))
+        run_task(WORK, profile, folder, stop_after(history), save_seconds=0)
+    assert run_task(WORK, profile, folder, lambda number, metrics: seen.append(number))
     assert seen[-1] == 3
     assert not compare_rebuilds(folder, made).differences
     assert not partial_folder(folder).exists()
@@ -174,13 +175,13 @@ def test_stopped_and_resumed(made, profile, tmp_path, history):
 def test_pieces_after_the_last_save_are_repeated(made, profile, tmp_path):
     folder = tmp_path / WORK.name
     with pytest.raises(KeyboardInterrupt):
-        run_noise(WORK, profile, folder, stop_after(2), save_seconds=0)
+        run_task(WORK, profile, folder, stop_after(2), save_seconds=0)
     partial = partial_folder(folder)
     assert StateFile(partial / LEARNER).progress == 1
     rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
     rewards.reshape(-1, 100)[PIECE:] = 77
     rewards.flush()
-    run_noise(WORK, profile, folder)
+    run_task(WORK, profile, folder)
     assert not compare_rebuilds(folder, made).differences
 
 
@@ -198,13 +199,13 @@ def test_a_full_disk(profile, tmp_path, monkeypatch):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
-        run_noise(WORK, profile, tmp_path / "task", fill, save_seconds=0)
+        run_task(WORK, profile, tmp_path / "task", fill, save_seconds=0)
     assert StateFile(partial_folder(tmp_path / "task") / LEARNER).progress == 1
     monkeypatch.setattr(shutil, "disk_usage", lambda path: type("Usage", (), {"free": 5_000}))
     with pytest.raises(
         DiskFullError, match=r"other: the disk is full: this task needs [\d,]{6,} bytes, 5,000 are free"
     ):
-        run_noise(WORK, profile, tmp_path / "other", stop_after(0))
+        run_task(WORK, profile, tmp_path / "other", stop_after(0))
     assert not partial_folder(tmp_path / "other").exists()
 
 
@@ -216,9 +217,9 @@ def test_histories_with_a_learned_teammate(profile, tmp_path):
     work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")
     folder, suite = tmp_path / work.name, tmp_path / "suite"
     with pytest.raises(KeyboardInterrupt):
-        run_noise(work, profile, folder, stop_after(1), suite=suite, save_seconds=0)
-    assert run_noise(work, profile, folder, suite=suite)
-    run_noise(work, profile, tmp_path / "again", suite=suite)
+        run_task(work, profile, folder, stop_after(1), suite=suite, save_seconds=0)
+    assert run_task(work, profile, folder, suite=suite)
+    run_task(work, profile, tmp_path / "again", suite=suite)
     assert not compare_rebuilds(folder, tmp_path / "again").differences
     states = np.load(folder / "state.npy").reshape(40, 100, -1)[[0, 25]].swapaxes(0, 1)
     policy = build_learned(LAYOUT, suite / "member")

@@ -21,10 +21,11 @@ from icrl4aht_generation.layouts import (
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS
 from icrl4aht_generation.layouts.fixtures import FREE_COUNTERS
 from icrl4aht_generation.layouts.grids import agent_rooms, grid_of, symmetric_images
-from icrl4aht_generation.layouts.playable import layouts_delivered
 from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
 from icrl4aht_generation.layouts.solvable import faced_cells
 from icrl4aht_generation.layouts.templates import has_tested_rooms, published_rooms
+from icrl4aht_generation.teammates.references import reference_returns
+from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS
 from icrl4aht_data.commands.cli import cli
@@ -209,6 +210,7 @@ def test_the_command_refuses_more_layouts_than_there_are(monkeypatch):
 
 @pytest.mark.slow  # compiles a program for each layout
 @EVERY_FAMILY
-def test_oracles_deliver(family, drawn):
-    idle = Layout("idle", "idle", ("WWWWWW", "WA  WW", "WAW0PB", "WWWWXW"), recipes=((0, 0, 0),))
-    assert layouts_delivered([*drawn[family][:2], idle]).tolist() == [True, True, False]
+def test_the_oracle_earns_something(family, drawn):
+    mate = build_teammate(None, heuristic_teammate("utility_greedy", "default", 0))
+    for layout in drawn[family][:2]:
+        assert reference_returns(layout, [mate])["oracle"] > 0

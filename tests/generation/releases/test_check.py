@@ -45,7 +45,7 @@ def test_differences_are_reported(built, tmp_path):
     (theirs / "metrics.jsonl").write_text("\n".join([*lines[:2], "{}", *lines[3:]]) + "\n")
     (theirs / "checkpoints/c2/policy.json").unlink()
     (theirs / "notes.txt").touch()
-    for name in ("timing.jsonl", "filter.png", "labeller_returns.json"):
+    for name in ("timing.jsonl", "labeller_returns.json"):
         (theirs / name).write_bytes(b"another clock")
     result = CliRunner().invoke(cli, ["check", "--json", str(ours), str(theirs)])
     assert result.exit_code == 1
