@@ -158,7 +158,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     write_page_with_episodes(runs, page)
     write(f"return in each episode: {picture}\nreport: {page}")
     write(f"done in {time.perf_counter() - started:.0f} s\n")
-    write("\n".join([*overlap_legend(own.overlaps(cells)), *_conclusion(own, leads, len(settings.seeds))]))
+    write("\n".join([*overlap_legend(own.overlaps(cells)), *_conclusion(own, leads)]))
     return page
 
 
@@ -178,23 +178,16 @@ def _evaluate(name: str, out: Path, tasks: Sequence[Task], settings: DemoSetting
     return read_run(folder)
 
 
-def _conclusion(own: EvaluationRun, leads: Mapping[ResultCell, MeanInterval], seeds: int) -> list[str]:
-    """Return what was measured and its limits, in a few lines; the last one is the verdict."""
-    curve = np.mean([returns.mean(axis=0) for returns in own.cells.values()], axis=0)
-    half, floor = len(curve) // 2, " and ".join(FLOOR)
-    pairs = ", ".join(f"{cell.family} {len(returns) * seeds}" for cell, returns in own.cells.items())
-    better = [cell.family for cell, lead in leads.items() if lead.low > 0]
-    others = ", ".join(cell.family for cell, lead in leads.items() if not lead.low > 0)
-    verdict = f"{own.agent} earns no more than {floor} with any of these families: {others}."
-    if better:
-        verdict = f"{own.agent} earns more than {floor} with {len(better)} of {len(leads)} families: "
-        verdict += ", ".join(better) + (f"; no more with {others}." if others else ".")
+def _conclusion(own: EvaluationRun, leads: Mapping[ResultCell, MeanInterval]) -> list[str]:
+    """Return the limits of what was measured, and the verdict."""
+    floor, better = " and ".join(FLOOR), [cell.family for cell, lead in leads.items() if lead.low > 0]
+    others = ", ".join(cell.family for cell in leads if cell.family not in better)
+    verdict = f"{own.agent} earns more than {floor} with {len(better)} of {len(leads)} families"
+    parts = [", ".join(better)] * bool(better) + [f"no more with {others}"] * bool(others)
     return [
-        f"Measured on {len(curve)} episodes of each task and seed ({pairs}). It is one training run: the intervals "
-        f"leave out how much trainings differ. Validation tasks are for choosing models, so this is no test result.",
-        f"Within a task, its first episode earns {curve[0]:.1f}, episodes {half + 1} to {len(curve)} "
-        f"{curve[half:].mean():.1f}.",
-        verdict,
+        "It is one training run: the intervals leave out how much trainings differ. Validation tasks are for choosing "
+        "models, so this is no test result.",
+        f"{verdict}: {'; '.join(parts)}.",
     ]
 
 

@@ -20,7 +20,7 @@ ORDER = {
     "": "icrl4aht_data icrl4aht_generation icrl4aht_baselines benchmarks tests",
     "icrl4aht_data": "errors utils overcooked benchmark format plotting clients fetch download reading sampling "
     "environments dataset interop writing checking publishing browsing commands",
-    "icrl4aht_generation": "plotting policy env paths learners jobs experts layouts teammates profiles collection "
+    "icrl4aht_generation": "policy env paths learners jobs experts layouts teammates profiles collection "
     "adapters populations releases planning verbs commands",
     "icrl4aht_baselines": "plotting methods training agents evaluate online control report experiments reference demo "
     "commands",

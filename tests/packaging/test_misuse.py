@@ -87,7 +87,7 @@ evaluate --agent empty --out e | empty: not a run: config.json is missing
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
-research headroom --protocol x | unknown protocol 'x'; valid: published, seeded, swap.
+research headroom --protocol x | unknown protocol 'x'; valid: published, seeded.
 research sweep size --only smal | unknown setting of sweep size 'smal'; valid: small, medium, large.
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """

@@ -306,14 +306,13 @@ def test_named_extras_train_evaluate_and_draw(grown, wheel, tmp_path):
     assert f"curves.png was not drawn, matplotlib is not installed: {hinted('plot')}" in trained
     assert not list(tmp_path.rglob("*.png"))
     generate = ("icrl4aht-data", "generate", "--profile", "smoke", "--out", "rebuilt")
-    for command in (generate, ("icrl4aht-data", "report", "results")):
-        assert "pip install" in run(*command, code=1)
-    assert not (tmp_path / "rebuilt").exists() and not (tmp_path / "results" / "report").exists()
+    assert "pip install" in run(*generate, code=1)
+    assert not (tmp_path / "rebuilt").exists()
 
     follow(hinted("baselines"), grown)
     run("icrl4aht-data", "report", "results")
     assert "demo_wide" in (tmp_path / "results" / "report" / "report.md").read_text(encoding="utf-8")
-    assert (tmp_path / "results" / "report" / "curves.png").stat().st_size > 5000
+    assert (tmp_path / "results" / "report" / "report.csv").stat().st_size > 500
 
 
 def test_the_installed_size_is_limited(installed, capsys):

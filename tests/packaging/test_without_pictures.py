@@ -8,7 +8,6 @@ import sys
 import pytest
 from icrl4aht_baselines.demo import run_demo
 from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
-from icrl4aht_generation.populations.build import build_suite
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.build import build_releases
 from rich.console import Console
@@ -36,9 +35,8 @@ def missing(request, monkeypatch) -> str:
         lambda out: run_demo(out, CONSOLE),
         lambda out: run_experiment("tracks", ExperimentPlan(), out),
         lambda out: build_releases(SMOKE, out, ("lite",), CONSOLE),
-        lambda out: build_suite(SMOKE, out, {"demo_wide": ["fcp"]}, 0, CONSOLE),
     ],
-    ids=["demo", "experiment", "releases", "suite"],
+    ids=["demo", "experiment", "releases"],
 )
 def test_work_with_pictures_is_refused_at_once(missing, work, tmp_path):
     with pytest.raises(OptionError, match=f"drawing needs matplotlib and Pillow: {HINT}"):

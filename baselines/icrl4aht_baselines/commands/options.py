@@ -84,8 +84,7 @@ protocol_option = click.option(
     "--protocol",
     type=PROTOCOL_NAME,
     default="seeded",
-    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers. swap: seeded, with "
-    "another teammate every 25 episodes.",
+    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers.",
 )
 _ACTING = Names("acting", lazy_attribute("icrl4aht_baselines.agents.egos", "ACTING"))
 _ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster."

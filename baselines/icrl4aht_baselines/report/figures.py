@@ -20,7 +20,6 @@ from icrl4aht_baselines.report.scores import cell_scales, cell_scores
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.report.tables import describe_conditions, mean_of
 from icrl4aht_baselines.training.seen import overlap_marks
-from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.plotting import MOST_PANELS, return_limits
 
@@ -143,20 +142,14 @@ def _score_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
     ends = [found.mean for of_run in values.values() for found in of_run.values()]
     scale = _Scale(max(_SCORE_LIMITS[0], min(-0.05, *ends)), min(_SCORE_LIMITS[1], max(1.05, *ends)))
     played = in_order(cell for run in runs.values() for cell in run.cells if cell.kind == "test")
-    others = [cell for cell in played if cell not in cells]
-    flat = f"The best response earns less than {LEAST_HEADROOM:g} more than an ego that stays"
-    reasons = {
-        "No best response measured": [cell for cell in others if cell not in scales],
-        flat: [cell for cell in others if cell in scales and not scales[cell].has_headroom],
-        "Not all tasks were played": [cell for cell in others if cell in scales and scales[cell].has_headroom],
-    }
+    without = [f"{cell.layout} {cell.family}" for cell in played if cell not in cells]
     about = (
         "A bar runs from the return of an ego that stays to that of the agent, relative to the best response; next to "
-        "a family are the returns of both. *: beyond the chart.",
-        *(f"{why}: {', '.join(f'{cell.layout} {cell.family}' for cell in of)}." for why, of in reasons.items() if of),
+        "a family are the returns of both. *: beyond the chart."
+        + (f" Without a score, the tables say why: {', '.join(without)}." if without else "")
     )
     ranges = {cell: f"{scales[cell].stay:z.1f} to {scales[cell].best:z.1f}" for cell in cells}
-    chart = _bar_chart("Score in each cell", runs, values, scale, " ".join(about), ranges, digits=2)
+    chart = _bar_chart("Score in each cell", runs, values, scale, about, ranges, digits=2)
     return [chart._replace(x_ticks=[Tick(scale.position(0), "stay"), Tick(scale.position(1), "best response")])]
 
 

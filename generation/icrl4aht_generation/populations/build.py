@@ -20,7 +20,6 @@ from icrl4aht_data.benchmark.facts import (
 )
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR
@@ -64,9 +63,8 @@ def build_suite(
 
     Raises:
         FailedJobsError: if a population could not be trained.
-        OptionError: if matplotlib is not installed.
+        UnknownNameError: for an unknown algorithm.
     """
-    check_can_draw()  # fail before the long training, not after it
     for name in chain(*algorithms.values()):
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)

@@ -2,7 +2,7 @@
 
     SUITE/<layout>/<algorithm>/m<member>/c<checkpoint>/policy.safetensors, policy.json
     SUITE/<layout>/<algorithm>/responses/m<member>/...      best responses, if the algorithm trains them
-    SUITE/<layout>/<algorithm>/metrics.jsonl, timing.jsonl, curves.png, population.json
+    SUITE/<layout>/<algorithm>/metrics.jsonl, timing.jsonl, population.json
 
 `population.json` is written last and has the hash of every file. Before that, `resume.safetensors` holds the state from
 which a stopped run resumes to the same bytes.
@@ -56,7 +56,6 @@ from icrl4aht_generation.learners.resume import (
     run_lock,
     software_versions,
 )
-from icrl4aht_generation.plotting import plot_training
 from icrl4aht_generation.policy import stacked
 from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR, cross_play_returns
 
@@ -377,8 +376,6 @@ class _PopulationTraining:
                 save_policy(path, population.network, response, card | {"role": "best response", "seats": [0]})
 
     def _finish(self) -> None:
-        title = f"{self.run.algorithm}, {self.run.layout.name}"
-        plot_training(self.folder / METRICS, self.folder / "curves.png", title)
         files = {
             str(path.relative_to(self.folder)): file_hash(path)
             for name in (POLICY_WEIGHTS, POLICY_CARD)

@@ -114,7 +114,7 @@ def test_bars_run_from_stay_to_the_score(measured, tmp_path):
         assert (bar.start, bar.width) == (pytest.approx(stay), pytest.approx(0.5 * (best - stay), abs=0.02))
     assert rows[0].scale == "0.0 to 20.0" and rows[0].bars[0].text == "0.50"
     flat = ", ".join(f"coord_simple H{number}" for number in range(1, 5))
-    assert chart.caption.endswith(f"The best response earns less than 5 more than an ego that stays: {flat}.")
+    assert chart.caption.endswith(f"Without a score, the tables say why: {flat}.")
     (low,) = bar_charts({0: evaluated_run("mine", ("asymm_right",), value=-90.0)}, "seeded")
     assert low.bars["asymm_right"][3].bars[0].text.endswith("*")
     (returns,) = bar_charts({0: evaluated_run("mine", ("coord_simple",))}, "seeded")
