@@ -73,7 +73,7 @@ def test_evaluation_on_an_untrained_layout(trained, tmp_path):
     results = evaluate(agent.name, agent.make, [task], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(results[0].returns) == (1, 1)
     note_results(tmp_path, folder)
-    card = model_card(read_run(tmp_path))
+    card = model_card(read_run(tmp_path), "x-y", "make", [], {})
     assert "| cramped_down | 8 of coord_simple, demo_wide; the release's manifest" in card
     assert "* channels: canonical\n" in card
 
