@@ -16,7 +16,6 @@ from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
-from icrl4aht_baselines.plotting import plot_return_curves
 from icrl4aht_baselines.report.page import write_page_with_episodes
 from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, bundled_by_id, note_results, read_run
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
@@ -100,11 +99,11 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     check_can_draw()
     started = time.perf_counter()
     settings = settings or DemoSettings()
-    paths = [out / name for name in ("learning_curves.png", "episode.gif", "adaptation.png", "report.html")]
+    paths = [out / name for name in ("learning_curves.png", "episode.gif", "report.html")]
     for path in paths:
         check_output(path, overwrite=(out / "ad").is_dir())  # of a stopped run
     out.mkdir(parents=True, exist_ok=True)
-    curves, episode, picture, page = paths
+    curves, episode, page = paths
 
     def say(number: int, text: str) -> None:
         console.print(f"[bold]{number}/6[/bold] ({time.perf_counter() - started:.0f} s) {text}")
@@ -151,12 +150,9 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     }
     write(pd.DataFrame(means).T.to_string())
 
-    say(6, "drawing the curves and the report")
-    models, egos = ([run for run in runs if (run.agent in REFERENCES) == is_ego] for is_ego in (False, True))
-    levels = {cell.title: {run.agent: float(run.cells[cell].mean()) for run in egos} for cell in cells}
-    plot_return_curves({cell.title: {run.agent: run.cells[cell] for run in models} for cell in cells}, picture, levels)
+    say(6, "drawing the report")
     write_page_with_episodes(runs, page)
-    write(f"return in each episode: {picture}\nreport: {page}")
+    write(f"report: {page}")
     write(f"done in {time.perf_counter() - started:.0f} s\n")
     write("\n".join([*overlap_legend(own.overlaps(cells)), *_conclusion(own, leads)]))
     return page

@@ -1,15 +1,13 @@
-"""Figures of training and evaluation, drawn from plain numbers into PNG files."""
+"""Figures of a training's log, and what other figures share."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from icrl4aht_data.plotting import MOST_PANELS, legend_below, new_figure, return_limits, running_mean, save_figure
 
@@ -96,59 +94,3 @@ def shrink_picture(picture: Path, path: Path) -> None:
     with Image.open(picture) as image:
         reduced = image.convert("RGB").quantize(64)
     reduced.save(path, optimize=True)
-
-
-SMOOTHING = 10
-"""Most episodes in the running mean of a curve of returns; of few episodes a tenth."""
-
-
-def smooth_returns(returns: Float[np.ndarray, " E"]) -> Float[np.ndarray, " E"]:
-    """Return the running mean of a task's returns over up to `SMOOTHING` episodes."""
-    return running_mean(returns, min(SMOOTHING, len(returns) // 10))
-
-
-_REFERENCE_LINES = {"oracle": ("#2c8a4b", "--"), "random": ("#b0653a", ":"), "stay": ("#6b7280", "-.")}
-
-
-def plot_return_curves(
-    panels: Mapping[str, Mapping[str, np.ndarray]],
-    path: Path,
-    references: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
-) -> None:
-    """Plot the return per episode on shared axes: a panel per cell, a line per run.
-
-    Lines are running means of the mean over a cell's instances, bands the range of the instances' running means, and
-    thin lines the mean of each single episode.
-
-    Args:
-        panels: title of a cell -> label of a run -> returns (instances, episodes); at most `MOST_PANELS`.
-        path: file to write, of a type in `icrl4aht_data.plotting.PICTURES`.
-        references: title -> reference ego, stay, random or oracle -> its mean return, drawn as a level line.
-    """
-    columns = min(4, len(panels))
-    figure, grid = panel_grid([*panels], columns, (2.7, 1.9), "episode", sharex=True, sharey=True)
-    labels = list(dict.fromkeys(label for runs in panels.values() for label in runs))
-    limits = []
-    for axes, (title, runs) in zip(grid, panels.items(), strict=False):
-        for label, returns in runs.items():
-            limits += _plot_curve(axes, label, f"C{labels.index(label)}", returns)
-        for name, level in references.get(title, {}).items():
-            colour, dashes = _REFERENCE_LINES[name]
-            axes.axhline(level, color=colour, linestyle=dashes, linewidth=1.1, label=name)
-            limits.append(level)
-    grid[0].set_ylim(*return_limits(limits))
-    for axes in grid[::columns]:
-        axes.set_ylabel("return", fontsize=9)
-    legend_below(figure)
-    save_figure(figure, path)
-
-
-def _plot_curve(axes: Any, label: str, color: str, returns: np.ndarray) -> list[float]:
-    """Plot the curve of a run in a cell. Return the lowest and the highest return drawn."""
-    curves = np.stack([smooth_returns(row) for row in returns])
-    low, high, raw = curves.min(axis=0), curves.max(axis=0), returns.mean(axis=0)
-    episodes = np.arange(1, returns.shape[1] + 1)
-    axes.fill_between(episodes, low, high, color=color, alpha=0.15, linewidth=0)
-    axes.plot(episodes, raw, color=color, alpha=0.35, linewidth=0.7)
-    axes.plot(episodes, curves.mean(axis=0), color=color, label=label, linewidth=1.6)
-    return [float(min(low.min(), raw.min())), float(max(high.max(), raw.max()))]

@@ -30,16 +30,13 @@ from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from icrl4aht_baselines.online.prepare import prepare_play
 from icrl4aht_baselines.online.student import collect_release, release_teammates
-from icrl4aht_baselines.plotting import SMOOTHING, plot_return_curves, shrink_picture
 from icrl4aht_baselines.report.cards import model_card
 from icrl4aht_baselines.report.results import merge, note_results, read_run
-from icrl4aht_baselines.report.scores import known_headroom
 from icrl4aht_baselines.training.histories import prepare, start_from
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
 from icrl4aht_baselines.training.trainer import show_steps
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError, unknown
@@ -67,9 +64,6 @@ TEST_SEEDS = {"seeded": 3, "published": 1}
 
 VALIDATION_KINDS = ("validation", "diverse")
 """Kinds of tasks that models are chosen by."""
-
-RETURNS = "returns.png"
-"""File name of the curves of a bundled model's returns, in the folder of a track."""
 
 TRACK_VIEWS: dict[str, dict[str, Any]] = {
     "teammate": {},
@@ -300,7 +294,7 @@ class _Steps:
 def write_bundled_card(
     name: str, outcomes: Sequence[ReferenceOutcome], folder: Path = MODELS, teacher: str | None = None
 ) -> Path:
-    """Write the card of a bundled model: its results on test and validation tasks, and curves. Return its path.
+    """Write the card of a bundled model: its results on test and validation tasks, and its training. Return its path.
 
     Args:
         name: of the bundled model.
@@ -312,22 +306,8 @@ def write_bundled_card(
     validation = merge([read_run(found.results[kind]) for found in outcomes for kind in VALIDATION_KINDS])
     taught = f" --teacher {teacher}" if teacher else ""
     command = f"icrl4aht-data research reference --name {outcomes[0].name}{taught} --bundle-as {name}"
-    pictures, headroom = {}, read_headroom("seeded")
-    for found in outcomes:
-        of_track = read_run(found.results["test-seeded"])
-        cells = [cell for cell, has_any in known_headroom("seeded").items() if has_any and cell in of_track.cells]
-        returns, training = f"{found.track}/{RETURNS}", f"{found.track}/{RUN_CURVES}"
-        path = folder / name / returns
-        panels = {cell.title: {name: of_track.cells[cell]} for cell in cells}
-        plot_return_curves(panels, path, {cell.title: headroom[cell[:2]] for cell in cells})
-        shrink_picture(path, path)
-        pictures[returns] = (
-            f"Return in each episode of the test tasks of track {found.track}, protocol seeded: running mean over "
-            f"{SMOOTHING} episodes of the mean over a cell's instances and seeds, range over the instances (band), "
-            f"single episodes (thin)"
-        )
-        if (folder / name / training).is_file():
-            pictures[training] = f"Training of the model of track {found.track}"
+    drawn = {f"{found.track}/{RUN_CURVES}": f"Training of the model of track {found.track}" for found in outcomes}
+    pictures = {path: text for path, text in drawn.items() if (folder / name / path).is_file()}
     card = folder / name / MODEL_CARD
     card.write_text(model_card(run, name, command, validation, pictures), encoding="utf-8")
     return card

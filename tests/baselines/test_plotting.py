@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 from itertools import product
 
-import numpy as np
 import pytest
 from icrl4aht_baselines import plotting
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
-from tests.helpers.evaluated import evaluated_run
 
 
 @pytest.fixture
@@ -38,17 +36,3 @@ def test_a_log_of_many_returns_has_few_panels(layouts, panels, tmp_path, drawn):
     limits = {axes.get_ylim() for axes in shown(figure) if axes.get_title().startswith("return")}
     assert len(limits) == 1
     assert next(iter(limits))[0] < 0 < 40 < next(iter(limits))[1]
-
-
-def test_curves_of_cells_share_their_axes(tmp_path, drawn):
-    runs = [evaluated_run("AD", value=38.0), evaluated_run("DPT")]
-    panels = {cell.title: {run.name: run.cells[cell] for run in runs} for cell in runs[0].cells}
-    plotting.plot_return_curves(panels, tmp_path / "curves.png")
-    (figure,) = drawn
-    assert [axes.get_title() for axes in shown(figure)] == [f"demo_wide, H{number}" for number in range(1, 5)]
-    assert len(figure.legends) == 1
-    assert len({axes.get_ylim() for axes in shown(figure)}) == 1
-    low, high = shown(figure)[0].get_ylim()
-    assert low < 0 and high > 40
-    smooth = [line.get_ydata() for line in shown(figure)[0].lines if line.get_linewidth() > 1]
-    assert all(np.ptp(line) == 2.0 for line in smooth), "a curve jumps once, by 2, and is constant before and after"

@@ -75,6 +75,7 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
     planned = []
     for task in tasks:
         partner = _partner(task, by_layout[task.layout.name])
+        # The id stays, so that keys of episodes do, and the last episodes start as those of the plain evaluation.
         before = replace(task, teammate=partner.teammate, recipes=partner.recipes)
         planned.append(PlannedTask(task, (before, task), (partner.task_id, task.task_id)))
     return planned

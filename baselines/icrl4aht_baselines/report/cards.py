@@ -91,7 +91,7 @@ def model_card(
         settings="\n\n".join(listed),
         protocol=run.protocol,
         results="\n\n".join(f"#{section}" for section in sections),
-        curves="\n\n".join(["## Curves", *shown, ""]),
+        curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
         limits="\n".join(f"* {limit}" for limit in limits),
     )
 

@@ -14,14 +14,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_baselines.plotting import smooth_returns
 from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, in_order
 from icrl4aht_baselines.report.scores import cell_scales, cell_scores
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.report.tables import describe_conditions, mean_of
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
-from icrl4aht_data.plotting import MOST_PANELS, return_limits
+from icrl4aht_data.plotting import MOST_PANELS, return_limits, running_mean
+
+SMOOTHING = 10
+"""Most episodes in the running mean of a curve of returns; of few episodes a tenth."""
 
 _SCORE_LIMITS = (-0.5, 1.5)  # a cell with little headroom can have a score far outside, which is clipped
 _TICKS = 5
@@ -228,7 +230,7 @@ def curve_charts(runs: NumberedRuns) -> list[Chart]:
 
 def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) -> Chart:
     raw = {(number, cell): run.cells[cell] for number, run in runs.items() for cell in cells if cell in run.cells}
-    smooth = {key: np.stack([smooth_returns(returns) for returns in of_cell]) for key, of_cell in raw.items()}
+    smooth = {key: np.stack([_smooth(returns) for returns in of_cell]) for key, of_cell in raw.items()}
     drawn = [*smooth.values(), *(of_cell.mean(axis=0) for of_cell in raw.values())]
     y = _Scale(*return_limits(float(value) for found in drawn for value in found.flat))
     episodes = max(returns.shape[1] for returns in raw.values())
@@ -246,6 +248,11 @@ def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) ->
     return Chart(
         title, describe_conditions(runs.values(), cells), _series(runs, cells), x_ticks, y_ticks, panels=panels
     )
+
+
+def _smooth(returns: np.ndarray) -> np.ndarray:
+    """Return the running mean of a task's returns over up to `SMOOTHING` episodes."""
+    return running_mean(returns, min(SMOOTHING, len(returns) // 10))
 
 
 def _curve(number: int, smooth: np.ndarray, raw: np.ndarray, x: _Scale, y: _Scale) -> Curve:

@@ -18,8 +18,7 @@ from typing import Any
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from icrl4aht_baselines.plotting import SMOOTHING
-from icrl4aht_baselines.report.figures import bar_charts, curve_charts
+from icrl4aht_baselines.report.figures import SMOOTHING, bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, family_gifs
 from icrl4aht_baselines.report.results import (
     PUBLISHED_PROTOCOL,

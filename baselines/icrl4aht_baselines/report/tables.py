@@ -50,15 +50,11 @@ def mean_of(cells: Iterable[np.ndarray]) -> float:
     return float(np.mean([values.mean() for values in cells]))
 
 
-def _block_means(cells: Sequence[CellReturns]) -> dict[str, float]:
-    """Return block of episodes -> mean return over cells, of the blocks that all cells have."""
-    names = [name for name in EPISODE_BLOCKS if all(name in of.blocks for of in cells)]
-    return {name: mean_of(of.blocks[name] for of in cells) for name in names}
-
-
 def blocks_text(cells: Sequence[CellReturns]) -> str:
     """Return the mean returns over cells in each block of episodes, such as "1: 10.0, 2-5: 12.0"."""
-    return ", ".join(f"{name}: {value:z.1f}" for name, value in _block_means(cells).items())
+    # Evaluations of different lengths may share a table: only blocks that all of them have can be compared.
+    names = [name for name in EPISODE_BLOCKS if all(name in of.blocks for of in cells)]
+    return ", ".join(f"{name}: {mean_of(of.blocks[name] for of in cells):z.1f}" for name in names)
 
 
 class Headline(NamedTuple):

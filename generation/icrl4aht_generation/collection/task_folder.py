@@ -193,6 +193,7 @@ class ArrayWriter:
             "seconds": round(seconds, 6),
             "recording": round(self._recording, 6),
         }
+        # The first piece is compiled, which says nothing about the speed of the others.
         if not self._has_written:
             self._started, self._steps, self._recording, self._has_written = now, 0, 0.0, True
         return timing
