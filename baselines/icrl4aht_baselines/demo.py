@@ -6,18 +6,16 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from rich.console import Console
 
 from icrl4aht_baselines.agents.egos import find_agent
-from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
 from icrl4aht_baselines.report.page import write_page_with_episodes
-from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, bundled_by_id, note_results, read_run
+from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, bundled_by_id, evaluate_agent
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
@@ -140,7 +138,11 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
         tasks = tuple(task for task in bundled_by_id("validation").values() if task.layout.name == DEMO_LAYOUT)
     others = [*REFERENCES, *([settings.reference] if settings.reference else [])]
     say(5, f"evaluating it and {', '.join(others)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
-    runs = [_evaluate(name, out, tasks, settings) for name in (*others, str(out / "ad"))]
+    agents = [find_agent(name) for name in (*others, out / "ad")]
+    runs = [
+        evaluate_agent(agent, tasks, settings.protocol, out / "results" / agent.name, seeds=settings.seeds)
+        for agent in agents
+    ]
     own, cells = runs[-1], [*runs[0].cells]
     leads = {cell: find_lead({run.agent: run.returns[cell].mean for run in runs}, own.agent) for cell in cells}
     better = f"{own.agent} - better of {' and '.join(FLOOR)}"
@@ -163,15 +165,6 @@ def _train_demo(folder: Path, settings: DemoSettings) -> None:
     job = prepare("ad", settings.model, settings.training, histories)
     with progress_bars(unit="steps") as show:
         job.train(folder, done=show_steps(show, "AD", job.options.steps))
-
-
-def _evaluate(name: str, out: Path, tasks: Sequence[Task], settings: DemoSettings) -> EvaluationRun:
-    agent = find_agent(name)
-    folder = out / "results" / agent.name
-    rules: Any = {"seeds": settings.seeds, "out": folder, "details": agent.details}
-    evaluate(agent.name, agent.make, tasks, settings.protocol, **rules)
-    note_results(folder, agent.run, tasks)
-    return read_run(folder)
 
 
 def _conclusion(own: EvaluationRun, leads: Mapping[ResultCell, MeanInterval]) -> list[str]:

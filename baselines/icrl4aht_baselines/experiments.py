@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from icrl4aht_baselines.agents.egos import Acting, find_agent
-from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol, limit_tasks
 from icrl4aht_baselines.methods.options import PAPER_SIZES, SIZES, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
 from icrl4aht_baselines.report.page import REPORT_FILES, write_page_with_episodes, write_report
-from icrl4aht_baselines.report.results import merge, note_results, read_run
+from icrl4aht_baselines.report.results import evaluate_agent, merge, read_run
 from icrl4aht_baselines.training.histories import filter_histories, prepare
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.trainer import TrainingTask
@@ -36,7 +35,6 @@ from icrl4aht_data.format.schema import TASKS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import check_output
-from icrl4aht_data.utils.progress import counted
 
 CONTEXTS = (250, 500, 1000, 2000, 5000, 10_000)
 """K of the paper's context sweeps (Sec. 5.3; App. F, "Extended Context Lengths")."""
@@ -377,19 +375,9 @@ def _evaluate_entry(
     progress: ExperimentProgress,
 ) -> None:
     agent = find_agent(folder / "run", acting=plan.acting or experiment.acting)
-    details = dict(agent.details or {}) | ({"variant": entry.variant} if entry.variant else {})
+    if entry.variant:
+        agent = agent._replace(details={**(agent.details or {}), "variant": entry.variant})
     names = list(dict.fromkeys(task.layout.name for task in tasks))
     what = f"{agent.name} {entry.name} on {names[0] if len(names) == 1 else f'{len(names)} layouts'}: episodes"
-    protocol = get_protocol(plan.protocol, plan.episodes)
-    evaluate(
-        agent.name,
-        agent.make,
-        tasks,
-        protocol,
-        seeds=range(plan.seeds),
-        suite=plan.suite,
-        out=folder / "results",
-        details=details,
-        played=counted(progress, what, len(tasks) * plan.seeds * protocol.episodes),
-    )
-    note_results(folder / "results", folder / "run", tasks)
+    protocol, shown = get_protocol(plan.protocol, plan.episodes), {"show": progress, "what": what}
+    evaluate_agent(agent, tasks, protocol, folder / "results", seeds=range(plan.seeds), suite=plan.suite, **shown)

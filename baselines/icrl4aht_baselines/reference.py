@@ -25,13 +25,12 @@ from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS
 from icrl4aht_baselines.agents.egos import find_agent
-from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from icrl4aht_baselines.online.prepare import prepare_play
 from icrl4aht_baselines.online.student import collect_release, release_teammates
 from icrl4aht_baselines.report.cards import model_card
-from icrl4aht_baselines.report.results import merge, note_results, read_run
+from icrl4aht_baselines.report.results import evaluate_agent, merge, read_run
 from icrl4aht_baselines.training.histories import prepare, start_from
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
@@ -40,7 +39,6 @@ from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError, unknown
-from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.writing.combine import combine_releases
 
 PROFILE = "noise"
@@ -274,19 +272,10 @@ class _Steps:
         for kind, protocol, seeds, forgets in kinds:
             tasks = bundled_tasks(self.track, kind if kind in VALIDATION_KINDS else "test")
             folder = self.out / "results" / f"{name}-{self.track}" / kind
-            agent, played = find_agent(run, greedy=recipe.greedy), get_protocol(protocol)
-            evaluate(
-                name,
-                agent.make,
-                tasks,
-                played,
-                seeds=range(seeds),
-                control="forgets" if forgets else None,
-                out=folder,
-                details=agent.details,
-                played=counted(self.show, f"{name}-{self.track}, {kind}", len(tasks) * seeds * played.episodes),
-            )
-            note_results(folder, run, tasks)
+            agent = find_agent(run, greedy=recipe.greedy)._replace(name=name)
+            shown = {"show": self.show, "what": f"{name}-{self.track}, {kind}"}
+            control = "forgets" if forgets else None
+            evaluate_agent(agent, tasks, get_protocol(protocol), folder, seeds=range(seeds), control=control, **shown)
             found[kind] = folder
         return found
 

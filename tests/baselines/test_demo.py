@@ -14,7 +14,7 @@ from icrl4aht_baselines import demo
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.results import Result, write_result
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.report import gifs
+from icrl4aht_baselines.report import gifs, results
 from icrl4aht_baselines.report.statistics import MeanInterval
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_generation.teammates.registry import sample_teammate
@@ -46,16 +46,16 @@ def release(tmp_path_factory) -> Path:
     return root
 
 
-def evaluate_without_playing(agent, make, tasks, protocol, *, seeds, out, details):
+def evaluate_without_playing(agent, make, tasks, protocol, *, seeds, out, details, played):
     """Write results in which the model earns 10 more than `random` with H4 and equally much with H2."""
     settings = {"agent": agent, "seeds": list(seeds), "protocol": asdict(protocol), "code_version": "0"}
     settings |= {"details": details} if details else {}
-    results = []
+    found = []
     for task in tasks:
         value = EARNED.get(agent, 12.0 if task.teammate_family == "H4" else 2.0)
-        results.append(Result(task.task_id, settings, [[value, value] for _ in seeds]))
-        write_result(out, results[-1])
-    return results
+        found.append(Result(task.task_id, settings, [[value, value] for _ in seeds]))
+        write_result(out, found[-1])
+    return found
 
 
 def test_an_agent_leads_if_its_gain_over_both_is_significant():
@@ -80,7 +80,7 @@ def run(out: Path, settings: demo.DemoSettings) -> tuple[str, Path]:
 
 def test_the_demo_runs_every_step(release, tmp_path, monkeypatch):
     """The model is trained; its evaluation is replaced by invented results."""
-    monkeypatch.setattr(demo, "evaluate", evaluate_without_playing)
+    monkeypatch.setattr(results, "evaluate", evaluate_without_playing)
     monkeypatch.setattr(gifs, "save_episodes", lambda *arguments, **named: ())
     text, page = run(tmp_path, replace(SETTINGS, root=release))
     for expected in ("1/6", "target_actions", "context_next_obs", "transitions replayed", "6/6", "done in", str(page)):

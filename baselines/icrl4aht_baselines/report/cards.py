@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from icrl4aht_baselines.agents.egos import AGENTS
-from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import UNUSED_OPTIONS
 from icrl4aht_baselines.report.page import markdown_sections
@@ -19,14 +18,12 @@ from icrl4aht_baselines.report.results import (
     TEST_LAYOUTS,
     EvaluationRun,
     ResultSource,
-    as_run,
-    published_cells,
+    evaluate_agent,
 )
-from icrl4aht_baselines.report.tables import PAPER_METHODS, instances_range
+from icrl4aht_baselines.report.tables import PAPER_METHODS, instances_range, published_cells
 from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
-from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.templates import fill_template, markdown_table
 
 HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json")
@@ -167,9 +164,9 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
         for agent in REFERENCES:
             splits = EVALUATION_SPLITS if agent == "stay" else ("test",)
             tasks = [task for split in splits for track in TRACKS for task in bundled_tasks(track, split)]
-            rules, folder = get_protocol(protocol), out / protocol / agent
-            played = counted(show, f"{agent}, {protocol}", len(tasks) * rules.episodes)
-            runs.append(as_run(evaluate(agent, AGENTS[agent], tasks, rules, out=folder, played=played)))
+            ego, folder = NamedEgo(agent, AGENTS[agent]), out / protocol / agent
+            what = f"{agent}, {protocol}"
+            runs.append(evaluate_agent(ego, tasks, get_protocol(protocol), folder, show=show, what=what))
     return runs
 
 

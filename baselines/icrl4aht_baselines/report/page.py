@@ -25,10 +25,9 @@ from icrl4aht_baselines.report.results import (
     TASK_KINDS,
     EvaluationRun,
     family_title,
-    read_published,
 )
 from icrl4aht_baselines.report.scores import add_scales
-from icrl4aht_baselines.report.tables import find_headlines, returns_tables
+from icrl4aht_baselines.report.tables import find_headlines, read_published, returns_tables
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash

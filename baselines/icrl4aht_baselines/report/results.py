@@ -17,7 +17,7 @@ Shapes: T trainings, U tasks of a cell, S seeds.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -27,8 +27,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from icrl4aht_baselines.agents.egos import AGENTS
-from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks
+from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo
+from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.protocols import Protocol, bundled_tasks
 from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import OVERLAPS, TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on
@@ -36,7 +37,7 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE, TRACKS, family
 from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
-from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.text import counted_noun
 
 TEST_LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
@@ -271,9 +272,8 @@ def cell_rows(
 
     Args:
         agent: values of `AGENT_COLUMNS`.
-        cell: the cell.
+        cell, overlaps: see the module's docstring.
         returns: return of each episode, (tasks, seeds, episodes).
-        overlaps: see the module's docstring.
         tasks, seeds: keys of the tasks, and the seeds; numbers by default.
     """
     marks = " ".join(overlaps)
@@ -326,6 +326,31 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
         known = {task.task_id: task for task in read_tasks(path)} if path.exists() else {}
         with atomic_write(path) as partial:
             write_tasks(partial, (known | own).values())
+
+
+def evaluate_agent(
+    agent: NamedEgo,
+    tasks: Sequence[Task],
+    protocol: Protocol,
+    out: Path,
+    *,
+    seeds: Sequence[int] = (0,),
+    show: Callable[..., None] | None = None,
+    what: str = "",
+    **options: Any,
+) -> EvaluationRun:
+    """Evaluate an agent into a folder, note there what reports need to know, and return the results.
+
+    Args:
+        agent, tasks, protocol, seeds, options: see `evaluate`.
+        out: folder of the results.
+        show: called with (`what`, episodes played, episodes); by default a bar is shown.
+    """
+    played = show and counted(show, what, len(tasks) * len(seeds) * protocol.episodes)
+    shared: Any = {"seeds": seeds, "out": out, "details": agent.details, "played": played}
+    evaluate(agent.name, agent.make, tasks, protocol, **shared, **options)
+    note_results(out, agent.run, tasks)
+    return read_run(out)
 
 
 def read_results(folder: Path) -> tuple[list[Result], dict[str, Any] | None]:
@@ -448,16 +473,6 @@ def bundled_by_id(split: str) -> dict[str, Task]:
     return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
 
 
-@cache
-def bundled_cells() -> dict[ResultCell, list[str]]:
-    """Return cell -> ids of its tasks, of all tasks in the package."""
-    found: dict[ResultCell, list[str]] = defaultdict(list)
-    for split in EVALUATION_SPLITS:
-        for task in bundled_by_id(split).values():
-            found[cell_of(task)].append(task.task_id)
-    return {cell: found[cell] for cell in in_order(found)}
-
-
 def published_instances(cell: ResultCell) -> int:
     """Return the number of published test tasks of a cell; 0 for cells of other kinds."""
     return sum(cell_of(task) == cell for task in bundled_by_id("test").values())
@@ -483,14 +498,3 @@ def in_order(cells: Iterable[ResultCell]) -> list[ResultCell]:
 def family_title(family: str) -> str:
     """Return a family of teammates as people read it."""
     return "learned" if family == "rl" else family
-
-
-@cache
-def read_published() -> dict[str, Any]:
-    """Return the paper's numbers, each part with its source, from cards/published.json."""
-    return parse_json(read_text(card_file("published.json")))
-
-
-def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
-    """Return layout -> family or "Average" -> published mean and std; empty for an agent that is not in the paper."""
-    return read_published()["methods"].get(agent, {})

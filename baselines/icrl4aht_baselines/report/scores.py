@@ -11,18 +11,21 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS
 from icrl4aht_baselines.report.results import (
     CELL_COLUMNS,
     AgentReturns,
     CellReturns,
     EvaluationRun,
     ResultCell,
-    bundled_cells,
+    bundled_by_id,
+    cell_of,
     in_order,
     task_label,
 )
@@ -72,6 +75,16 @@ class CellScale(NamedTuple):
 
 CellScales = Mapping[ResultCell, CellScale]
 """Scales of the cells whose tasks have best responses."""
+
+
+@cache
+def bundled_cells() -> dict[ResultCell, list[str]]:
+    """Return cell -> ids of its tasks, of all tasks in the package."""
+    found: dict[ResultCell, list[str]] = defaultdict(list)
+    for split in EVALUATION_SPLITS:
+        for task in bundled_by_id(split).values():
+            found[cell_of(task)].append(task.task_id)
+    return {cell: found[cell] for cell in in_order(found)}
 
 
 def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
+from functools import cache
 from itertools import product
 from typing import NamedTuple
 
@@ -16,9 +17,7 @@ from icrl4aht_baselines.report.results import (
     EvaluationRun,
     ResultCell,
     in_order,
-    published_cells,
     published_instances,
-    read_published,
 )
 from icrl4aht_baselines.report.scores import (
     CellScales,
@@ -33,6 +32,8 @@ from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM, TRACKS, family_order
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
+from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.utils.text import counted_noun
 
 PAPER_METHODS = ("AD", "DPT")
@@ -238,6 +239,17 @@ def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTa
         caption = describe_conditions(played.values(), cells)
         tables.append(ScoreTable(f"{kind.capitalize()} tasks", kind, columns, rows, caption))
     return tables
+
+
+@cache
+def read_published() -> dict[str, Any]:
+    """Return the paper's numbers, each part with its source, from cards/published.json."""
+    return parse_json(read_text(card_file("published.json")))
+
+
+def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return layout -> family or "Average" -> published mean and std; empty for an agent that is not in the paper."""
+    return read_published()["methods"].get(agent, {})
 
 
 def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> Published | None:

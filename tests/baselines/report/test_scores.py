@@ -12,15 +12,13 @@ from icrl4aht_baselines.report.results import (
     BLOCKS,
     CellReturns,
     ResultCell,
-    bundled_cells,
-    published_cells,
-    read_published,
     task_label,
 )
 from icrl4aht_baselines.report.scores import (
     CellScale,
     TaskScale,
     block_difference,
+    bundled_cells,
     cell_scales,
     find_score,
     open_cells,
@@ -29,7 +27,9 @@ from icrl4aht_baselines.report.scores import (
 from icrl4aht_baselines.report.tables import (
     AVERAGE,
     find_headlines,
+    published_cells,
     published_score,
+    read_published,
     returns_tables,
     table_score,
 )
