@@ -40,6 +40,7 @@ from icrl4aht_data.format.schema import (
     stream_score,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.files import write_json
@@ -189,7 +190,7 @@ def _write_meta(
     """Write the files of meta/: index, tasks, provenance and info."""
     with (root / HISTORIES).open("w", encoding="utf-8") as stream:
         stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
-    write_layouts(root, [one.task.layout for one in new])
+    write_layouts(root, [get_layout(one.task.layout_name) for one in new])  # not with the recipes of a task
     tasks = [one.task for one in new if not isinstance(one.task, NamedTask)]
     write_tasks(root / TASKS, tasks)
     provenance = {one.task.task_id: one.provenance for one in new}

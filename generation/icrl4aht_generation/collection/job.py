@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from icrl4aht_generation.collection.noise import is_noise_finished, run_noise
+from icrl4aht_generation.collection.scripted import is_scripted_finished, run_scripted
+from icrl4aht_generation.collection.scripted_rollout import scripted_pieces
 from icrl4aht_generation.collection.task import run_task
 from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing
 from icrl4aht_generation.jobs.job import OnUpdate
@@ -16,7 +17,7 @@ from icrl4aht_generation.profiles.work import Work
 
 def _functions(source: str) -> tuple[Callable[..., bool], Callable[..., bool]]:
     """Return the functions that record the histories of a source, and that check whether they are complete."""
-    return {"ppo": (run_task, is_task_finished), "noise": (run_noise, is_noise_finished)}[source]
+    return (run_task, is_task_finished) if source == "ppo" else (run_scripted, is_scripted_finished)
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,10 @@ class CollectionJob:
 
     @property
     def updates(self) -> int:
-        """Updates of the ego, or of the noise."""
-        return self.profile.updates(self.work)
+        """Updates of the ego, or pieces that a script plays."""
+        if self.work.source == "ppo":
+            return self.profile.ego_on(self.work.task.layout.name).updates
+        return len(scripted_pieces(self.work.source, self.profile.scripted[self.work.source]))
 
     @property
     def xla_threads(self) -> int | None:
