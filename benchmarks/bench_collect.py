@@ -26,7 +26,7 @@ from typing import Any
 import click
 import h5py
 import jax
-from icrl4aht_generation.collection.noise import run_noise
+from icrl4aht_generation.collection.scripted import run_scripted
 from icrl4aht_generation.collection.task import make_learner, run_task
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.learners.config import Widths
@@ -103,7 +103,7 @@ def noise_speed(layout: str) -> dict[str, Any]:
     tasks = [make_task(track_of(layout), "train", layout, mate, seed) for seed in range(2)]
     with tempfile.TemporaryDirectory() as folder:
         first, second = (
-            elapsed(lambda task=task: run_noise(Work(task, "noise"), profile, Path(folder) / task.task_id))
+            elapsed(lambda task=task: run_scripted(Work(task, "noise"), profile, Path(folder) / task.task_id))
             for task in tasks
         )
     transitions = _NOISE.histories * _NOISE.episodes * KEPT_STEPS
