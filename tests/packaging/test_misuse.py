@@ -49,6 +49,11 @@ verify --from x | --from is the source of a repair: give --repair with it
 show 158 | 158: no such folder; give a history's id as --history 158
 show --history -1 | -1 is not in the range x>=0
 show --history 9999 | this selection has no history [9999], ids are within 0..
+browse --port 0 | --port is for the server: give --serve with it
+browse --overwrite --serve | --overwrite replaces a file: give --out FILE with it
+browse --out page.txt | page.txt: expected a name that ends in .html
+browse --out none/page.html | no folder none: make it first, or give another path
+browse --histories 0 | 0 is not in the range x>=1
 show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
 show --plot none/curves.png | no folder none: make it first, or give another path
 download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
@@ -81,6 +86,7 @@ research reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states 
 research reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 results | Missing option '--out'
 submit empty --out r.json --about a | missing --data, --labels
+research tracks --layout al | unknown layout 'al'; valid: all, coord_simple,
 research tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid: ad, dpt, hybrid_ad, amago_offline.
 evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent none --out e | A trained model is named by its folder
