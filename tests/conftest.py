@@ -195,13 +195,8 @@ def built(shared_folder) -> Path:
 
 @pytest.fixture(scope="session")
 def pair(built, shared_folder) -> Path:
-    """pair.toml, collected and packaged by the command, which finds the first task finished. Read only."""
-
-    def make(folder: Path) -> None:
-        shutil.copytree(built / "a" / "artefacts", folder / "artefacts")
-        _generate(built / "pair.toml", folder)
-
-    return shared_folder("pair", make)
+    """pair.toml, collected and packaged by the command. Read only."""
+    return shared_folder("pair", lambda folder: _generate(built / "pair.toml", folder))
 
 
 @pytest.fixture(scope="session")
