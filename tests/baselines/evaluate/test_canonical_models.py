@@ -88,7 +88,7 @@ def test_jax_egos_get_canonical_channels_on_every_layout(layout):
     state = RolloutState(EnvState(key, zero, zero, jnp.asarray(record[None])), (), before)
     for channels in ("own", "canonical"):
         rollout = EvaluationRollout(layout, with_view(shown, channels), [], PROTOCOLS["seeded"])
-        seen: Any = rollout.ego_actions((), state, key)[0]
+        seen: Any = jax.jit(rollout.ego_actions)((), state, key)[0]
         np.testing.assert_array_equal(seen.obs[0], observe(layout, record, 0, canonical=channels == "canonical"))
         assert seen._replace(obs=0) == before._replace(obs=0)
 
