@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import inspect
-import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -20,7 +17,6 @@ from icrl4aht_data.checking.report import Finding
 from icrl4aht_data.interop import torch_loader
 from icrl4aht_data.plotting import curve_svg, return_limits
 from icrl4aht_data.utils.text import facts_html
-from tests.helpers.paths import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -138,22 +134,6 @@ def test_provenance_is_a_mapping_with_a_short_repr(bundled):
 
 
 SCRIPT = Path(__file__).with_name("user_script.py")
-
-
-def test_a_users_script_has_no_type_errors(tmp_path):
-    """Check Grain, PyTorch and JAX batches; one wrong line proves that types are checked."""
-    settings = {"typeCheckingMode": "standard", "pythonVersion": "3.11", "extraPaths": [str(ROOT)]}
-    settings |= {"venvPath": str(Path(sys.prefix).parent), "venv": Path(sys.prefix).name}
-    wrong = "\nfrom icrl4aht_data import load_icrl4aht as load\nload().ad(batch_size=2, length=3)[0].obs.at\n"
-    (tmp_path / "right.py").write_text(SCRIPT.read_text())
-    (tmp_path / "wrong.py").write_text(wrong)
-    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
-    checker = Path(sys.executable).with_name("basedpyright")
-    done = subprocess.run([checker, "--outputjson", "-p", tmp_path], capture_output=True, text=True, check=False)
-    found = json.loads(done.stdout)["generalDiagnostics"]
-    errors = [(Path(one["file"]).name, one["message"]) for one in found if one["severity"] == "error"]
-    assert [name for name, _ in errors] == ["wrong.py"], errors
-    assert '"at"' in errors[0][1]
 
 
 def test_the_users_script_runs(tmp_path, monkeypatch):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.utils.install_hints import EXTRAS, RESTORE, install_command
-from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import SHARD
 
 
@@ -224,15 +222,3 @@ def test_package_that_is_not_installed(elsewhere, monkeypatch):
 
     monkeypatch.setattr(doctor, "metadata", missing)
     assert problems() == {"icrl4aht-data: not installed": "pip install icrl4aht-data, or -e . in a checkout"}
-
-
-def test_missing_module_names_its_extra(tmp_path):
-    """A process without flax, as where only the reader is installed."""
-    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['flax'] = None\n")
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "generation", ROOT / "baselines")))
-    }
-    command = [sys.executable, "-m", "icrl4aht_data", "research", "speed", "--profile", "smoke"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr.endswith(f"error: this needs flax, which is not installed: {install_command('baselines')}\n")

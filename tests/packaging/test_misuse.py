@@ -12,10 +12,9 @@ import pytest
 from icrl4aht_generation.jobs import ray_executor as on_ray
 from icrl4aht_generation.jobs.options import QueueOptions
 
-from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli, run
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.errors import EmptySelectionError, OptionError, UnknownNameError
+from icrl4aht_data.errors import OptionError
 from tests.helpers.paths import ROOT
 
 
@@ -50,6 +49,11 @@ verify --from x | --from is the source of a repair: give --repair with it
 show 158 | 158: no such folder; give a history's id as --history 158
 show --history -1 | -1 is not in the range x>=0
 show --history 9999 | this selection has no history [9999], ids are within 0..
+browse --port 0 | --port is for the server: give --serve with it
+browse --overwrite --serve | --overwrite replaces a file: give --out FILE with it
+browse --out page.txt | page.txt: expected a name that ends in .html
+browse --out none/page.html | no folder none: make it first, or give another path
+browse --histories 0 | 0 is not in the range x>=1
 show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
 show --plot none/curves.png | no folder none: make it first, or give another path
 download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
@@ -72,7 +76,8 @@ train ad --layout demo_wide --batch-size 0 | batch_size = '0': expected `int` >=
 train ad --layout demo_wide --learning-rate nan | learning_rate = 'nan': expected `float` > 0
 train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
-train rl2 --layout demo_wide --context 5 | --context: not with rl2, which learns by playing
+train rl2 --layout demo_wide --size tiny | --size: not with rl2, which learns by playing
+train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: not with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
 collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
 collect --agent stay --out c --noise 2 0 | noise = '2': expected `float` <= 1
@@ -81,13 +86,18 @@ research reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states 
 research reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 results | Missing option '--out'
 submit empty --out r.json --about a | missing --data, --labels
+research tracks --layout al | unknown layout 'al'; valid: all, coord_simple,
 research tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid: ad, dpt, hybrid_ad, amago_offline.
 evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent none --out e | A trained model is named by its folder
 evaluate --agent empty --out e | empty: not a run: config.json is missing
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
+evaluate --agent stay --out e --split train | unknown split 'train'; valid: test, validation
+evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --split: not with --manifest
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
+research unseen --layout asymm_right | no validation tasks; choose layouts that models are trained on
+research unseen --agent rl2-refernce | Did you mean 'rl2-reference'
 research headroom --protocol x | unknown protocol 'x'; valid: published, seeded, swap.
 research sweep size --only smal | unknown setting of sweep size 'smal'; valid: small, medium, large.
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
@@ -138,13 +148,6 @@ def test_bad_input_has_a_message_and_an_exit_code(say, arguments, message, code)
 def test_empty_arguments_are_refused(say):
     assert say("list", "")[1].endswith("expected a folder, found an empty text")
     assert say("release", "build", "--out", "")[1].endswith("expected a folder, found an empty text")
-
-
-def test_verify_raises_for_unknown_names():
-    with pytest.raises(UnknownNameError, match="unknown layout 'demo_wied'"):
-        verify_release(layout="demo_wied")
-    with pytest.raises(EmptySelectionError):
-        verify_release(split="test")
 
 
 @pytest.mark.parametrize(

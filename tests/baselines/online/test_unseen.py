@@ -83,15 +83,3 @@ class TestCommand:
         assert result.exit_code == 0, result.output
         assert played == [(["stay", "oracle", "rl2-reference"], {"asymm_both", "cramped_up"}, 4, 40)]
         assert "| `rl2-reference` | 5.0 (5.0 to 5.0) | 5.0 (5.0 to 5.0) |" in result.output
-
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
-            (["--layout", "asymm_right"], "--layout asymm_right: no validation tasks; choose layouts that models are"),
-            (["--agent", "rl2-refernce"], "rl2-refernce"),
-        ],
-    )
-    def test_misuse(self, played, options, message):
-        result = CliRunner().invoke(cli, ["research", "unseen", *options])
-        assert result.exit_code == 2 and message in " ".join(result.output.split()), result.output
-        assert not played

@@ -121,7 +121,7 @@ def test_labels_are_those_of_an_oracle_that_watches_the_episode(arrays):
 
 def test_an_episode_is_a_function_of_its_numbers(arrays):
     """An episode is the same in a mixed batch as in its task."""
-    mate = build_teammate(LAYOUT, MATE)
+    mate = build_teammate(None, MATE)
     history, episode = np.array([3, 1, *[0] * 14]), np.array([2, 9, *range(14)])
     chances = np.concatenate([arrays["noise"], arrays["noise"]], axis=1)  # episodes 10 to 13 have chances, too
 

@@ -198,21 +198,6 @@ class TestCommand:
             browse(release)
         assert (tmp_path / "browse.html").read_text().endswith("<title>mine</title>")
 
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            (("--port", "0"), "--serve"),
-            (("--overwrite", "--serve"), "--out FILE"),
-            (("--out", "page.txt"), ".html"),
-            (("--out", "missing/page.html"), "missing"),
-            (("--histories", "0"), "--histories"),
-        ],
-    )
-    def test_misuse(self, release, tmp_path, monkeypatch, arguments, message):
-        monkeypatch.chdir(tmp_path)
-        assert message in browse(release, *arguments, code=2)
-        assert not list(tmp_path.iterdir())
-
     def test_serve(self, release, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))

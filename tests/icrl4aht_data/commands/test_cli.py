@@ -208,14 +208,6 @@ def test_commands_destroy_nothing(lite, full, tmp_path):
     assert result.exit_code == 0 and read_info(tmp_path / "cb").kind == "lite"
 
 
-def test_errors_become_one_line_and_exit_code_1(tmp_path):
-    result = run("show", str(tmp_path / "nowhere"))
-    assert result.returncode == 1
-    assert result.stderr.startswith("error: ")
-    assert "no release here" in result.stderr
-    assert "Traceback" not in result.stderr
-
-
 @pytest.mark.parametrize(("arguments", "code"), [(["list"], 0), (["show", "--json"], 0), (["list", "--nope"], 2)])
 def test_closed_stdout_is_ignored(lite, monkeypatch, arguments, code):
     """Regression: `list >&-` failed with an AttributeError."""

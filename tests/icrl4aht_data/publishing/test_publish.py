@@ -278,5 +278,3 @@ def test_the_command_builds(release, tmp_path):
     summary = json.loads(result.output)
     assert set(summary["files"]) == set(read_manifest(out))
     assert summary["bytes"] > 10_000
-    result = CliRunner().invoke(cli, ["release", "build", str(release), str(release), "--out", str(out)])
-    assert result.exit_code == 2
