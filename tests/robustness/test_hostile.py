@@ -158,7 +158,7 @@ def test_files_that_no_release_has_are_refused(damaged, name):
 @pytest.mark.parametrize(
     "name",
     [
-        *("README.md", "LICENSE", "CITATION.cff", "croissant.json", "meta/source_card.md", "figures/headroom.png"),
+        *("README.md", "LICENSE", "CITATION.cff", "croissant.json", "meta/source_card.md", "figures/layouts.png"),
         *("index/demo_wide/train.parquet", f"experts/{'a' * 64}/policy.safetensors", f"teammates/{'a' * 64}/README.md"),
         "episodes/demo_wide/train-00000-of-00002.parquet",
         *("data/layout/coord_ring/train-00000-of-00010.h5", "meta/chunks/layout/coord_ring/train-00000-of-00010.npy"),
