@@ -8,7 +8,6 @@ The environment itself is `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`, 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -18,7 +17,6 @@ from icrl4aht_data.utils.install_hints import install_command
 
 if TYPE_CHECKING:
     import gymnasium
-    from gymnasium.envs.registration import EnvSpec
 
 TASK_ENVIRONMENT = "icrl4aht/task-v0"
 """Gymnasium id of the environment of the task given as argument `task`."""
@@ -47,22 +45,6 @@ def register_environments() -> None:
     for name, (entry_point, arguments) in entries.items():
         if name not in registry:
             register(name, f"{_MODULE}:{entry_point}", max_episode_steps=KEPT_STEPS, kwargs=arguments)
-
-
-def environment_spec(max_steps: int, arguments: dict[str, Any]) -> EnvSpec:
-    """Return the Gymnasium `EnvSpec` of a task, without making the environment.
-
-    Args:
-        max_steps: steps of an episode.
-        arguments: arguments of `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`.
-
-    Raises:
-        ImportError: if Gymnasium is not installed.
-    """
-    import gymnasium
-
-    register_environments()
-    return replace(gymnasium.spec(TASK_ENVIRONMENT), max_episode_steps=max_steps, kwargs=arguments)
 
 
 def make_environment(**options: Any) -> gymnasium.Env:

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.environments import environment_spec
 from icrl4aht_data.errors import NotStoredError, OptionError
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, PROVENANCE
@@ -34,7 +33,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
-from icrl4aht_data.writing.stored import HistoryProgress, with_source
+from icrl4aht_data.writing.stored import HistoryProgress
 
 _NAME = re.compile(r"[\w.-]+-v\d+")
 _INFOS = {name: name.removesuffix("s") for name in ACTION_FIELDS if name != "actions"}
@@ -49,8 +48,7 @@ def to_minari(
 ) -> Path:
     """Write a selection as a Minari dataset; `minari.load_dataset(target.name)` opens it in MINARI_DATASETS_PATH.
 
-    Observations have the layouts' own channels if all layouts have the same number, else the canonical channels. For a
-    single task with a heuristic teammate, Minari's `recover_environment` makes its environment.
+    Observations have the layouts' own channels if all layouts have the same number, else the canonical channels.
 
     Args:
         dataset: a release with state records, or a part of one.
@@ -85,7 +83,6 @@ def to_minari(
             folder / "data",
             spaces.Box(0, 255, observation_shape(dataset.layouts[0], canonical), np.uint8),
             spaces.Discrete(len(ACTIONS)),
-            _environment(dataset, about["tasks"], canonical),
         )
         metadata = {
             "dataset_id": target.name,
@@ -114,22 +111,9 @@ def _describe(dataset: Dataset) -> dict[str, Any]:
         "data_version": dataset.info.data_version,
         "kept_steps": dataset.info.environment.kept_steps,
         "tasks": [asdict(dataset.history_task(entry.history_id)) for entry in first.values()],
-        "provenance": {
-            name: with_source(recorded.get(name, Provenance()), entry.source).to_json() for name, entry in first.items()
-        },
+        "provenance": {name: recorded.get(name, Provenance()).to_json() for name in first},
         "histories": [{name: getattr(entry, name) for name in names} for entry in dataset.entries],
     }
-
-
-def _environment(dataset: Dataset, tasks: list[dict[str, Any]], canonical: bool) -> Any:
-    """Return the environment spec if there is a single task with a heuristic teammate, else None."""
-    if len(tasks) > 1 or tasks[0]["teammate"]["kind"] == "rl":
-        return None
-    noise = dataset.recover_teammate(dataset.entries[0].history_id).get("noise", "seeded")
-    channels = "canonical" if canonical else "own"
-    return environment_spec(
-        dataset.info.environment.max_steps, {"task": tasks[0], "noise": noise, "channels": channels}
-    )
 
 
 def _buffers(history: History, steps: int, canonical: bool) -> Iterator[Any]:

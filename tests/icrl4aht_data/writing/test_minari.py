@@ -13,8 +13,6 @@ import pytest
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.commands.cli import main
-from icrl4aht_data.dataset import MINI
-from icrl4aht_data.environments import TASK_ENVIRONMENT
 from icrl4aht_data.errors import NotStoredError, OptionError
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.writing.minari import to_minari
@@ -53,19 +51,6 @@ def test_minari_opens_every_episode(lite, converted, monkeypatch):
         np.testing.assert_array_equal(episode.infos["expert_action"][:-1], history.expert_actions[steps])
     facts = next(iter(opened.storage.get_episode_metadata([EPISODES])))
     assert (facts["history"], facts["episode"], facts["task_id"]) == (1, 0, release.entries[1].task_id)
-
-
-def test_a_dataset_of_one_task_has_its_environment(tmp_path):
-    """Minari and the release recover equal environments."""
-    release = load_icrl4aht(MINI, layout="demo_wide", source="noise", teammate_family="H3")
-    part = release.filter(task_id=release.entries[0].task_id)[:1]
-    to_minari(part, tmp_path / "one-v0")
-    spec = minari.MinariDataset(tmp_path / "one-v0" / "data").env_spec
-    assert spec is not None
-    assert (spec.id, spec.max_episode_steps) == (TASK_ENVIRONMENT, 400)
-    assert spec.kwargs["task"]["task_id"] == part.entries[0].task_id
-    env = minari.MinariDataset(tmp_path / "one-v0" / "data").recover_environment()
-    assert env.observation_space.shape == (5, 5, 45)
 
 
 def test_other_facts_are_in_minaris_metadata(lite, converted):
