@@ -82,8 +82,7 @@ def test_no_release_here(tmp_path):
     ("version", "error", "what_to_do"),
     [
         (6, FormatTooNewError, "pip install -U icrl4aht-data"),
-        (1, FormatTooOldError, "fetch the release again"),
-        (3, FormatTooOldError, "convert it to version 4 with `icrl4aht-data convert` of commit 71f723c"),
+        (3, FormatTooOldError, "fetch a newer version of the release"),
     ],
 )
 def test_other_format_versions(damaged, version, error, what_to_do):

@@ -130,7 +130,7 @@ class TestWeakLabels:
         entry = dataset.entries[0]
         assert "1 of 2 tasks come from a policy that earns" in str(warning.message)
         end = dataset.column("return_end")[:2].mean()
-        assert f"{entry.task_id} (labels -30.0, sampled 1.0, histories {end:.1f})" in str(warning.message)
+        assert f"{entry.task_id} (labels -30.0, histories {end:.1f})" in str(warning.message)
         assert warning.filename == __file__
 
     @pytest.mark.parametrize(("ends", "weak"), [([20.0, 18.2], True), ([20.0, 17.0], False), ([-4.0, -1.0], False)])
