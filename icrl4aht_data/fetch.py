@@ -159,12 +159,12 @@ class Remote:
         if scratch is None:
             _remove_from_cache(target)  # a changed file, which the client would take
         path = _get(self.client, address, name, scratch, advance)
-        found = file_hash(path)
+        size, found = path.stat().st_size, file_hash(path)
         if found != self.manifest[name]:
             if scratch is None:
                 _remove_from_cache(path)
             raise RemoteError(
-                f"{address}: expected sha256 {self.manifest[name]}, found {found} in {path.stat().st_size:,} bytes: "
+                f"{address}: expected sha256 {self.manifest[name]}, found {found} in {size:,} bytes: "
                 f"fetch it again; if that does not help, it is damaged there: report it to its publisher",
             )
         if scratch is not None:

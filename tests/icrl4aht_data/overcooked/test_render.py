@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pathlib
 import re
 import sys
 
@@ -151,7 +152,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
         self.write_text("half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(Path, "write_bytes", fail)
+    monkeypatch.setattr(pathlib.Path, "write_bytes", fail)
     with pytest.raises(OSError, match="disk full"):
         save_episode(path, COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up")))
     assert [(entry.name, entry.read_text()) for entry in tmp_path.iterdir()] == [("frame.png", "old")]
