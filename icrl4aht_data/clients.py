@@ -27,7 +27,6 @@ _TIMEOUT = 15.0  # seconds to connect, and between two bytes of a response
 _WAITS = (1.0, 2.0, 4.0)  # seconds before a request is repeated after a transient error
 _TRANSIENT_STATUS = (408, 429)  # and all from 500
 _PERMANENT = (FileNotFoundError, PermissionError, ImportError, NotImplementedError, TypeError, ValueError)
-_RETRIED = ("LocalEntryNotFoundError",)  # errors of huggingface_hub after its own retries
 _ADDRESS = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*://)(?:[^/\s'\"<>]*@)?(?P<rest>[^\s?#'\"<>]*)[^\s'\"<>]*")
 
 
@@ -200,7 +199,8 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
             is_transient = not isinstance(cause, _PERMANENT) and "Timeout" not in type(cause).__name__
             if status is not None:
                 is_transient = status in _TRANSIENT_STATUS or status >= 500
-            if wait is None or not is_transient or type(error).__name__ in _RETRIED:
+            # huggingface_hub raises LocalEntryNotFoundError after its own retries.
+            if wait is None or not is_transient or type(error).__name__ == "LocalEntryNotFoundError":
                 text = without_credentials(" ".join(f"{type(cause).__name__}: {cause}".split()))[:400]
                 if isinstance(cause, FileNotFoundError) or status == 404:
                     raise RemoteError(f"{address}: the remote has no such file: {text}", missing=True) from None

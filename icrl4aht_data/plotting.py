@@ -67,7 +67,9 @@ class Picture:
         """Return the picture as an HTML element, for notebooks."""
         content, kind = self._content, "gif"
         if not isinstance(content, bytes):
-            content, kind = _png(content), "png"
+            drawn = BytesIO()
+            content.savefig(drawn, dpi=110, format="png")
+            content, kind = drawn.getvalue(), "png"
         data = b64encode(content).decode()
         return f'<img alt="{escape(self.title)}" style="max-width:100%" src="data:image/{kind};base64,{data}">'
 
@@ -85,12 +87,6 @@ class Picture:
         _check_suffix(target, (".gif",))
         with atomic_write(target) as partial:
             partial.write_bytes(self._content)
-
-
-def _png(figure: Figure) -> bytes:
-    drawn = BytesIO()
-    figure.savefig(drawn, dpi=110, format="png")
-    return drawn.getvalue()
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:

@@ -34,8 +34,6 @@ from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
-_FILE = "browse.html"
-
 
 @click.command(
     epilog=examples(
@@ -59,7 +57,7 @@ _FILE = "browse.html"
     "--out",
     type=NewFile(".html", ".htm"),
     metavar="FILE",
-    default=_FILE,
+    default="browse.html",
     help="File to write.",
 )
 @overwrite_option

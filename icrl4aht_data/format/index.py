@@ -100,7 +100,9 @@ class Index:
             matching &= self.entries.matches(name, {self._known_value(name, one, given) for one in names})
         if not matching.any():
             what = ", ".join(f"{name}={value!r}" for name, value in filters.items()) or "any"
-            raise EmptySelectionError(f"{self.root}: no history has {what}. This release has {self.summary()}")
+            names = ("split", "layout", "teammate_family", "source")
+            found = "; ".join(f"{name} {listed_names(self.values(name)) or 'none'}" for name in names)
+            raise EmptySelectionError(f"{self.root}: no history has {what}. This release has {found}")
         return np.flatnonzero(matching)
 
     def _of_families(self, families: Iterable[str]) -> list[str]:
@@ -127,11 +129,6 @@ class Index:
         known = (*_KNOWN_VALUES.get(name, tuple)(), *own)
         check_choice(given, value, known)
         return value
-
-    def summary(self) -> str:
-        """Return a line that lists the splits, layouts, teammate families and sources."""
-        names = ("split", "layout", "teammate_family", "source")
-        return "; ".join(f"{name} {listed_names(self.values(name)) or 'none'}" for name in names)
 
 
 def read_index(root: Path) -> Index:

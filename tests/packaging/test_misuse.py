@@ -55,7 +55,7 @@ download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 download s3://a/b --to file | 'file' is a file
 convert --out out | give the form to convert to: --to full, lite, observations, published,
-convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps are for published files
+convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps is for published files
 convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
 release build a b --out c | unexpected extra argument
 upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
@@ -94,7 +94,7 @@ train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 FAILED = """
 list none | none: no release here, expected meta/info.json in it; give the folder of a release
 list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
-list --split test | no history has split=['test']. This release has split train; layout
+list --split test | no history has split=['test']. This release has split train, validation; layout
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
 convert {MINI} --out file/x --to lite | file: File exists; a file is where a folder is needed
