@@ -25,7 +25,7 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, UnsafePathError
 from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.utils.files import atomic_write, parse_json
+from icrl4aht_data.utils.files import atomic_write, parse_json, resolve_inside
 from tests.robustness.hostile.cases import CASES
 from tests.robustness.hostile.run import bound_process, make_bases, run_case
 from tests.robustness.hostile.spoil import TERABYTE
@@ -128,9 +128,9 @@ def test_the_depth_of_json_is_limited():
 
 
 def test_reserved_names_of_windows(tmp_path):
-    for name in ("con", "meta/NUL.json", "com1.h5/x", "a./b", "a /b"):
+    for name in ("con", "meta/NUL.json", "com1.h5/x", "a./b", "a /b", "data/teammate/aux/train.h5"):
         with pytest.raises(Icrl4ahtError, match="leads out"):
-            parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")
+            resolve_inside(tmp_path, name)
 
 
 FOREIGN = (
