@@ -158,7 +158,8 @@ class Remote:
         address, target = f"{self.url}/{name}", self.path(name)
         if scratch is None:
             _remove_from_cache(target)  # a changed file, which the client would take
-        path = _get(self.client, address, name, scratch, advance)
+        most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
+        path = _get(self.client, address, name, scratch, advance, most)
         size, found = path.stat().st_size, file_hash(path)
         if found != self.manifest[name]:
             if scratch is None:
@@ -208,14 +209,18 @@ class Remote:
         return read_info(self.folder).shards
 
 
-def _get(client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, advance: Advance) -> Path:
-    """Fetch a file with retries; the sum of `advance` is then the size of the file."""
+def _get(
+    client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, advance: Advance, most: int
+) -> Path:
+    """Fetch a file of at most `most` bytes, with retries; the sum of `advance` is then the size of the file."""
     arrived = 0
 
     def count(size: int) -> None:
         nonlocal arrived
         arrived += size
         advance(size)
+        if arrived > most:
+            raise RemoteError(f"{address}: expected at most {most:,} bytes, the server sent more")
 
     def attempt() -> Path:
         count(-arrived)  # the bytes of a failed attempt are sent again
@@ -301,7 +306,7 @@ def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | 
     address = f"{url}/{MANIFEST}"
     try:
         with client.connect():
-            path = _get(client, address, MANIFEST, scratch, lambda size: None)
+            path = _get(client, address, MANIFEST, scratch, lambda size: None, disk.TEXT_BYTES)
     except RemoteError as error:
         if error.missing and offline_switches():
             raise OfflineError(f"{url}: offline, and no version of it is downloaded; go online") from None

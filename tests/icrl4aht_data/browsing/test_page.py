@@ -163,7 +163,6 @@ class TestCommand:
         facts = json.loads(browse(release, "--out", out, "--histories", 4, "--json"))
         assert facts == {
             "page": str(out),
-            "address": None,
             "histories": 4,
             "episodes": 32,
             "shown_episodes": 32,
