@@ -139,13 +139,6 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON i
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace existing files, or an existing release folder."
 )
-family_map_option = click.option(
-    "--family-map",
-    multiple=True,
-    metavar="OLD=NEW",
-    help="Translate a teammate family of published files to rl, H1 to H4, or a kind such as fcp; repeat for more.",
-    show_default="the names of the published code",
-)
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
 
 

@@ -1,22 +1,18 @@
-"""Displayed texts: `repr`, HTML in notebooks, `help()`, and types in a user's script."""
+"""Displayed texts: `repr`, `help()`, and types in a user's script."""
 
 from __future__ import annotations
 
 import inspect
 import re
 from pathlib import Path
-from xml.etree import ElementTree
 
 import jax
-import numpy as np
 import pytest
 
 import icrl4aht_data
 from icrl4aht_data import ADBatch, Curriculum, Dataset, Report, get_layout, load_icrl4aht
 from icrl4aht_data.checking.report import Finding
 from icrl4aht_data.interop import torch_loader
-from icrl4aht_data.plotting import curve_svg, return_limits
-from icrl4aht_data.utils.text import facts_html
 
 
 @pytest.fixture(scope="module")
@@ -83,47 +79,6 @@ def test_batches_print_shapes_wherever_their_arrays_are(bundled):
     (tensors,) = torch_loader(sampler, stop=1)
     assert repr(tensors).replace("int64", "int32") == repr(sampler[0])
     assert "obs             P('data',)" in repr(ADBatch(*[jax.sharding.PartitionSpec("data")] * 6))
-
-
-def test_html_has_a_learning_curve_and_counts(bundled):
-    shown = (
-        (bundled, ["532 histories", "noise (456)", "demo_wide"]),
-        (bundled[0], ["History 0", "H3"]),
-        (bundled[0].episodes[-1], ["Episode 195 of history 0", "+20 at step"]),
-    )
-    for value, words in shown:
-        html = value._repr_html_()
-        tree = ElementTree.fromstring(html)
-        assert tree.findall(".//{*}polyline") or tree.findall(".//polyline")
-        for word in words:
-            assert word in html
-        assert len(html) < 20_000
-
-
-def test_html_escapes_names():
-    html = facts_html("<b>", {"<i>": "a & b"}, curve_svg({"<s>": np.array([1.0, 3.0])}))
-    assert "<b>" not in html and "<i>" not in html and "<s>" not in html
-    assert ElementTree.fromstring(html).find("strong") is not None
-
-
-@pytest.mark.parametrize("values", [[40.0, 40.0, 40.0], [38.0, 42.0] * 3])
-def test_the_axis_of_a_curve_does_not_magnify(values):
-    """Regression: small changes filled the axis, and constants lay on its lower edge."""
-    svg = ElementTree.fromstring(curve_svg({"ppo": np.array(values)}))
-    low, high = return_limits(values)
-    assert [text.text for text in svg.iter("text")][:2] == [f"{high:.1f}", f"{low:.1f}"]
-    (line,) = svg.iter("polyline")
-    heights = [float(point.split(",")[1]) for point in str(line.get("points")).split()]
-    assert max(heights) - min(heights) <= 0.1 * 130
-    assert max(heights) < 0.5 * 130, "near the top: 0 is at the bottom"
-
-
-def test_points_of_a_curve_are_where_their_values_are():
-    (line,) = ElementTree.fromstring(curve_svg({"ppo": np.arange(100.0)})).iter("polyline")
-    x, y = np.array([point.split(",") for point in str(line.get("points")).split()], float).T
-    assert len(x) == 60
-    slopes = np.diff(y) / np.diff(x)
-    np.testing.assert_allclose(slopes, slopes.mean(), rtol=0.1)
 
 
 def test_provenance_is_a_mapping_with_a_short_repr(bundled):

@@ -45,7 +45,6 @@ list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
 list --source nois | unknown source 'nois'; valid: ppo, noise, student. Did you mean 'noise'?
 verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
 verify --deeep | No such option
-verify --from x | --from is the source of a repair: give --repair with it
 show 158 | 158: no such folder; give a history's id as --history 158
 show --history -1 | -1 is not in the range x>=0
 show --history 9999 | this selection has no history [9999], ids are within 0..
@@ -60,9 +59,8 @@ download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 download s3://a/b --to file | 'file' is a file
 convert --out out | give the form to convert to: --to full, lite, observations, published,
-convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps are for published files
+convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps is for published files
 convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
-convert {MINI} --out out --to lite --tasks none | 'none' does not exist
 release build a b --out c | unexpected extra argument
 upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
 generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, small, smoke.
@@ -104,10 +102,9 @@ train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """
 
 FAILED = """
-list none | none: no release here, expected meta/info.json in it; there is no such folder: check
+list none | none: no release here, expected meta/info.json in it; give the folder of a release
 list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
-list outer | outer: no release here, expected meta/info.json in it; did you mean outer/lite?
-list --split test | no history has split=['test']. This release has train on coord_simple,
+list --split test | no history has split=['test']. This release has split train, validation; layout
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
 convert {MINI} --out file/x --to lite | file: File exists; a file is where a folder is needed
