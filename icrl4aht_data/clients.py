@@ -7,11 +7,9 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import urlsplit
 
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, RemoteError
 from icrl4aht_data.utils.files import NO_ROOM
@@ -27,7 +25,7 @@ THREADS = 8
 
 _TIMEOUT = 15.0  # seconds to connect, and between two bytes of a response
 _WAITS = (1.0, 2.0, 4.0)  # seconds before a request is repeated after a transient error
-_TRANSIENT_STATUS = {408, 425, 429, 500, 502, 503, 504}
+_TRANSIENT_STATUS = (408, 429)  # and all from 500
 _PERMANENT = (FileNotFoundError, PermissionError, ImportError, NotImplementedError, TypeError, ValueError)
 _ADDRESS = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*://)(?:[^/\s'\"<>]*@)?(?P<rest>[^\s?#'\"<>]*)[^\s'\"<>]*")
 
@@ -41,25 +39,6 @@ def offline_switches() -> list[str]:
 def without_credentials(text: str) -> str:
     """Remove user names, passwords, queries and fragments from all addresses in a text."""
     return _ADDRESS.sub(r"\g<scheme>\g<rest>", text)
-
-
-def check_credentials(address: str) -> None:
-    """Check that the password in an address has no unencoded "/": the rest would be parsed as the path and shown.
-
-    Raises:
-        OptionError: if it may have one; the message does not contain the address.
-    """
-    try:
-        parts = urlsplit(address)
-        # With a port and a later "@", the part before may be USER:PASSWORD, unless it looks like a host with a dot.
-        is_clear = parts.port is None or "@" in parts.netloc or "@" not in parts.path or "." in parts.netloc
-    except ValueError:  # the port is not a number
-        is_clear = False
-    if not is_clear:
-        raise OptionError(
-            "an address, not shown because it may have a password: expected SCHEME://HOST:PORT/PATH or "
-            "SCHEME://USER:PASSWORD@HOST/PATH: percent-encode the user name and password, such as / as %2F"
-        )
 
 
 class HubClient:
@@ -168,8 +147,7 @@ class FsspecClient:
     def sizes(self, names: list[str]) -> list[int]:
         """Return the bytes of files; 0 where the server does not say."""
         assert self._files is not None
-        with ThreadPoolExecutor(THREADS) as pool:
-            return [int(info["size"] or 0) for info in pool.map(self._files.info, map(self._file_address, names))]
+        return [int(size or 0) for size in self._files.sizes(list(map(self._file_address, names)))]
 
     def _file_address(self, name: str) -> str:
         path, mark, query = self._address.partition("?")
@@ -216,30 +194,21 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
         except Exception as error:  # each client raises different classes
             if isinstance(error, OSError) and error.errno in (*NO_ROOM, errno.EROFS):
                 raise
-            if wait is None or not _is_transient(error):
-                raise _remote_error(address, error) from None
+            status, cause = _http_status(error), _root_cause(error)
+            # Timeouts are not retried: the user is still waiting for the first output.
+            is_transient = not isinstance(cause, _PERMANENT) and "Timeout" not in type(cause).__name__
+            if status is not None:
+                is_transient = status in _TRANSIENT_STATUS or status >= 500
+            # huggingface_hub raises LocalEntryNotFoundError after its own retries.
+            if wait is None or not is_transient or type(error).__name__ == "LocalEntryNotFoundError":
+                text = without_credentials(" ".join(f"{type(cause).__name__}: {cause}".split()))[:400]
+                if isinstance(cause, FileNotFoundError) or status == 404:
+                    raise RemoteError(f"{address}: the remote has no such file: {text}", missing=True) from None
+                raise RemoteError(
+                    f"{address}: {text}; repeat the command, which keeps the files that are complete"
+                ) from None
         time.sleep(wait)
     raise AssertionError
-
-
-def _is_transient(error: Exception) -> bool:
-    """Return whether an error is transient, so that a retry may succeed."""
-    if type(error).__name__ == "LocalEntryNotFoundError":  # huggingface_hub has already retried
-        return False
-    status, cause = _http_status(error), _root_cause(error)
-    if status is not None:
-        return status in _TRANSIENT_STATUS
-    # Timeouts are not retried: the user is still waiting for the first output.
-    return not isinstance(cause, _PERMANENT) and "Timeout" not in type(cause).__name__
-
-
-def _remote_error(address: str, error: Exception) -> RemoteError:
-    """Return an error without credentials to raise instead of a client's error."""
-    cause = _root_cause(error)
-    text = without_credentials(" ".join(f"{type(cause).__name__}: {cause}".split()))[:400]
-    if isinstance(cause, FileNotFoundError) or _http_status(error) == 404:
-        return RemoteError(f"{address}: the remote has no such file: {text}", missing=True)
-    return RemoteError(f"{address}: {text}; repeat the command, which keeps the files that are complete")
 
 
 def _root_cause(error: BaseException) -> BaseException:
@@ -250,14 +219,8 @@ def _root_cause(error: BaseException) -> BaseException:
 
 
 def _http_status(error: BaseException | None) -> int | None:
-    """Return the HTTP status of an aiohttp, httpx or botocore error; None without a response."""
-    while error is not None:
-        answer = getattr(error, "response", None)
-        if isinstance(answer, dict):  # botocore
-            status = answer.get("ResponseMetadata", {}).get("HTTPStatusCode")
-        else:
-            status = getattr(answer, "status_code", getattr(error, "status", None))
-        if isinstance(status, int):
-            return status
-        error = error.__cause__
-    return None
+    """Return the HTTP status of an error of aiohttp or httpx, or of its cause; None without a response."""
+    if error is None:
+        return None
+    status = getattr(getattr(error, "response", None), "status_code", getattr(error, "status", None))
+    return status if isinstance(status, int) else _http_status(error.__cause__)

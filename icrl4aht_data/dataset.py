@@ -23,10 +23,10 @@ from icrl4aht_data.format.schema import ENTRY_HINTS, INFO, TASKS, TEAMMATES
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import columns
-from icrl4aht_data.plotting import Picture, curve_svg, plot_layout_curves
+from icrl4aht_data.plotting import Picture, plot_learning_curves
 from icrl4aht_data.reading.episodes import Episode
 from icrl4aht_data.reading.history import Labels, Obs
-from icrl4aht_data.reading.selection import COUNTED, FilterValues, ReadOptions, Selection
+from icrl4aht_data.reading.selection import FilterValues, ReadOptions, Selection
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.reading.splitting import SPLIT_BY, SplitBy, choose_histories, choose_teammates
@@ -36,15 +36,13 @@ from icrl4aht_data.sampling.dpt import ContextOrder, DPTSampler
 from icrl4aht_data.sampling.draws import draw_subset
 from icrl4aht_data.utils.options import check_int, check_number
 from icrl4aht_data.utils.system import usable_cores
-from icrl4aht_data.utils.text import counted_histories, counted_noun, facts_html
+from icrl4aht_data.utils.text import counted_histories
 
 if TYPE_CHECKING:
     import gymnasium
 
 MINI = Path(__file__).parent / "mini"
 """Path of the bundled mini release."""
-
-_CURVES_SHOWN, _CURVE_POINTS = 12, 25  # per source: histories averaged for a notebook's curve, and points of the curve
 
 
 def load_icrl4aht(
@@ -237,39 +235,12 @@ class Dataset(Selection):
     def plot(self) -> Picture:
         """Return learning curves by layout and source as a picture, which notebooks show.
 
-        Reads the rewards of all selected histories. For curves by task see `plotting.plot_learning_curves`.
+        Reads the rewards of all selected histories.
 
         Raises:
             OptionError: if matplotlib is not installed.
         """
-        return Picture(f"Returns of {counted_histories(len(self))} by layout and source", plot_layout_curves(self))
-
-    def _repr_html_(self) -> str:
-        """Return the selection's counts and learning curve as HTML, for notebooks."""
-        tasks = len(self.counts("task_id"))
-        steps, episodes = (int(self.column(name).sum()) for name in ("T", "episodes"))
-        lengths = f"{counted_noun(steps, 'step')}, {counted_noun(episodes, 'episode')}"
-        facts = {
-            "transitions": lengths,
-            **{name.replace("_", " "): self.counts_text(name) for name in COUNTED},
-            "observations": f"{self.obs}, {self.channels} channels",
-            "release": f"{self.info.kind} {self.info.data_version} at {self.origin}",
-        }
-        return facts_html(f"{counted_histories(len(self))} of {counted_noun(tasks, 'task')}", facts, self._curves_svg())
-
-    def _curves_svg(self) -> str:
-        """Return an SVG of mean returns by source, of a few histories stored on this machine; empty if none are."""
-        curves, sources = {}, self.column("source")
-        here = {shard for shard in self.shards if self.origin.is_here(shard)}
-        for source in self.counts("source"):
-            rows = np.flatnonzero(sources == source)
-            rows = rows[np.linspace(0, len(rows) - 1, min(_CURVES_SHOWN, len(rows))).astype(int)]
-            found = [self[row].returns() for row in rows.tolist() if self.index.entry(int(self.ids[row])).shard in here]
-            if found:
-                parts = min(_CURVE_POINTS, *map(len, found))
-                means = [[part.mean() for part in np.array_split(returns, parts)] for returns in found]
-                curves[f"{source} ({len(found)} of {(sources == source).sum()})"] = np.mean(means, axis=0)
-        return curve_svg(curves, "share of a history") if curves else ""
+        return Picture(f"Returns of {counted_histories(len(self))} by layout and source", plot_learning_curves(self))
 
     @cached_property
     def _tasks(self) -> dict[str, Task]:
@@ -386,7 +357,8 @@ class Dataset(Selection):
         if not self.knows_tasks:
             raise NotStoredError(
                 f"{self.root / TASKS}: empty: this release was converted without its tasks and knows of this teammate "
-                f"only family {entry.teammate_family} and kind {entry.teammate_kind}; convert again with --tasks FILE"
+                f"only family {entry.teammate_family} and kind {entry.teammate_kind}; convert again with tasks.jsonl "
+                f"in the folder"
             )
         if entry.task_id not in self._tasks:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)

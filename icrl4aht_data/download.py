@@ -1,27 +1,22 @@
-"""Downloads of remote releases, complete or in part, and repair of damaged files from their address."""
+"""Downloads of remote releases, complete or in part."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
-from icrl4aht_data.clients import Advance, without_credentials
-from icrl4aht_data.errors import Icrl4ahtError, OptionError
-from icrl4aht_data.fetch import ReleaseLocation, Remote, is_address, open_remote, short_hash
+from icrl4aht_data.clients import Advance
+from icrl4aht_data.fetch import ReleaseLocation, Remote, open_remote
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.schema import MANIFEST, PARQUET_EPISODES
-from icrl4aht_data.utils.files import atomic_write, has_content, json_hash
-from icrl4aht_data.utils.hashes import file_hash
-from icrl4aht_data.utils.system import data_folder
+from icrl4aht_data.format.schema import PARQUET_EPISODES
+from icrl4aht_data.utils.progress import counted
 
 
 @dataclass(frozen=True)
@@ -82,29 +77,23 @@ def plan_download(
     index, names = read_index(remote.folder), sorted(chosen_files(ReleaseLocation(remote.folder, remote), **wanted))
     present = {name: remote.path(name).stat().st_size for name in names if remote.path(name).exists()}
     sizes = {name: index.info.shards[name] for name in names if name in index.info.shards}
-    unknown = [name for name in names if name not in sizes and name not in present]
-    sizes = present | sizes | remote.sizes(unknown)
-    total, done, changed = sum(sizes[name] for name in present), 0, []
-    for name in present:
+    sizes = present | sizes | remote.sizes(name for name in names if name not in sizes and name not in present)
+    compared, changed = counted(advance, "compare", sum(present.values())), []
+    for name, size in present.items():
         if not remote.is_here(name, by_hash=True):
             changed.append(name)
-        done += sizes[name]
-        advance("compare", done, total)
+        compared(size)
     return DownloadPlan(remote, sizes, sorted(sizes.keys() - present), changed)
 
 
-def fetch_planned(plan: DownloadPlan, advance: Advance | None = None) -> int:
-    """Download the files of a plan, replace changed files, and return the number of bytes fetched.
+def fetch_planned(plan: DownloadPlan, advance: Advance | None = None) -> None:
+    """Download the files of a plan, and replace changed files.
 
     Raises:
         RemoteError: if a file cannot be fetched; calling again resumes.
         OSError: if the disk is full or not writable.
     """
-    remote, before = plan.root, plan.root.fetched
-    if not remote.in_hub_cache:
-        _write_note(remote, plan.files)
-    remote.fetch([*plan.changed, *plan.absent], advance, again=True)
-    return remote.fetched - before
+    plan.root.fetch([*plan.changed, *plan.absent], advance, again=True)
 
 
 def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) -> set[str]:
@@ -114,8 +103,7 @@ def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) ->
 
     Args:
         root: an opened release.
-        wanted: filters as in `load_icrl4aht`. Without filters, all files, or for a folder filled by `download` the
-            requested files, see `DownloadNote`.
+        wanted: filters as in `load_icrl4aht`. Without filters, all files.
     """
     index = read_index(root.folder)
     listed = root.remote.manifest if root.remote is not None else read_manifest(root.folder)
@@ -127,111 +115,4 @@ def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) ->
         others = set(all_shards) - {all_shards[code] for code in codes}
         chosen -= others | {chunk_table_name(name) for name in others}
         return {name for name in chosen if not name.startswith(f"{PARQUET_EPISODES}/")}
-    note = None if root.remote is not None else read_note(root.folder)
-    if note is None or note.release != json_hash(listed):
-        return chosen
-    return {name for name in chosen if name in note.files or (root.folder / name).exists()}
-
-
-class DownloadNote(msgspec.Struct):
-    """Record of a download into a folder. It is in the data folder, since a release could contain a forged one.
-
-    Args:
-        url: address of the release, without credentials.
-        release: hash of the manifest's content.
-        files: names of all files requested so far.
-    """
-
-    url: str
-    release: str
-    files: list[str]
-
-
-def read_note(folder: Path) -> DownloadNote | None:
-    """Return the note of a folder; None if there is none or it cannot be read."""
-    with suppress(OSError, msgspec.MsgspecError):
-        return msgspec.json.decode(_note_path(folder).read_bytes(), type=DownloadNote)
-    return None
-
-
-def _write_note(remote: Remote, files: Iterable[str]) -> None:
-    """Write the note of a download; skipped if the data folder is not writable."""
-    before, release = read_note(remote.folder), json_hash(remote.manifest)
-    requested = {*files, *(before.files if before is not None and before.release == release else ())}
-    path = _note_path(remote.folder)
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as partial:
-            partial.write_bytes(msgspec.json.encode(DownloadNote(remote.url, release, sorted(requested))))
-
-
-def _note_path(folder: Path) -> Path:
-    return data_folder() / "downloads" / f"{short_hash(os.fsencode(folder.resolve()), 32)}.json"
-
-
-def repair(root: str | Path, damaged: Iterable[str], *, source: str | None = None) -> tuple[dict[str, str | None], int]:
-    """Fetch damaged files of a release again.
-
-    Args:
-        root: the release, a folder or an address.
-        damaged: names of files; other files are replaced only if the manifest itself is damaged.
-        source: address to repair from; by default the root if it is an address, the noted address, or
-            $ICRL4AHT_REMOTE.
-
-    Returns:
-        name -> None or the reason why the file could not be repaired; and the number of bytes fetched.
-
-    Raises:
-        OptionError: if no source is known, or the source has another release.
-        RemoteError, OfflineError: if the source cannot be reached.
-    """
-    remote = open_remote(_repair_source(root, source))
-    names = set(damaged) & remote.manifest.keys()
-    if not is_address(root):
-        manifest = (remote.folder / MANIFEST).read_bytes()
-        remote = replace(remote, folder=Path(root), in_hub_cache=False)
-        if not has_content(remote.folder / MANIFEST, manifest):
-            names |= _replace_manifest(remote, manifest)
-    before, outcome = remote.fetched, dict.fromkeys(sorted(names, key=lambda name: name.startswith("data/")))
-    for name in outcome:  # shards last: their sizes are in meta/info.json, which may need repair
-        try:
-            remote.fetch([name], again=True)
-        except (Icrl4ahtError, OSError) as error:
-            outcome[name] = str(error)
-    return outcome, remote.fetched - before
-
-
-def _replace_manifest(remote: Remote, manifest: bytes) -> set[str]:
-    """Replace a folder's damaged manifest; return the names of files that differ from the new one.
-
-    Raises:
-        OptionError: if most files differ, which means that the remote has another release.
-    """
-    listed = {remote.folder / name: (name, digest) for name, digest in remote.manifest.items()}
-    wrong = {name for path, (name, digest) in listed.items() if not path.is_file() or file_hash(path) != digest}
-    if 2 * len(wrong) > len(listed):
-        raise OptionError(
-            f"{remote.url}: {len(wrong)} of its {len(listed)} files are not those of {remote.folder}: it has another "
-            f"release or version; give the address that this one came from"
-        )
-    with atomic_write(remote.folder / MANIFEST) as partial:
-        partial.write_bytes(manifest)
-    return wrong
-
-
-def _repair_source(root: str | Path, source: str | None) -> str:
-    """Return the address to repair from: the argument, the release's address, the noted one, or the default."""
-    if source is None and is_address(root):
-        return str(root)
-    note, default = read_note(Path(root)), default_remote()
-    noted = None if note is None else note.url
-    if default is not None and noted == without_credentials(default).rstrip("/"):
-        noted = default  # unlike the note, this address contains credentials
-    url = source or noted or default
-    if url is None or not is_address(url):
-        found = url and without_credentials(url)
-        raise OptionError(
-            f"{root}: repairing needs the address of a complete copy, found {found!r}: give --from, or set "
-            f"ICRL4AHT_REMOTE"
-        )
-    return url
+    return chosen

@@ -95,12 +95,11 @@ class RemoteError(ReleaseError, OSError):
     Args:
         message: the error message, with the address.
         missing: whether the file does not exist on the remote.
-        is_content: whether the remote answered, but with a missing file or unexpected content.
     """
 
-    def __init__(self, message: str, missing: bool = False, is_content: bool = False) -> None:
+    def __init__(self, message: str, missing: bool = False) -> None:
         super().__init__(message)
-        self.missing, self.is_content = missing, missing or is_content
+        self.missing = missing
 
 
 class OfflineError(ReleaseError):

@@ -7,7 +7,6 @@ after its SHA-256 was found to be the manifest's, so that an interrupted downloa
 
 from __future__ import annotations
 
-import hashlib
 import re
 import shutil
 from collections.abc import Iterable
@@ -23,7 +22,6 @@ from icrl4aht_data.clients import (
     Advance,
     FsspecClient,
     HubClient,
-    check_credentials,
     offline_switches,
     with_retries,
     without_credentials,
@@ -33,7 +31,7 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import check_against_manifest, check_folder, parse_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, LAYOUTS_FILE, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.utils import files as disk
-from icrl4aht_data.utils.hashes import file_hash, git_hash
+from icrl4aht_data.utils.hashes import file_hash, short_hash
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.system import data_folder
 
@@ -90,10 +88,6 @@ class ReleaseLocation:
         check_folder(self.folder, name)
         return path
 
-    def is_here(self, name: str) -> bool:
-        """Return whether a file needs no fetching."""
-        return self.remote is None or self.remote.is_here(name)
-
 
 @dataclass
 class Remote:
@@ -106,7 +100,6 @@ class Remote:
         manifest: file -> SHA-256, hexadecimal.
         client: fetches files.
         in_hub_cache: whether `folder` belongs to the Hub's cache.
-        fetched: bytes of the files fetched so far.
     """
 
     url: str
@@ -115,7 +108,6 @@ class Remote:
     manifest: dict[str, str]
     client: HubClient | FsspecClient
     in_hub_cache: bool = False
-    fetched: int = 0
 
     def __str__(self) -> str:
         return self.url
@@ -159,29 +151,27 @@ class Remote:
             pool = stack.enter_context(ThreadPoolExecutor(THREADS))
             stack.callback(pool.shutdown, cancel_futures=True)
             for file in as_completed([pool.submit(self._fetch_file, name, scratch, advance) for name in absent]):
-                self.fetched += file.result()
+                file.result()
 
-    def _fetch_file(self, name: str, scratch: Path | None, advance: Advance) -> int:
-        """Fetch a file and move it to its path if it has the manifest's hash; return its bytes."""
+    def _fetch_file(self, name: str, scratch: Path | None, advance: Advance) -> None:
+        """Fetch a file and move it to its path if it has the manifest's hash."""
         address, target = f"{self.url}/{name}", self.path(name)
-        most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
         if scratch is None:
             _remove_from_cache(target)  # a changed file, which the client would take
-        path = _get(self.client, address, name, scratch, most, advance)
+        most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
+        path = _get(self.client, address, name, scratch, advance, most)
         size, found = path.stat().st_size, file_hash(path)
         if found != self.manifest[name]:
             if scratch is None:
                 _remove_from_cache(path)
             raise RemoteError(
-                f"{address}: expected sha256 {self.manifest[name]}, found {found} in {size:,} bytes: fetch it again; "
-                f"if that does not help, it is damaged or not of this version: report it to its publisher",
-                is_content=True,
+                f"{address}: expected sha256 {self.manifest[name]}, found {found} in {size:,} bytes: "
+                f"fetch it again; if that does not help, it is damaged there: report it to its publisher",
             )
         if scratch is not None:
             disk.sync(path)
             target.parent.mkdir(parents=True, exist_ok=True)
             path.replace(target)
-        return size
 
     def is_here(self, name: str, by_hash: bool = False) -> bool:
         """Return whether a file needs no fetching: it has the manifest's hash, or as a shard the right size.
@@ -220,7 +210,7 @@ class Remote:
 
 
 def _get(
-    client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, most: int, advance: Advance
+    client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, advance: Advance, most: int
 ) -> Path:
     """Fetch a file of at most `most` bytes, with retries; the sum of `advance` is then the size of the file."""
     arrived = 0
@@ -230,7 +220,7 @@ def _get(
         arrived += size
         advance(size)
         if arrived > most:
-            raise RemoteError(f"{address}: expected at most {most:,} bytes, the server sent more", is_content=True)
+            raise RemoteError(f"{address}: expected at most {most:,} bytes, the server sent more")
 
     def attempt() -> Path:
         count(-arrived)  # the bytes of a failed attempt are sent again
@@ -282,10 +272,7 @@ def _open_hub(url: str, to: Path | None) -> Remote:
         found = without_credentials(url)
         raise OptionError(f"{found}: expected hf://datasets/<org>/<repo> or hf://datasets/<org>/<repo>@<revision>")
     path, text = _fetch_manifest(HubClient(match["repo"], match["revision"] or "main"), url, None)
-    blob, commit = path.resolve().name, path.parent.name
-    if len(blob) == 40 and blob != git_hash(text):  # the cache names a small file by the hash that git has
-        _remove_from_cache(path)
-        raise RemoteError(f"{url}/{MANIFEST}: arrived damaged: expected git hash {blob}; fetch it again")
+    commit = path.parent.name
     url = f"hf://datasets/{match['repo']}@{commit}"
     if to is not None:
         _prepare_folder(to, text, url)
@@ -294,7 +281,6 @@ def _open_hub(url: str, to: Path | None) -> Remote:
 
 
 def _open_address(address: str, to: Path | None) -> Remote:
-    check_credentials(address)
     client, url = FsspecClient(address), without_credentials(address).rstrip("/")
     base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{short_hash(url.encode(), 8)}"
     latest = base / "latest"  # the version that this address had when it was last opened
@@ -320,7 +306,7 @@ def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | 
     address = f"{url}/{MANIFEST}"
     try:
         with client.connect():
-            path = _get(client, address, MANIFEST, scratch, disk.TEXT_BYTES, lambda size: None)
+            path = _get(client, address, MANIFEST, scratch, lambda size: None, disk.TEXT_BYTES)
     except RemoteError as error:
         if error.missing and offline_switches():
             raise OfflineError(f"{url}: offline, and no version of it is downloaded; go online") from None
@@ -336,11 +322,6 @@ def _parse_manifest(text: bytes, url: str) -> dict[str, str]:
     return parse_manifest(text.decode(errors="surrogateescape"), f"{url}/{MANIFEST}")
 
 
-def short_hash(data: bytes, digits: int = 16) -> str:
-    """Return the first hexadecimal digits of a text's SHA-256."""
-    return hashlib.sha256(data).hexdigest()[:digits]
-
-
 def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) -> None:
     """Write the manifest into the folder for a release.
 
@@ -348,7 +329,7 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
         OptionError: if the folder has files of something else, unless it is one of `system.data_folder`.
     """
     path = folder / MANIFEST
-    if disk.has_content(path, text):
+    if path.is_file() and path.stat().st_size == len(text) and path.read_bytes() == text:
         return
     if path.exists() and not is_ours:
         raise OptionError(f"{folder}: holds another release or version than {url} has now; give another folder")

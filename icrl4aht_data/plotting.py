@@ -1,6 +1,4 @@
-"""Figures of datasets, histories, layouts and reference returns, and animated episodes.
-
-All but `curve_svg` need the extra `plot`.
+"""Figures of datasets, histories and layouts, and animated episodes. They need the extra `plot`.
 
 Every function that draws a figure returns it, and writes it to a file if a path is given.
 """
@@ -8,22 +6,18 @@ Every function that draws a figure returns it, and writes it to a file if a path
 from __future__ import annotations
 
 from base64 import b64encode
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from html import escape
 from importlib.util import find_spec
 from io import BytesIO
-from itertools import product
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import SOURCES
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, Cell, has_headroom
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.schema import Entry
 from icrl4aht_data.overcooked.actions import DOWN
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import draw_frame, encode_episode
@@ -31,7 +25,6 @@ from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.install_hints import import_optional, install_command
-from icrl4aht_data.utils.text import counted_noun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,33 +34,8 @@ PICTURES = (".png", ".svg", ".pdf")
 
 _CURVE_PARTS = 25  # most points of a history's curve
 
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _MARGIN = 420, 130, 44, 18, 8  # pixels of an SVG
-# Points of an SVG curve: each is the mean of several episodes, whose returns scatter too much to show a trend.
-_MOST_POINTS = 60
-_COLOURS = ("#1f77b4", "#d9730d", "#2ca02c", "#9467bd")  # readable on white and on black
-
 MOST_PANELS = 12
 """Most panels of a figure with one panel per task or cell."""
-
-
-class RecordedCurve(Protocol):
-    """Interface of a history in figures: its index entry and its episode returns."""
-
-    entry: Entry
-
-    def returns(self) -> np.ndarray:
-        """Return each episode's return, float64 (E,)."""
-        ...
-
-
-class RecordedCurves(Protocol):
-    """Interface of a sequence of histories in figures, such as a `Dataset`."""
-
-    def __iter__(self) -> Iterator[RecordedCurve]: ...
-
-    def counts(self, name: str) -> dict[str, int]:
-        """Return the number of histories for each value of an index field."""
-        ...
 
 
 class Picture:
@@ -99,7 +67,9 @@ class Picture:
         """Return the picture as an HTML element, for notebooks."""
         content, kind = self._content, "gif"
         if not isinstance(content, bytes):
-            content, kind = _small_png(content), "png"
+            drawn = BytesIO()
+            content.savefig(drawn, dpi=110, format="png")
+            content, kind = drawn.getvalue(), "png"
         data = b64encode(content).decode()
         return f'<img alt="{escape(self.title)}" style="max-width:100%" src="data:image/{kind};base64,{data}">'
 
@@ -117,16 +87,6 @@ class Picture:
         _check_suffix(target, (".gif",))
         with atomic_write(target) as partial:
             partial.write_bytes(self._content)
-
-
-def _small_png(figure: Figure) -> bytes:
-    """Return a figure as a PNG of 256 colours, a third of the usual size, since notebooks store pictures as text."""
-    from PIL import Image
-
-    drawn, small = BytesIO(), BytesIO()
-    figure.savefig(drawn, dpi=110, format="png")
-    Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
-    return small.getvalue()
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
@@ -148,42 +108,6 @@ def return_limits(values: Iterable[float]) -> tuple[float, float]:
     high = max(high, low + DELIVERY_REWARD)
     margin = 0.04 * (high - low)
     return low - margin, high + margin
-
-
-def curve_svg(curves: Mapping[str, np.ndarray], axis: str = "episode") -> str:
-    """Return curves of returns in one pair of axes as an SVG element that uses the page's text colour.
-
-    The vertical axis has the limits of `return_limits` as labels. Needs no optional library.
-
-    Args:
-        curves: label -> values at equal distances, (N,) of at least one.
-        axis: label of the horizontal axis.
-    """
-    points = {
-        label: [float(part.mean()) for part in np.array_split(values, min(len(values), _MOST_POINTS))]
-        for label, values in curves.items()
-    }
-    drawn = [value for of_curve in points.values() for value in of_curve]
-    (low, high), floor, right = return_limits(drawn), _HEIGHT - _BOTTOM, _WIDTH - _MARGIN
-    lines, legend = [], []
-    for number, (label, values) in enumerate(curves.items()):
-        last, parts = max(len(values) - 1, 1), np.array_split(np.arange(len(values)), len(points[label]))
-        xs = [_LEFT + (right - _LEFT) * part.mean() / last for part in parts]
-        ys = [floor - (floor - _MARGIN) * (value - low) / (high - low) for value in points[label]]
-        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(xs, ys, strict=True))
-        colour = _COLOURS[number % len(_COLOURS)]
-        lines.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
-        legend.append(f'<tspan fill="{colour}"> {escape(label)}</tspan>')
-    words = f"return from {min(drawn):.4g} to {max(drawn):.4g} by {axis}, of {', '.join(curves)}"
-    return (
-        f'<svg role="img" aria-label="{escape(words)}" viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" '
-        f'height="{_HEIGHT}" style="display:block;max-width:100%;font:11px sans-serif">'
-        f'<path d="M{_LEFT},{_MARGIN}V{floor}H{right}" fill="none" stroke="currentColor" stroke-opacity="0.4"/>'
-        f'<g fill="currentColor"><text x="{_LEFT - 5}" y="{_MARGIN + 8}" text-anchor="end">{high:.1f}</text>'
-        f'<text x="{_LEFT - 5}" y="{floor}" text-anchor="end">{low:.1f}</text>'
-        f'<text x="{_LEFT}" y="{_HEIGHT - 4}">return by {escape(axis)}</text>'
-        f'<text x="{right}" y="{_HEIGHT - 4}" text-anchor="end">{"".join(legend)}</text></g>{"".join(lines)}</svg>'
-    )
 
 
 def plot_history(returns: np.ndarray, title: str, expert_return: float | None = None) -> Figure:
@@ -231,34 +155,7 @@ def animate_episode(
     return Picture(title, encode_episode(layout, records, rewards, cell=cell, fps=fps))
 
 
-def plot_learning_curves(dataset: RecordedCurves, path: Path | None = None) -> Figure:
-    """Plot the return by episode of every task in a selection, one panel each, see `plot_curves`.
-
-    More than 12 tasks are drawn by layout and source, see `plot_layout_curves`.
-
-    Raises:
-        OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
-    """
-    if len(dataset.counts("task_id")) > MOST_PANELS:
-        return plot_layout_curves(dataset, path)
-    streams: dict[str, list[RecordedCurve]] = {}
-    for history in dataset:
-        streams.setdefault(history.entry.task_id, []).append(history)
-    titles = {task: f"{of[0].entry.layout} with {of[0].entry.teammate_kind}" for task, of in streams.items()}
-    equal, seen = Counter(titles.values()), Counter[str]()
-    panels = []
-    for task, of_task in streams.items():
-        title = titles[task]
-        seen[title] += 1
-        number = f", {seen[title]}" if equal[title] > 1 else ""
-        returns = [history.returns() for history in of_task]
-        length = min(map(len, returns))  # streams of one task may differ in length
-        count = counted_noun(len(returns), "stream")
-        panels.append((f"{title}{number} ({count})", {"mean": np.stack([own[:length] for own in returns])}))
-    return plot_curves(path, panels)
-
-
-def plot_layout_curves(dataset: RecordedCurves, path: Path | None = None) -> Figure:
+def plot_learning_curves(dataset: Iterable[Any], path: Path | None = None) -> Figure:
     """Plot the return over the course of a history on every layout in a selection, see `plot_source_curves`.
 
     Raises:
@@ -389,34 +286,6 @@ def plot_layouts(layouts: Sequence[Layout], path: Path | None = None) -> Figure:
         axes.imshow(draw_frame(layout, record, view=False))
         axes.set_title(f"{layout.name} ({layout.alias})", fontsize=9)
         axes.set_axis_off()
-    return _saved(figure, path, dpi=120)
-
-
-def plot_headroom(
-    cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str], path: Path | None = None
-) -> Figure:
-    """Plot the oracle's mean return minus that of `stay`, for each test layout and teammate family.
-
-    Args:
-        cells: the reference returns, see `reference_returns.read_headroom`.
-        layouts: names of the layouts, one column each.
-        path: the file to write; None to write none.
-
-    Raises:
-        OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
-    """
-    figure, (axes,) = _panels(path, 1, (3.4 + 0.9 * len(layouts), 3.3))
-    gains = np.array([[cells[n, f]["oracle"] - cells[n, f]["stay"] for n in layouts] for f in HEURISTICS])
-    brightest = max(10.0, gains.max())
-    axes.imshow(gains, cmap="viridis", vmin=0, vmax=brightest, aspect="auto")
-    for (row, family), (column, name) in product(enumerate(HEURISTICS), enumerate(layouts)):
-        text = f"{gains[row, column]:.1f}" if has_headroom(cells[name, family]) else "none"
-        colour = "white" if gains[row, column] < brightest / 2 else "black"
-        axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=9)
-    axes.set_xticks(range(len(layouts)), layouts, fontsize=8, rotation=20, ha="right")
-    axes.set_yticks(range(len(HEURISTICS)), HEURISTICS)
-    axes.set_ylabel("test teammates")
-    axes.set_title("Return of the oracle minus that of an ego that stays", fontsize=9)
     return _saved(figure, path, dpi=120)
 
 

@@ -38,6 +38,11 @@ COMPILATION_CACHE: dict[str, Any] = {
     "jax_compilation_cache_max_size": 2 * 2**30,  # with a limit JAX locks the folder, so that processes can share it
     "jax_persistent_cache_min_compile_time_secs": 0.1,  # with a warm cache a third less CPU time than 0.5
 }
+COSTLIEST = """
+collect notebooks suite rl2 wheel reference run generate noise heuristics fetch controls responses commands docs hostile
+faults
+"""
+"""The files that take longest, in their order; `test_collect.py` makes what others read."""
 QUICK_COMPILATION = (
     "--xla_cpu_use_fusion_emitters=false"  # XLA's older code generator takes less time without optimizations
 )
@@ -80,8 +85,9 @@ def _remove_unfinished_entries(folder: Path) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the file that builds the releases of many others, so that no second worker waits for them."""
-    items.sort(key=lambda item: item.path.name != "test_collect.py")
+    """Start with the costliest files, so that no worker waits for another one in the end."""
+    order = {f"test_{name}.py": place for place, name in enumerate(COSTLIEST.split())}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -30,7 +30,7 @@ from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import save_episode
-from icrl4aht_data.plotting import check_can_draw, plot_layout_curves
+from icrl4aht_data.plotting import check_can_draw, plot_learning_curves
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 
@@ -111,7 +111,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
 
     say(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}")')
     dataset = load_icrl4aht(settings.root, split="train", layout=DEMO_LAYOUT)
-    plot_layout_curves(load_icrl4aht(settings.root), curves)
+    plot_learning_curves(load_icrl4aht(settings.root), curves)
     _draw_best_episode(dataset, episode)
     write(f"{dataset!r}\nlearning curves: {curves}\nbest episode: {episode}")
 

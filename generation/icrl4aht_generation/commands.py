@@ -47,7 +47,7 @@ _profile_option = click.option(
     "profile_name",
     default="smoke",
     metavar="PROFILE",
-    help="smoke, noise, small, mini, cpu or paper, or a TOML file.",
+    help="smoke, noise, search, small, mini, cpu or paper, or a TOML file.",
 )
 
 _ego_options = dataclass_options(
@@ -113,8 +113,8 @@ def generate(
     """Rebuild a release, or resume a rebuild.
 
     Trains the learned teammates of a profile, then collects its tasks into OUT/artefacts: egos that learn (source ppo),
-    noise histories (source noise), or both. Packs the release OUT/lite or OUT/full. Unfinished work resumes from its
-    last save. The executor trains the teammates and collects the tasks. Tasks that fail are listed in
+    scripts (sources noise and search), or several of these. Packs the release OUT/lite or OUT/full. Unfinished work
+    resumes from its last save. The executor trains the teammates and collects the tasks. Tasks that fail are listed in
     OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1. Hyper-parameters of the egos
     replace those of the profile.
     """

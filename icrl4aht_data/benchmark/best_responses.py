@@ -25,6 +25,7 @@ class TrainedResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         seed: seed of the training.
         steps: environment steps of the training.
+        width: width of its features and its recurrent state.
         mean_return: mean return of an episode after it, `return` in the file.
         choice: mean return on the episodes by which the best training is chosen.
         acting: whether it takes its most probable actions ("greedy") or draws them ("sampled"), by the same episodes.
@@ -35,6 +36,7 @@ class TrainedResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int
     steps: int
     mean_return: float = msgspec.field(name="return")
+    width: int = 128
     choice: float | None = None
     acting: str = ""
     slope: float | None = None

@@ -109,12 +109,15 @@ KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
 TEAMMATE_PLUGINS = Plugins("icrl4aht.teammates", (*FAMILIES, *KIND_FAMILIES))
 """Heuristic teammates registered by other packages. Each is a separate family with the same name."""
 
-SOURCES = ("ppo", "noise", "student")
+SOURCES = ("ppo", "noise", "student", "search")
 """How histories are made: by an ego that learns with PPO; by a script whose random actions become rarer (noise
-distillation, Zisman et al. 2024); by a trained agent, perhaps with random actions in the same way. Releases may name
-other sources."""
+distillation, Zisman et al. 2024); by a trained agent, perhaps with random actions in the same way; by a script that
+finds out which dish its teammate wants. Releases may name other sources."""
 
-REBUILT_SOURCES = SOURCES[:2]
+SCRIPTED_SOURCES = ("noise", "search")
+"""Sources of histories that a script plays; its actions without noise label them."""
+
+REBUILT_SOURCES = ("ppo", *SCRIPTED_SOURCES)
 """Sources of histories that `generate` can make without a trained agent."""
 
 EPISODE_STEPS = 400

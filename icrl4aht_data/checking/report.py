@@ -42,26 +42,22 @@ class Report:
         level: depth of the verification.
         findings: problems, in the order in which they were found.
         notes: remarks that are not problems, such as checks that were impossible and shards that were not selected.
-        repaired: files that `icrl4aht-data verify --repair` replaced.
         replayed: whether every step was replayed under the rules.
         files: number of files checked.
         chunks: number of chunks decoded.
         histories: number of histories checked.
         transitions: number of steps of these histories.
-        fetched_bytes: bytes fetched from a remote.
     """
 
     root: str
     level: Level = "full"
     findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    repaired: list[str] = field(default_factory=list)
     replayed: bool = False
     files: int = 0
     chunks: int = 0
     histories: int = 0
     transitions: int = 0
-    fetched_bytes: int = 0
 
     def __repr__(self) -> str:
         number = len(self.findings)
@@ -69,7 +65,7 @@ class Report:
         checked = f"{counted_noun(self.files, 'file')}, {counted_histories(self.histories)}"
         lines = [f"Report({self.root}, level {self.level}: {state}; {checked}"]
         lines += [f"    {finding.file}: {finding.problem:.200}" for finding in islice(self.findings, _SHOWN)]
-        lines += [f"    and {number - _SHOWN:,} more: see .findings"] * (number > _SHOWN)
+        lines += ["    ..."] * (number > _SHOWN)
         return "\n".join(lines) + ")"
 
     @property
@@ -107,8 +103,7 @@ def verdict_in_words(report: Report) -> str:
     if report.level == "quick":
         return f"{verdict}; checked names, sizes and the index of {counted_noun(report.files, 'file')}, no contents"
     physics = " and their physics" if report.replayed else ""
-    fetched = f"; fetched {report.fetched_bytes:,} bytes" * (report.fetched_bytes > 0)
     return (
         f"{verdict}; checked {counted_noun(report.files, 'file')}, {counted_noun(report.chunks, 'chunk')}, "
-        f"{counted_histories(report.histories)}, {counted_noun(report.transitions, 'transition')}{physics}{fetched}"
+        f"{counted_histories(report.histories)}, {counted_noun(report.transitions, 'transition')}{physics}"
     )

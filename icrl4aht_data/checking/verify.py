@@ -6,7 +6,6 @@ A release of observations cannot be replayed: level "deep" checks only that each
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import get_args
 
@@ -19,11 +18,11 @@ from icrl4aht_data.checking.index import check_index
 from icrl4aht_data.checking.provenance import check_provenance
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
 from icrl4aht_data.checking.structure import check_structure
-from icrl4aht_data.clients import check_credentials, without_credentials
+from icrl4aht_data.clients import without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.download import chosen_files
-from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, RemoteError, UnknownNameError, unknown
-from icrl4aht_data.fetch import ReleaseLocation, Remote, open_root
+from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, check_choice
+from icrl4aht_data.fetch import ReleaseLocation, open_root
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
@@ -59,17 +58,14 @@ def verify_release(
             one under the rules, with the recorded reward, and that every episode starts as the environment starts.
             Without state records it checks only that every observation shows the layout, and adds a note to the report.
         advance: called with the name of a stage, the number of items done, and their total.
-        wanted: check only the shards of these histories; see `load_icrl4aht`. In a folder that `download` filled with a
-            part of a release, only that part has to exist.
+        wanted: check only the shards of these histories; see `load_icrl4aht`. For a folder with a part of a release,
+            give the filters that it was downloaded with.
 
     Raises:
         UnknownNameError: if `level` or a name in `wanted` does not exist.
         EmptySelectionError: if no history matches `wanted`.
-        OptionError: if the user name or password in an address has characters that are not percent-encoded.
     """
-    if level not in get_args(Level):
-        raise unknown("level", level, get_args(Level))
-    check_credentials(str(root))
+    check_choice("level", level, get_args(Level))
     report = Report(without_credentials(str(MINI if root is None else root)), level)
     try:
         origin = open_root(MINI if root is None else root)
@@ -79,7 +75,6 @@ def verify_release(
     if not origin.folder.is_dir():
         report.add(".", f"{origin.folder}: no such folder; give the folder or the address of a release")
         return report
-    before = origin.remote.fetched if origin.remote else 0
     report.root = str(origin)
     try:
         _verify(origin, report, advance, wanted)
@@ -87,8 +82,6 @@ def verify_release(
         if isinstance(error, (EmptySelectionError, UnknownNameError)) and any(wanted.values()):
             raise  # wrong arguments are raised, not reported
         report.add("meta", str(error))
-    if origin.remote is not None:
-        report.fetched_bytes = origin.remote.fetched - before
     return report
 
 
@@ -106,7 +99,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     except Icrl4ahtError as error:  # reported after problems of files, which may be the cause
         unreadable = error
     if origin.remote is not None and report.level != "quick":
-        _fetch(origin.remote, sorted(chosen), report, advance)
+        origin.remote.fetch(sorted(chosen))
     check_files(origin, listed, chosen, report, advance)
     if unreadable is not None:
         report.add("meta", str(unreadable))
@@ -144,25 +137,6 @@ def _unchecked_values(index: Index, provenance: Mapping[str, Provenance]) -> Ite
     for name, note in _NOT_RECOMPUTED.items():
         if count := sum(getattr(of_task, name) is not None for of_task in provenance.values()):
             yield note.format(count)
-
-
-def _fetch(remote: Remote, names: list[str], report: Report, advance: NamedProgress) -> None:
-    """Fetch files together; after a failure, fetch them one by one to report every damaged file.
-
-    Raises:
-        RemoteError: if the remote cannot be reached.
-    """
-    with suppress(RemoteError):
-        remote.fetch(names)
-        return
-    for number, name in enumerate(names, start=1):
-        try:
-            remote.fetch([name])
-        except RemoteError as error:
-            if not error.is_content:
-                raise
-            report.add(name, str(error))
-        advance("fetched", number, len(names))
 
 
 def _check_shards(

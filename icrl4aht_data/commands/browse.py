@@ -1,4 +1,4 @@
-"""Command `icrl4aht-data browse`, which writes or serves an HTML page with histories."""
+"""Command `icrl4aht-data browse`, which writes an HTML page with histories."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from icrl4aht_data.browsing.page import (
     make_browser_page,
     save_browser_page,
 )
-from icrl4aht_data.browsing.serving import LOOPBACK, page_server
 from icrl4aht_data.commands.options import (
     COUNT,
     COUNT_OR_NONE,
@@ -35,13 +34,11 @@ from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
-_FILE = "browse.html"
-
 
 @click.command(
     epilog=examples(
         "icrl4aht-data browse --layout demo_wide --source ppo --out demo_wide.html",
-        "icrl4aht-data browse path/to/release --history 0 --history 7 --serve",
+        "icrl4aht-data browse path/to/release --history 0 --history 7",
     )
 )
 @click.argument("root", required=False, type=Root())
@@ -60,14 +57,10 @@ _FILE = "browse.html"
     "--out",
     type=NewFile(".html", ".htm"),
     metavar="FILE",
+    default="browse.html",
     help="File to write.",
-    show_default=f"{_FILE}, with --serve nowhere",
 )
 @overwrite_option
-@click.option("--serve", is_flag=True, help="Serve the page on this machine only, until Ctrl-C.")
-@click.option(
-    "--port", type=click.IntRange(0, 65535), metavar="PORT", help="Port of --serve.", show_default="a free one"
-)
 @quiet_option
 @json_option
 def browse(
@@ -75,10 +68,8 @@ def browse(
     wanted: tuple[int, ...],
     histories: int,
     megabytes: int,
-    out: Path | None,
+    out: Path,
     overwrite: bool,
-    serve: bool,
-    port: int | None,
     quiet: bool,
     as_json: bool,
     **filters: Any,
@@ -90,16 +81,9 @@ def browse(
     episodes fit, some of each history can be watched, the first and the last among them; the page says which. A release
     of observations has no states to draw.
     """
-    if port is not None and not serve:
-        raise click.UsageError("--port is for the server: give --serve with it")
-    if out is None and not serve:
-        out = Path(_FILE)
-    if out is None and overwrite:
-        raise click.UsageError("--overwrite replaces a file: give --out FILE with it")
-    if out is not None:
-        with suppress(OSError), out.open("rb") as stream:  # a page written by this command may be replaced
-            overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
-        check_output(out, overwrite)
+    with suppress(OSError), out.open("rb") as stream:  # a page written by this command may be replaced
+        overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
+    check_output(out, overwrite)
     matching = load_icrl4aht(root, **filters)
     check_drawable(matching)
     chosen = matching.select(list(dict.fromkeys(wanted)) or spread_histories(matching, histories))
@@ -107,19 +91,10 @@ def browse(
         page = make_browser_page(
             chosen, megabytes=megabytes, advance=lambda done, total: show("histories", done, total)
         )
-    if out is not None:
-        save_browser_page(page, out)
-    server = page_server(page.html, port or 0) if serve else None
-    address = f"http://{LOOPBACK}:{server.server_port}/" if server else None
-    facts = {"page": str(out) if out else None, "address": address, "histories": page.histories}
+    save_browser_page(page, out)
+    facts: dict[str, Any] = {"page": str(out), "histories": page.histories}
     facts |= {"episodes": page.episodes, "shown_episodes": page.shown_episodes, "bytes": len(page.html)}
     shown = "all" if page.shown_episodes == page.episodes else f"{page.shown_episodes:,} of"
-    text = f"{out or 'page'}: {page.histories} of {counted_histories(len(matching))}, {shown} "
+    text = f"{out}: {page.histories} of {counted_histories(len(matching))}, {shown} "
     text += f"{counted_noun(page.episodes, 'episode')} to watch, {len(page.html):,} bytes"
     print_result(facts, text, as_json, quiet)
-    if server:
-        with server:
-            if not as_json:
-                click.echo(f"{address} until Ctrl-C")
-            with suppress(KeyboardInterrupt):
-                server.serve_forever()

@@ -36,7 +36,6 @@ _REMEDIES = {
 
 _EPILOG = """\b
 Examples:
-  icrl4aht-data list
   icrl4aht-data show --layout coord_simple --plot curves.png
   icrl4aht-data download hf://datasets/you/icrl4aht --layout coord_simple
   icrl4aht-data train ad --layout demo_wide --out runs/ad

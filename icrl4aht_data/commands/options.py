@@ -139,13 +139,6 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON i
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace existing files, or an existing release folder."
 )
-family_map_option = click.option(
-    "--family-map",
-    multiple=True,
-    metavar="OLD=NEW",
-    help="Translate a teammate family of published files to rl, H1 to H4, or a kind such as fcp; repeat for more.",
-    show_default="the names of the published code",
-)
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems only.")
 
 
@@ -155,7 +148,7 @@ _FILTERS: dict[str, tuple[click.ParamType, str | None, str]] = {
     "track": (TRACK, None, "Only this track: teammate or layout."),
     "teammate-family": (FAMILY, None, "Only this family: rl (learned), H1, H2, H3 or H4."),
     "teammate-kind": (click.STRING, "KIND", "Only this kind, such as utility_greedy or fcp."),
-    "source": (click.STRING, "NAME", "Only histories of this source: ppo, noise or student."),
+    "source": (click.STRING, "NAME", "Only histories of this source: ppo, noise, student or search."),
 }
 """Option -> type, placeholder and help text."""
 

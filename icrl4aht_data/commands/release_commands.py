@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ from icrl4aht_data.commands.options import (
     NewFile,
     Root,
     examples,
-    family_map_option,
     filter_options,
     is_terminal,
     json_option,
@@ -30,18 +30,15 @@ from icrl4aht_data.commands.options import (
     quiet_option,
 )
 from icrl4aht_data.commands.summaries import (
-    facts_table,
+    fact_lines,
     layout_table,
     summarize_selection,
     summarize_tasks,
     tab_separated,
     task_table,
 )
-from icrl4aht_data.dataset import MINI, load_icrl4aht
+from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.download import fetch_planned, plan_download
-from icrl4aht_data.download import repair as repair_files
-from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import ALL_KINDS, OBSERVATIONS
 from icrl4aht_data.plotting import PICTURES, plot_learning_curves
@@ -55,9 +52,7 @@ from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.minari import to_minari
 from icrl4aht_data.writing.parquet import to_parquet
 from icrl4aht_data.writing.published import from_published, to_published
-from icrl4aht_data.writing.published_index import parse_family_map
 from icrl4aht_data.writing.release_folder import HISTORIES_H5
-from icrl4aht_data.writing.statistics import print_statistics
 
 _FORMS = (*ALL_KINDS, "published", "parquet", "minari")
 
@@ -93,7 +88,7 @@ def list_(root: str | Path | None, as_json: bool, **filters: Any) -> None:
     "--plot",
     type=NewFile(*PICTURES),
     metavar="FILE",
-    help="Also draw learning curves by task, or by layout for more than 12 tasks: .png, .svg or .pdf.",
+    help="Also draw learning curves by layout and source: .png, .svg or .pdf.",
 )
 @overwrite_option
 @json_option
@@ -137,7 +132,7 @@ def show(
         del facts["layouts"]  # already in the table
     else:
         console.print(repr(dataset[0]), "", sep="\n")
-    console.print(facts_table(facts))
+    console.print(*fact_lines(facts), sep="\n")
 
 
 @click.command(
@@ -169,14 +164,18 @@ def download(
         plan = plan_download(str(root), to=to, advance=show, **filters)
         facts = plan.to_json()
         if not dry_run:
-            facts["fetched_bytes"] = fetch_planned(plan, counted(show, "download", plan.size))
+            fetch_planned(plan, counted(show, "download", plan.size))
     absent = sorted((*plan.absent, *plan.changed))
     lines = [f"{plan.files[name]:>15,}  {name}" for name in absent if dry_run]
     lines += [f"{name}: had changed{'' if dry_run else ', was fetched again'}" for name in plan.changed]
     verb = "to download" if dry_run else "downloaded"
     here = f"{counted_noun(len(plan.files) - len(absent), 'file')} present already, with the right hashes"
     lines.append(f"{plan.root}: {counted_noun(len(absent), 'file')}, {plan.size:,} bytes {verb}; {here}")
-    print_result(facts, "\n".join([*lines, f"folder: {plan.root.folder}"]), as_json, quiet)
+    lines.append(f"folder: {plan.root.folder}")
+    chosen = [f"--{name.replace('_', '-')} {value}" for name, values in filters.items() for value in values or ()]
+    if chosen:
+        lines.append(f"it is a part: `icrl4aht-data verify {plan.root.folder} {' '.join(chosen)}` checks it")
+    print_result(facts, "\n".join(lines), as_json, quiet)
 
 
 @click.command()
@@ -184,49 +183,27 @@ def download(
 @filter_options
 @click.option("--quick", is_flag=True, help="Check only names, sizes and the index.")
 @click.option("--deep", is_flag=True, help="Also replay every step and render every observation.")
-@click.option("--repair", is_flag=True, help="Fetch damaged and missing files again, then verify once more.")
-@click.option(
-    "--from",
-    "origin",
-    metavar="ADDRESS",
-    help="Repair from this release.",
-    show_default="the origin of ROOT",
-)
 @quiet_option
 @json_option
 def verify(
     root: str | Path | None,
     quick: bool,
     deep: bool,
-    repair: bool,
-    origin: str | None,
     quiet: bool,
     as_json: bool,
     **filters: Any,
 ) -> None:
     """Verify a release: every byte, count and range.
 
-    Prints one line per problem, and exits with 1 if there is one. Writes nothing without --repair. A remote release is
-    fetched first, unless --quick.
+    Prints one line per problem, and exits with 1 if there is one. A remote release is fetched first, unless --quick.
+    `download` replaces damaged files. For a folder with a part of a release, give the filters of its download.
     """
-    if quick and (deep or repair):
-        raise click.UsageError("--quick reads no contents: give --deep or --repair without it")
+    if quick and deep:
+        raise click.UsageError("--quick reads no contents: give --deep without it")
     level = "quick" if quick else "deep" if deep else "full"
-    if origin and not repair:
-        raise click.UsageError("--from is the source of a repair: give --repair with it")
     with progress_bars(quiet) as advance:
         report = verify_release(root, level=level, advance=advance, **filters)
-        if repair and not report.ok:
-            if root is None and origin is None:
-                raise OptionError("the bundled release is repaired by installing the package again")
-            first = report
-            outcome, fetched = repair_files(MINI if root is None else root, first.files_at_fault, source=origin)
-            report = verify_release(root, level=level, advance=advance, **filters)
-            report.repaired = [name for name, error in outcome.items() if error is None]
-            report.notes += [f"{name}: not repaired: {error}" for name, error in outcome.items() if error is not None]
-            report.fetched_bytes += first.fetched_bytes + fetched
-    lines = [f"{name}: repaired" for name in report.repaired]
-    lines += [one.problem if one.file == "." else f"{one.file}: {one.problem}" for one in report.findings]
+    lines = [one.problem if one.file == "." else f"{one.file}: {one.problem}" for one in report.findings]
     lines += [f"{report.root}: {verdict_in_words(report)}", *report.notes] if not quiet else []
     print_result(report.to_json(), "\n".join(lines), as_json, quiet=not lines)
     sys.exit(0 if report.ok else 1)
@@ -250,14 +227,6 @@ def verify(
 )
 @overwrite_option
 @click.option("--to", "form", type=click.Choice(_FORMS), help="Format to convert to.")
-@click.option(
-    "--tasks",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
-    help="JSONL file with the tasks of published files.",
-    show_default="tasks.jsonl in SOURCE",
-)
-@family_map_option
 @click.option("--kept-steps", type=COUNT, default=KEPT_STEPS, help="Steps of an episode in published files.")
 @filter_options
 @quiet_option
@@ -266,8 +235,6 @@ def convert(
     target: Path,
     overwrite: bool,
     form: str | None,
-    tasks: Path | None,
-    family_map: tuple[str, ...],
     kept_steps: int,
     quiet: bool,
     **filters: Any,
@@ -275,10 +242,10 @@ def convert(
     """Convert a release or published files.
 
     SOURCE is a release, by default the bundled mini release, or a folder with the published code's histories.h5 and
-    histories_index.jsonl. Writes a release folder (full, lite, observations), a folder with the published code's two
-    files (published), a Minari dataset (minari) in a folder named as in demo_wide-v0, which minari.load_dataset opens,
-    or a Parquet file with the index
-    (parquet). Published files become lite by default or, where they have no state records, observations.
+    histories_index.jsonl, and with tasks.jsonl if the tasks are known. Writes a release folder (full, lite,
+    observations), a folder with the published code's two files (published), a Minari dataset (minari) in a folder named
+    as in demo_wide-v0, which minari.load_dataset opens, or a Parquet file with the index (parquet). Published files
+    become lite by default or, where they have no state records, observations.
     """
     with progress_bars(quiet) as show:
         advance = partial(show, "histories")
@@ -290,8 +257,6 @@ def convert(
                 root,
                 target,
                 form,
-                tasks=tasks,
-                family_map=parse_family_map(family_map),
                 kept_steps=kept_steps,
                 overwrite=overwrite,
                 advance=advance,
@@ -300,10 +265,8 @@ def convert(
             dataset = load_icrl4aht(root, **filters)
             if form is None:
                 raise click.UsageError(f"give the form to convert to: --to {', '.join(_FORMS)}")
-            if tasks or family_map or kept_steps != KEPT_STEPS:
-                raise click.UsageError(
-                    f"{dataset.root} is a release: --tasks, --family-map and --kept-steps are for published files"
-                )
+            if kept_steps != KEPT_STEPS:
+                raise click.UsageError(f"{dataset.root} is a release: --kept-steps is for published files")
             if form in ALL_KINDS:
                 to_release(dataset, target, form, overwrite=overwrite, advance=advance)
             elif form == "parquet":
@@ -332,32 +295,29 @@ def combine(
 ) -> None:
     """Combine releases into one.
 
-    They have to be of one kind and share no task. The combination gets a new card; the cards of the releases are kept
-    in meta/source_card.md.
+    They have to be of one kind and share no task. The combination gets a new card.
     """
     combine_releases(out, releases, data_version, overwrite=overwrite)
     if not quiet:
         click.echo(f"release: {out}")
-        print_statistics(read_info(out), Console())
 
 
 @click.command(epilog=examples("icrl4aht-data release build path/to/release --out build/release"))
 @click.argument("source", required=False, type=Folder())
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
 @overwrite_option
-@click.option("--link", is_flag=True, help="Hard-link files instead of copying: saves space, but edits affect both.")
 @quiet_option
 @json_option
-def build(source: Path | None, out: Path, overwrite: bool, link: bool, quiet: bool, as_json: bool) -> None:
+def build(source: Path | None, out: Path, overwrite: bool, quiet: bool, as_json: bool) -> None:
     """Build a release for publication.
 
     Copies all data of SOURCE, a release folder (by default the bundled mini release), which is verified first, and adds
     what people and tools look for in a dataset: README.md with a dataset card, figures, the index as Parquet for
-    viewers, croissant.json, LICENSE, CITATION.cff, cards of the learned teammates and a new manifest. Needs the extras
+    viewers, croissant.json, LICENSE, CITATION.cff and a new manifest. Needs the extras
     plot and hf.
     """
     with progress_bars(quiet) as advance:
-        build_release(source, out, link=link, overwrite=overwrite, advance=advance)
+        build_release(source, out, overwrite=overwrite, advance=advance)
     files = list(read_manifest(out))
     size = sum((out / name).stat().st_size for name in files)
     text = f"release: {out}, {len(files)} files, {size:,} bytes; its card is {out / 'README.md'}"
@@ -379,10 +339,10 @@ def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool
     content is compared with the manifest, and only then tagged with the data version. A tag never moves: other data
     need another version. `hf auth login` stores the token.
     """
+    if quiet or not sys.stderr.isatty():
+        import_module("huggingface_hub.utils").disable_progress_bars()
     with progress_bars(quiet) as advance:
-        done = upload_release(
-            folder, address, private=private, dry_run=dry_run, show=not quiet and sys.stderr.isatty(), advance=advance
-        )
+        done = upload_release(folder, address, private=private, dry_run=dry_run, advance=advance)
     print_result(done.to_json(), "\n".join(done.in_words()), as_json, quiet)
 
 

@@ -106,37 +106,19 @@ def layout_table(dataset: Dataset) -> Table:
     return table
 
 
-def facts_table(facts: Mapping[str, Any]) -> Table:
-    """Return a table of names and wrapped values; a mapping with nested mappings has one row per key."""
-    table = Table(box=None, pad_edge=False, show_header=False)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
+def fact_lines(facts: Mapping[str, Any], indent: str = "") -> Iterator[str]:
+    """Yield facts as lines for a terminal; those of a nested mapping are indented."""
     for name, value in facts.items():
-        for row in _rows(name, value):
-            table.add_row(*row)
-    return table
-
-
-def _rows(name: str, value: Any, indent: str = "") -> Iterator[tuple[str, str]]:
-    """Yield table rows for a JSON value; rows of nested keys are indented."""
-    label = indent + name.replace("_", " ")
-    if isinstance(value, dict) and (indent or any(isinstance(one, dict | list) for one in value.values())):
-        yield label, ""
-        for key, one in value.items():
-            yield from _rows(key, one, indent + "  ")
-    else:
-        yield label, "\n".join(value) if name == "map" else _in_words(value)
-
-
-def _in_words(value: Any) -> str:
-    """Return a JSON value as text: lists and mappings with commas, and one line per nested list."""
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {_in_words(one)}" for name, one in value.items())
-    if isinstance(value, list):
-        return ("\n" if any(isinstance(one, list) for one in value) else ", ").join(map(_in_words, value))
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return "unknown" if value is None else value if isinstance(value, str) else json.dumps(value)
+        label = indent + name.replace("_", " ")
+        if isinstance(value, dict):
+            yield label
+            yield from fact_lines(value, indent + "  ")
+        elif name == "map":
+            yield label
+            yield from (f"{indent}  {row}" for row in value)
+        else:
+            words = value if isinstance(value, list) else ["unknown" if value is None else value]
+            yield f"{label}: {', '.join(map(str, words))}"
 
 
 def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
@@ -147,7 +129,7 @@ def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
 
 def summarize_selection(dataset: Dataset) -> dict[str, Any]:
     """Return a JSON object with the location, kind, versions and counts of a selection."""
-    info, remote, missing = dataset.info, dataset.origin.remote, _missing(dataset)
+    info, remote = dataset.info, dataset.origin.remote
     content = describe(
         info.kind, info.data_version, info.environment.kept_steps, dataset.entries, info.format_version
     ).to_json()
@@ -160,17 +142,5 @@ def summarize_selection(dataset: Dataset) -> dict[str, Any]:
         "sources": dataset.counts("source"),
         "learners": len(np.unique(dataset.column("learner"))),
         "labels": dataset.counts("labels"),
-        **({"missing": missing} if missing else {}),
         "cache": f"{dataset.cache.cache}: {dataset.cache.reason}",
     }
-
-
-def _missing(dataset: Dataset) -> list[str]:
-    """Return descriptions of the data that a selection lacks, compared with a full or lite release."""
-    without = len(dataset) - int(dataset.column("has_teammate_actions").sum())
-    missing = {
-        "state records: nothing can be replayed or drawn, obs='state' is refused": not dataset.has_states,
-        "tasks: teammates are known by family and kind only": not dataset.knows_tasks,
-        f"teammate actions of {without} histories": without > 0,
-    }
-    return [what for what, is_missing in missing.items() if is_missing]

@@ -100,10 +100,9 @@ class Index:
             matching &= self.entries.matches(name, {self._known_value(name, one, given) for one in names})
         if not matching.any():
             what = ", ".join(f"{name}={value!r}" for name, value in filters.items()) or "any"
-            sources = ", ".join(self.values("source")) or "none"
-            raise EmptySelectionError(
-                f"{self.root}: no history has {what}. This release has {self.summary()}; sources: {sources}"
-            )
+            names = ("split", "layout", "teammate_family", "source")
+            found = "; ".join(f"{name} {listed_names(self.values(name)) or 'none'}" for name in names)
+            raise EmptySelectionError(f"{self.root}: no history has {what}. This release has {found}")
         return np.flatnonzero(matching)
 
     def _of_families(self, families: Iterable[str]) -> list[str]:
@@ -128,25 +127,8 @@ class Index:
         if value in (own := self.values(name)):
             return value  # without reading which other packages are installed
         known = (*_KNOWN_VALUES.get(name, tuple)(), *own)
-        if value not in known:
-            raise unknown(given, value, known)
+        check_choice(given, value, known)
         return value
-
-    def summary(self) -> str:
-        """Return a line that lists the layouts and teammate families of each split."""
-        found: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
-        names = ("layout", "split", "track", "teammate_family")
-        values = [self.values(name) for name in names]
-        columns = np.stack([self.entries.column(name) for name in names], axis=-1)
-        for codes in np.unique(columns, axis=0).tolist():
-            layout, split, _, family = (known[code] for known, code in zip(values, codes, strict=True))
-            layouts, families = found.setdefault(split, ({}, {}))
-            layouts[layout] = families[family] = None
-        texts = [
-            f"{split} on {listed_names([*layouts])} with {', '.join(families)}"
-            for split, (layouts, families) in found.items()
-        ]
-        return "; ".join(texts) or "no histories"
 
 
 def read_index(root: Path) -> Index:

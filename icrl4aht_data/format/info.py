@@ -36,7 +36,6 @@ _SEMVER = re.compile(
 )
 
 _VERSION_LENGTH = 100  # characters
-_CONVERTER = "commit 71f723c of this package, which reads versions 2, 3 and 4"
 
 _Steps = Annotated[int, Meta(gt=0, lt=2**31)]
 _Bytes = Annotated[int, Meta(ge=0, lt=2**62)]
@@ -210,7 +209,10 @@ def read_info(root: Path) -> ReleaseInfo:
     """
     path = resolve_inside(root, INFO)
     if not path.is_file():
-        raise RootNotFoundError(f"{root}: no release here, expected {INFO} in it; {_instead(root)}")
+        raise RootNotFoundError(
+            f"{root}: no release here, expected {INFO} in it; give the folder of a release, fetch one with "
+            f"`icrl4aht-data download`, or give none for the bundled one"
+        )
     read_layouts(root)  # left-out tasks may be on layouts that the release carries
     try:
         content = parse_json(read_text(path))
@@ -224,20 +226,7 @@ def read_info(root: Path) -> ReleaseInfo:
     found = f"{path}: format version {version}, this package reads {', '.join(map(str, READABLE_VERSIONS))}"
     if version > FORMAT_VERSION:
         raise FormatTooNewError(f"{found}: `pip install -U {PACKAGE}`")
-    raise FormatTooOldError(
-        f"{found}: fetch the release again, or convert it to version 4 with `icrl4aht-data convert` of {_CONVERTER}"
-    )
-
-
-def _instead(root: Path) -> str:
-    """Return advice for the error about a folder that is not a release."""
-    if not root.is_dir():
-        hint = "there is no such folder: check the path"
-    elif below := sorted(str(path.parent.parent) for path in root.glob(f"*/{INFO}")):
-        return f"did you mean {' or '.join(below[:3])}?"
-    else:
-        hint = "give the folder of a release"
-    return f"{hint}, fetch one with `icrl4aht-data download`, or give none for the bundled one"
+    raise FormatTooOldError(f"{found}: fetch a newer version of the release")
 
 
 def check_version(version: str) -> str:

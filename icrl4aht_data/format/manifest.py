@@ -7,7 +7,6 @@ checked.
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -29,7 +28,6 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.utils.files import (
     LARGEST,
     atomic_write,
-    is_inside,
     plain_size,
     read_text,
     resolve_inside,
@@ -71,7 +69,7 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
 
     Raises:
         IndexFormatError: if the manifest is empty or a line is malformed; with the line number.
-        UnsafePathError: if a path leads out of the release, or a release may not contain it.
+        UnsafePathError: if a release may not contain a file with this path.
     """
     if not text:
         raise IndexFormatError(f"{path}: empty: expected a line for each file of the release; fetch it again")
@@ -84,10 +82,6 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         if match is None:
             raise IndexFormatError(f"{path}, line {number}: expected '<sha256>  <path>', found {line[:200]!r}")
         digest, name = match.groups()
-        if not is_inside(name):
-            raise UnsafePathError(
-                f"{path}, line {number}: {name!r} leads out of the release: do not use it, and warn its publisher"
-            )
         if not is_known_file(name):
             raise UnsafePathError(
                 f"{path}, line {number}: {name[:200]!r} is not a file that a release has: do not use it, and warn its "
@@ -95,7 +89,7 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
             )
         if name in listed:
             raise IndexFormatError(f"{path}, line {number}: {name!r} is listed twice")
-        twin = folded.setdefault(unicodedata.normalize("NFC", name).casefold(), name)
+        twin = folded.setdefault(name.casefold(), name)
         if twin != name:
             raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are one file on some systems")
         listed[name] = digest
@@ -145,14 +139,14 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
         if found != listed[name]:
             raise kind(
                 f"{path}: expected sha256 {listed[name]} as {MANIFEST} says, found {found}: the file is damaged or was "
-                f"edited; `icrl4aht-data verify --repair` fetches it again"
+                f"edited; `icrl4aht-data download` replaces it"
             )
 
 
 def check_meta(root: Path) -> None:
     """Check the files of meta/ except chunk tables; see `check_against_manifest`.
 
-    `SOURCE_CARD` may be missing, since no code reads it.
+    meta/source_card.md, which earlier versions of this package wrote, may be missing, since no code reads it.
     """
     listed = [name for name in _listed(root) if re.fullmatch(r"meta/[^/]+", name)]
     read = {

@@ -22,9 +22,6 @@ from icrl4aht_data.utils.system import new_array
 _low: Any = h5py  # h5py's type stubs lack the low-level interface
 h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z
 
-OLDEST_HDF5 = (1, 10, 5)
-"""Oldest version of libhdf5 that reports the positions of chunks."""
-
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
 _SUPERBLOCKS = tuple(b"\x89HDF\r\n\x1a\n" + bytes([version, 8, 8]) for version in (2, 3))  # with addresses of 8 bytes

@@ -52,9 +52,6 @@ EXPERTS = "experts"
 RELEASE_CARD, CARD_TABLES = "README.md", "card.json"
 """Paths of the dataset card and of its long tables."""
 
-SOURCE_CARD = "meta/source_card.md"
-"""Path of the cards of the combined releases, or of the earlier card that `release build` replaced."""
-
 PARQUET_INDEX = "index"
 """Folder of the index as Parquet files, `index/<layout>/<split>.parquet`, in a release built for publication."""
 

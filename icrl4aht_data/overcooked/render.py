@@ -54,13 +54,6 @@ def draw_frame(
     return np.array(_picture(layout, _checked(layout, record, 1, cell), cell, caption, view))
 
 
-def save_frame(path: str | Path, layout: Layout, record: np.ndarray, **options: Any) -> None:
-    """Write the picture of one state as PNG; record uint8 (S,), options and errors as in `draw_frame`."""
-    frame = draw_frame(layout, record, **options)
-    with atomic_write(Path(path)) as partial:
-        _pillow()[0].fromarray(frame).save(partial, format="PNG")
-
-
 def save_episode(
     path: str | Path,
     layout: Layout,

@@ -69,9 +69,9 @@ def columns(layout: Layout | Tables) -> State:
     return State(slice(0, 2), slice(2, 4), slice(4, 6), 6, 7, *rest)
 
 
-def record_size(layout: Layout | Tables) -> int:
-    """Return S, the number of bytes of a state record of a layout, or of the layouts of stacked tables."""
-    pots, buttons, counters = _counts(layout)
+def record_size(*layouts: Layout | Tables) -> int:
+    """Return S, the number of bytes of a state record of a layout or stacked tables, or padded for all of several."""
+    pots, buttons, counters = np.max([_counts(layout) for layout in layouts], axis=0).tolist()
     return 8 + 2 * pots + buttons + counters
 
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import datetime
-import os
 import shutil
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS
-from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.checking.report import NamedProgress
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
-from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, ReleaseError, unknown
+from icrl4aht_data.errors import OptionError, ReleaseError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.schema import (
@@ -25,29 +21,18 @@ from icrl4aht_data.format.schema import (
     PARQUET_EPISODES,
     PARQUET_INDEX,
     RELEASE_CARD,
-    SOURCE_CARD,
-    TEAMMATES,
 )
-from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.plotting import plot_headroom, plot_layout_curves, plot_layouts
+from icrl4aht_data.plotting import plot_layouts, plot_learning_curves
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
-from icrl4aht_data.utils.files import files_below, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import files_below, write_json
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.install_hints import install_command
-from icrl4aht_data.utils.templates import card_file, fill_template
-from icrl4aht_data.writing.card import (
-    CURVES_FIGURE,
-    HEADROOM_FIGURE,
-    HEADROOM_PROTOCOL,
-    LAYOUTS_FIGURE,
-    evaluated_on,
-    write_card,
-)
+from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.writing.card import CURVES_FIGURE, LAYOUTS_FIGURE, write_card
 from icrl4aht_data.writing.parquet import to_parquet, write_episodes
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder, check_target
 
 _COPIED_TEXTS = ("LICENSE", "CITATION.cff")
-_POLICY = "policy.json"
 _LIBRARIES = {"matplotlib": "plot", "PIL": "plot", "pyarrow": "hf", "mlcroissant": "hf"}
 """Module required for building -> extra that installs it."""
 
@@ -56,7 +41,6 @@ def build_release(
     source: str | Path | None,
     target: str | Path,
     *,
-    link: bool = False,
     overwrite: bool = False,
     published: datetime.date | None = None,
     advance: NamedProgress = lambda what, done, total: None,
@@ -66,8 +50,6 @@ def build_release(
     Args:
         source: a release folder; the bundled mini release by default.
         target: the folder to write, which appears when it is complete.
-        link: hard-link the files of `source` instead of copying them, which saves space; later changes of a file then
-            affect both releases.
         overwrite: replace a release at `target`.
         published: date of publication for Croissant; today by default.
         advance: called with the name of a stage, the number of items done, and their total.
@@ -86,22 +68,13 @@ def build_release(
     with atomic_folder(target, overwrite=overwrite, sources=[source]) as root:
         for number, name in enumerate(kept, start=1):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
-            if link:
-                with suppress(OSError):  # hard links do not work across file systems, nor on all of them
-                    os.link(source / name, root / name)
-            if not (root / name).exists():
-                shutil.copyfile(source / name, root / name)
+            shutil.copyfile(source / name, root / name)
             advance("copying", number, len(kept))
-        _keep_source_card(source, root)
         dataset = load_icrl4aht(source)
         (root / CURVES_FIGURE).parent.mkdir()
-        plot_layout_curves(dataset, root / CURVES_FIGURE)
+        plot_learning_curves(dataset, root / CURVES_FIGURE)
         plot_layouts(dataset.layouts, root / LAYOUTS_FIGURE)
-        tested = evaluated_on(layout.name for layout in dataset.layouts)
-        plot_headroom(read_headroom(HEADROOM_PROTOCOL), tested, root / HEADROOM_FIGURE)
         _add_parquet(dataset, root, advance)
-        for folder in sorted((root / TEAMMATES).glob("*/")):
-            (folder / RELEASE_CARD).write_text(teammate_card(folder), encoding="utf-8")
         for name in _COPIED_TEXTS:
             shutil.copyfile(card_file(name), root / name)
         write_card(root)
@@ -135,52 +108,11 @@ def first_of(problems: Sequence[str]) -> str:
     return "; ".join(problems[:3]) + more
 
 
-def teammate_card(folder: Path) -> str:
-    """Return the README.md of a learned teammate, made from its policy.json.
-
-    Args:
-        folder: `teammates/<sha256>` of a release.
-
-    Raises:
-        IndexFormatError: if policy.json is missing or does not describe a teammate; names the file.
-    """
-    path = folder / _POLICY
-    try:
-        facts = parse_json(read_text(path))
-        if facts["algorithm"] not in ALGORITHMS:
-            raise unknown("algorithm", facts["algorithm"], ALGORITHMS)
-        return fill_template(
-            "teammate.md",
-            algorithm=facts["algorithm"],
-            layout=get_layout(facts["layout"]).name,
-            member=f"{facts['member']:d}",
-            checkpoint=f"{facts['checkpoint']:d}",
-            step=f"{facts['step']:,d}",
-            sha256=folder.name,
-            agents=", ".join(f"{slot:d}" for slot in facts["seats"]),
-            own_return=f"{facts['return']:.1f}",
-            teammate_return=f"{facts['teammate_return']:.1f}",
-            seed=f"{facts['seed']:d}",
-            widths=", ".join(f"{name} {value}" for name, value in facts["widths"].items()),
-            code_version=facts["code_version"],
-            return_of=facts["return_of"],
-        )
-    except (Icrl4ahtError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise IndexFormatError(f"{path}: not the card of a learned teammate: {error!r}") from error
-
-
 def _is_made_here(name: str) -> bool:
     """Return whether building writes this file, so that the source's version is not copied."""
     folders = ("figures/", f"{PARQUET_INDEX}/", f"{PARQUET_EPISODES}/")
     is_card = name == RELEASE_CARD or name.endswith(f"/{RELEASE_CARD}")
     return is_card or name in (CARD_TABLES, CROISSANT, *_COPIED_TEXTS) or name.startswith(folders)
-
-
-def _keep_source_card(source: Path, root: Path) -> None:
-    """Store the source's card as `SOURCE_CARD`, unless it is generated (starts with YAML) or one is already stored."""
-    text = read_text(source / RELEASE_CARD) if (source / RELEASE_CARD).is_file() else ""
-    if text and not text.startswith("---\n") and not (root / SOURCE_CARD).exists():
-        (root / SOURCE_CARD).write_text(text, encoding="utf-8")
 
 
 def _add_parquet(dataset: Dataset, root: Path, advance: NamedProgress) -> None:

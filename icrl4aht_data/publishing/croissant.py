@@ -13,12 +13,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import ReleaseInfo, read_info
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES, PARQUET_INDEX
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, record_width
-from icrl4aht_data.utils.install_hints import install_command
+from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.card import card_texts, episode_texts
 
@@ -61,14 +60,11 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
     Raises:
         OptionError: if mlcroissant is not installed.
     """
-    try:
-        import mlcroissant as mlc
-    except ImportError as error:
-        raise OptionError(f"croissant.json needs mlcroissant: {install_command('hf')}") from error
+    mlc = import_optional("mlcroissant", "croissant.json")
     info, texts = read_info(root), card_texts("arrays")
     arrays = "; ".join(f"{name}: {texts[name]}" for name, field in FIELDS.items() if info.kind not in field.absent)
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
-    context = mlc.Context(rdf=terms, conforms_to=_STANDARD)  # pyright: ignore[reportArgumentType]  # it parses addresses
+    context = mlc.Context(rdf=terms, conforms_to=_STANDARD)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # raised by libraries that mlcroissant is built on
         files = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -72,7 +72,6 @@ def upload_release(
     *,
     private: bool = False,
     dry_run: bool = False,
-    show: bool = False,
     advance: NamedProgress = lambda what, done, total: None,
 ) -> Upload:
     """Upload a release, compare the repository with the manifest, and tag the commit.
@@ -84,7 +83,6 @@ def upload_release(
         address: hf://datasets/ORG/REPO; a missing repository is created.
         private: make a new repository private, and accept an existing one only if it is private.
         dry_run: only make the plan.
-        show: show the client's progress bars.
         advance: called while verifying, with the name of a stage, the number of items done, and their total.
 
     Raises:
@@ -94,7 +92,6 @@ def upload_release(
             belong to no release, or its content differs from the manifest after the upload.
     """
     from huggingface_hub import HfApi
-    from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
 
     found, folder = re.fullmatch(r"hf://datasets/([\w.-]+/[\w.-]+)/?", str(address)), Path(folder)
     if found is None:
@@ -104,16 +101,12 @@ def upload_release(
     api, repo, version = HfApi(), found[1], read_info(folder).data_version
     sizes = {name: (folder / name).stat().st_size for name in sorted(hashes)}
     plan = Upload(repo, f"v{version}", f"{api.endpoint}/datasets/{repo}", sizes)
-    with ExitStack() as stack:
-        if not show and not are_progress_bars_disabled():
-            disable_progress_bars()
-            stack.callback(enable_progress_bars)
-        with _wrap_hub_errors(plan, api, _NOTHING_SENT):
-            plan = _plan(api, plan, folder, hashes, private)
-        if dry_run or plan.done == "already there":
-            return plan
-        with _wrap_hub_errors(plan, api, _KEPT):
-            return _send(api, plan, folder, hashes)
+    with _wrap_hub_errors(plan, api, _NOTHING_SENT):
+        plan = _plan(api, plan, folder, hashes, private)
+    if dry_run or plan.done == "already there":
+        return plan
+    with _wrap_hub_errors(plan, api, _KEPT):
+        return _send(api, plan, folder, hashes)
 
 
 def _plan(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str], private: bool) -> Upload:
@@ -208,6 +201,5 @@ def _wrap_hub_errors(plan: Upload, api: HfApi, remedy: str) -> Iterator[None]:
             remedy = f"expected a token that may write to {owner}: `hf auth login`, or set HF_TOKEN"
         elif isinstance(cause, ValueError):
             remedy = "correct it, then run the same command"
-        lines = [line.strip() for line in str(cause).splitlines()]
-        text = " ".join(line for line in lines if line and not line.startswith("For more information"))
-        raise UploadError(f"{plan.repo} at {api.endpoint}: {text or repr(cause)}; {remedy}") from error
+        text = " ".join(str(cause).split()) or repr(cause)
+        raise UploadError(f"{plan.repo} at {api.endpoint}: {text}; {remedy}") from error

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Self, overload
 import numpy as np
 
 from icrl4aht_data.errors import PositionTypeError
-from icrl4aht_data.plotting import curve_svg
 from icrl4aht_data.utils.options import check_position
-from icrl4aht_data.utils.text import facts_html
 
 if TYPE_CHECKING:
     from icrl4aht_data.reading.history import History
@@ -115,19 +113,6 @@ class Episode(FieldArrays):
             f"Episode({self.number} of {e.episodes} of history {e.history_id}: {e.layout} with {e.teammate_kind}, "
             f"steps {self.start}..{self.stop - 1}, return {self.total_return:g})"
         )
-
-    def _repr_html_(self) -> str:
-        """Return the episode's facts and its return by step as HTML, for notebooks."""
-        e, rewards = self.entry, self.rewards
-        given = ", ".join(f"{reward:+g} at step {step}" for step, reward in enumerate(rewards) if reward)
-        facts = {
-            "history": f"{e.history_id}, {e.layout} with {e.teammate_family}, {e.teammate_kind}",
-            "steps": f"{self.start:,} to {self.stop - 1:,} of the history",
-            "rewards": given or "none",
-            "return": f"{self.total_return:g}",
-        }
-        title = f"Episode {self.number} of history {e.history_id}"
-        return facts_html(title, facts, curve_svg({"return": np.cumsum(rewards)}, "step"))
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name == "episode_end_state":

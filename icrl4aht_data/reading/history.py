@@ -13,12 +13,12 @@ from icrl4aht_data.errors import LabelsMissingError, NotStoredError, OptionError
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
 from icrl4aht_data.overcooked.channels import Channels, observation_shape, to_canonical
 from icrl4aht_data.overcooked.fast_observe import fast_observe
-from icrl4aht_data.plotting import Picture, animate_episode, curve_svg, plot_history
+from icrl4aht_data.plotting import Picture, animate_episode, plot_history
 from icrl4aht_data.reading.episodes import Episodes, FieldArrays
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.system import new_array
-from icrl4aht_data.utils.text import counted_noun, facts_html
+from icrl4aht_data.utils.text import counted_noun
 
 Obs = Literal["float32", "uint8", "state"]
 OBS: tuple[Obs, ...] = ("float32", "uint8", "state")
@@ -70,21 +70,6 @@ class History(FieldArrays):
             + f", source {e.source}"
             + (f", learner {e.learner})" if e.learner else ")")
         )
-
-    def _repr_html_(self) -> str:
-        """Return the history's facts and learning curve as HTML, for notebooks."""
-        e = self.entry
-        facts = {
-            "layout": f"{e.layout}, {e.split}",
-            "teammate": f"{e.teammate_family}, {e.teammate_kind}",
-            "source": e.source + (f", learner {e.learner}" if e.learner else ""),
-            "length": f"{counted_noun(e.T, 'step')}, {counted_noun(e.episodes, 'episode')}",
-            "return": f"{e.return_start:.1f} to {e.return_end:.1f}",
-            "labels": ", ".join(name for name in LABELS if e.has(FIELDS[f"{name}_actions"])) or "none",
-            "expert return": "unknown" if e.expert_return is None else f"{e.expert_return:.1f}",
-            "task": e.task_id,
-        }
-        return facts_html(f"History {e.history_id}", facts, curve_svg({e.source: self.returns()}))
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self, overload
 
+import msgspec
 import numpy as np
 
 from icrl4aht_data.errors import (
@@ -24,7 +25,6 @@ from icrl4aht_data.format.provenance import ProvenanceByTask, read_provenance
 from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, PROVENANCE, Entry
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.reading.filters import learner_numbers, passing
 from icrl4aht_data.reading.history import LABELS, OBS, History, Labels, Obs
 from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.reading.sources import (
@@ -277,25 +277,14 @@ class Selection:
     def to_pandas(self) -> pandas.DataFrame:
         """Return the index entries as a data frame with one row per history and the columns of `Entry`.
 
-        Text columns are categories, integer columns with unknown values `Int64`; unknown floats are NaN.
+        Integer columns with unknown values are `Int64`; unknown floats are NaN.
 
         Raises:
             OptionError: if pandas is not installed.
         """
         pandas = import_optional("pandas", "a data frame")
-        columns: dict[str, Any] = {}
-        for name, hint in ENTRY_HINTS.items():
-            if hint is str:
-                codes, names = self.column_codes(name), pandas.Index(self.index.values(name))
-                columns[name] = pandas.Categorical.from_codes(codes, names).remove_unused_categories()
-            elif hint == int | None:
-                numbers = self.column(name)  # columns are of int64, in which -1 stands for None
-                columns[name] = pandas.arrays.IntegerArray(numbers, numbers == -1)
-            elif name == "obs_shape":
-                columns[name] = list(map(tuple, self.column(name).tolist()))
-            else:
-                columns[name] = self.column(name)
-        return pandas.DataFrame(columns)
+        frame = pandas.DataFrame([msgspec.structs.asdict(entry) for entry in self.entries])
+        return frame.astype({name: "Int64" for name, hint in ENTRY_HINTS.items() if hint == int | None})
 
     @cached_property
     def layouts(self) -> list[Layout]:
@@ -387,23 +376,33 @@ class Selection:
                 one value, several values, or None for any, as in `load_icrl4aht`.
 
         Raises:
-            UnknownNameError: for a field or value that does not exist, also in `predicate`.
+            UnknownNameError: for a field or value that does not exist.
             EmptySelectionError: if no history is left.
-            OptionError: if `predicate` is not a function that returns a bool, `min_expert_return` not a number, or
-                `learner` not an integer or several.
+            OptionError: if `predicate` is not a function, or `min_expert_return` not a number.
             NotStoredError: for `min_expert_return`, if the expert return of a remaining history is unknown.
         """
         # The index answers for the release; isin keeps the order of this selection, and repeated histories.
         found = self._keep(np.isin(self.ids, self.index.query(**wanted)), f"has {wanted}")
         if learner is not None:
-            learners, numbers = found.column("learner"), learner_numbers(learner)
+            learners = found.column("learner")
             known = ", ".join(map(str, np.unique(learners).tolist()))
-            found = found._keep(np.isin(learners, numbers), f"has learner = {learner!r}; its learners: {known}")
+            found = found._keep(np.isin(learners, learner), f"has learner = {learner!r}; its learners: {known}")
         if min_expert_return is not None:
-            least, returns = check_number("min_expert_return", min_expert_return), found._expert_returns()
+            least, returns = check_number("min_expert_return", min_expert_return), found.column("expert_return")
+            if np.isnan(returns).any():
+                raise NotStoredError(
+                    f"min_expert_return: {self.origin} does not say what the policies behind the labels of "
+                    f"{np.isnan(returns).sum()} of {len(found)} histories earn; leave them out by "
+                    f'ds.select(~np.isnan(ds.column("expert_return")))'
+                )
             found = found._keep(returns >= least, f"has expert_return >= {least:g}; the highest is {returns.max():g}")
         if predicate is not None:
-            kept = passing(predicate, map(self.index.entry, found.ids.tolist()))
+            if not callable(predicate):
+                raise OptionError(
+                    f"filter: expected a function of an index entry, such as lambda entry: entry.return_end > 30, "
+                    f"found {predicate!r}; values have names: filter(layout={str(predicate)!r})"
+                )
+            kept = np.array([bool(predicate(entry)) for entry in found.entries])
             found = found._keep(kept, "passes the function")
         return found
 
@@ -416,25 +415,6 @@ class Selection:
         if not kept.any():
             raise EmptySelectionError(f"{self.root}: no history of this selection {condition}; it is {self!r}")
         return self.select(kept)
-
-    def _expert_returns(self) -> np.ndarray:
-        """Return the expert return of each history, float64 (H,).
-
-        Raises:
-            NotStoredError: if some of them are unknown.
-        """
-        returns = self.column("expert_return")
-        absent = np.isnan(returns)
-        if absent.any():
-            tasks = np.unique(self.column("task_id")[absent])
-            known = 'ds.select(~np.isnan(ds.column("expert_return")))'
-            raise NotStoredError(
-                f"min_expert_return: {self.origin} does not say what the policies behind the labels of "
-                f"{int(absent.sum())} of {len(self)} histories earn (first task: {tasks[0]}), as releases "
-                f"converted from published files. Leave out min_expert_return"
-                + ("" if absent.all() else f", or take the histories where it is known: {known}")
-            )
-        return returns
 
     def select(self, ids: Sequence[int] | np.ndarray) -> Self:
         """Return the histories of this selection with these ids, in this order.

@@ -208,8 +208,7 @@ class Shard:
             raise self._unreadable(error) from error
         except ValueError as error:
             raise ShardCorruptError(
-                f"{self.path}: {self.describe(row)}: {error}; the file is damaged: `icrl4aht-data verify --repair` "
-                f"fetches it again"
+                f"{self.path}: {self.describe(row)}: {error}; the file is damaged: `icrl4aht-data download` replaces it"
             ) from error
         return data
 

@@ -133,7 +133,6 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
     ) -> None:
         super().__init__(dataset, batch_size=batch_size, length=length, **options)
         self.every = check_int("every", every, 1)
-        self.drawn_bytes = 32 if every > 1 else 0  # bytes per step of the four int64 arrays that `_draw` makes
         self.families, self.labels = families, labels
         if labels is not None:
             check_labels(dataset, labels)
@@ -167,12 +166,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         return np.array([families.index(str(name)) for name in self.dataset.column("teammate_family")], np.int32)
 
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the windows of batch i: history ids and first steps, int64 (B,) each.
-
-        Raises:
-            OptionError: if the batch is larger than the free memory.
-        """
-        self._check_memory()
+        """Return the windows of batch i: history ids and first steps, int64 (B,) each."""
         drawn = self._draw(i)
         return self.dataset.ids[drawn.position].astype(np.int64), drawn.starts
 

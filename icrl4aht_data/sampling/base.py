@@ -17,7 +17,7 @@ from icrl4aht_data.sampling.batches import Batches
 from icrl4aht_data.sampling.draws import Curriculum, EpisodeRange, HistoryDraws, Weights, random_uint32
 from icrl4aht_data.sampling.observer import ArraySpec, Observer
 from icrl4aht_data.utils.options import check_int
-from icrl4aht_data.utils.system import array_bytes, fits, free_memory, gigabytes
+from icrl4aht_data.utils.system import new_array
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 B = TypeVar("B", bound=tuple)
@@ -61,8 +61,6 @@ class Sampler(Generic[B, D, T]):
     batch_type: type[B]
     length_option = "length"
     """Name of the option that sets `length`, for messages."""
-    drawn_bytes = 0
-    """Bytes of temporary memory per step of a batch while drawing."""
 
     def __init__(
         self,
@@ -130,13 +128,11 @@ class Sampler(Generic[B, D, T]):
         """Return a batch of uninitialised arrays to pass to `batch` as `out`: reusing memory is faster.
 
         Raises:
-            OptionError: if it is larger than the free memory.
+            OptionError: if one of them is larger than the free memory.
         """
-        self._check_memory()
-        try:
-            return self.batch_type(**{name: np.empty(spec.shape, spec.dtype) for name, spec in self.specs.items()})
-        except MemoryError as error:  # the process has a memory limit, or memory was taken since the check
-            raise self._too_large() from error
+        what = f"batch_size = {self.batch_size}, {self.length_option} = {self.length}: "
+        arrays = {name: new_array(spec.shape, spec.dtype, what + name) for name, spec in self.specs.items()}
+        return self.batch_type(**arrays)
 
     @overload
     def batches(
@@ -174,36 +170,6 @@ class Sampler(Generic[B, D, T]):
         first = self.process_index * self.local_size
         return random_uint32(self.seed, i, count, self.batch_size)[:, first : first + self.local_size]
 
-    @cached_property
-    def _bytes(self) -> int:
-        """Bytes of memory needed to make a batch: its arrays, the records rendered into them, and the draws."""
-        arrays = sum(array_bytes(spec.shape, spec.dtype) for spec in self.specs.values())
-        records = sum(self._observer.record_bytes(spec.shape) for spec in self.specs.values() if len(spec.shape) > 3)
-        return arrays + records + self.drawn_bytes * self.local_size * self.length
-
-    def _check_memory(self) -> None:
-        """Check that a batch fits into memory.
-
-        Raises:
-            OptionError: see `_too_large`.
-        """
-        if not fits(self._bytes):
-            raise self._too_large()
-
-    def _too_large(self) -> OptionError:
-        """Return the error for batches that do not fit into memory: the sizes, and the options that change them."""
-        free, rows = free_memory(), self.local_size
-        # The largest array tells which option to change: observations in float32 nearly always.
-        name, spec = max(self.specs.items(), key=lambda item: array_bytes(item[1].shape, item[1].dtype))
-        most = free * rows // self._bytes // 2 * self.process_count  # half of it, because the next batch is prefetched
-        advice = f"take batch_size = {most} or less" if most else f"take a smaller {self.length_option}"
-        lighter = ', or obs = "uint8" or "state"' if self.dataset.obs == "float32" else ""
-        return OptionError(
-            f"batch_size = {self.batch_size}, {self.length_option} = {self.length}: a batch takes "
-            f"{gigabytes(self._bytes)} of memory ({name} {spec.dtype} {spec.shape} "
-            f"{gigabytes(array_bytes(spec.shape, spec.dtype))}), but {gigabytes(free)} are free: {advice}{lighter}"
-        )
-
     def _layout_specs(self) -> dict[str, ArraySpec]:
         """Return the spec of the field `layouts`, present in batches of state records of several layouts."""
         several = self.dataset.obs == "state" and len(self.layouts) > 1
@@ -221,9 +187,7 @@ class Sampler(Generic[B, D, T]):
                 raise OptionError("out: expected writeable, C-contiguous arrays; take a batch from sampler.empty()")
         found = {name: ArraySpec(str(array.dtype), array.shape) for name, array in arrays.items()}
         if found != self.specs:
-            names = [name for name in found.keys() | self.specs.keys() if found.get(name) != self.specs.get(name)]
-            wrong = {name: (self.specs.get(name), found.get(name)) for name in names}
-            raise OptionError(f"out: expected and found (dtype, shape): {wrong}; take a batch from sampler.empty()")
+            raise OptionError(f"out: expected {self.specs}, found {found}; take a batch from sampler.empty()")
         return out
 
 

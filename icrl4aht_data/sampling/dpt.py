@@ -112,7 +112,6 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
     """
 
     batch_type, length_option = DPTBatch, "context"
-    drawn_bytes = 48  # temporary bytes per transition: six int64 numbers (draws, steps, rows, episodes)
 
     def __init__(
         self,

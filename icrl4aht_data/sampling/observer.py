@@ -63,10 +63,6 @@ class Observer:
             return ArraySpec("uint8", (*shape, *self._record_shape))
         return ArraySpec(self._selection.obs, (*shape, *self._shape))
 
-    def record_bytes(self, shape: tuple[int, ...]) -> int:
-        """Return the size in bytes of the array from `records` for observations (..., 5, 5, C)."""
-        return math.prod((*shape[:-3], *self._record_shape)) if self._renders else 0
-
     def records(self, out: np.ndarray) -> np.ndarray:
         """Return the array to read records of observations into: uint8 (..., *R), or `out` if nothing is rendered."""
         return np.empty((*out.shape[:-3], *self._record_shape), np.uint8) if self._renders else out

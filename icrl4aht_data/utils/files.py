@@ -116,11 +116,6 @@ def json_hash(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def has_content(path: Path, content: bytes) -> bool:
-    """Return whether a file exists with exactly this content."""
-    return path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content
-
-
 @contextmanager
 def add_filename(path: Path) -> Iterator[None]:
     """Add the file's name to an OSError without one, which operations on open files raise."""
@@ -152,19 +147,13 @@ def allocate(stream: BinaryIO, size: int) -> None:
 
 
 def sync(path: Path) -> None:
-    """Wait until the content of a file or the entries of a folder are on the disk.
+    """Wait until the content of a file is on the disk.
 
     Raises:
-        OSError: if they cannot be written.
+        OSError: if it cannot be written.
     """
-    if path.is_dir() and os.name == "nt":  # Windows cannot open folders
-        return
-    number = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    try:
-        with add_filename(path):
-            os.fsync(number)
-    finally:
-        os.close(number)
+    with add_filename(path), path.open("r+b") as stream:
+        os.fsync(stream.fileno())
 
 
 def final_name(name: str) -> str:

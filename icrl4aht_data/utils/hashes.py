@@ -13,6 +13,11 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def short_hash(data: bytes, digits: int = 16) -> str:
+    """Return the first hexadecimal digits of a text's SHA-256."""
+    return hashlib.sha256(data).hexdigest()[:digits]
+
+
 def git_hash(content: bytes) -> str:
     """Return Git's blob hash of a file, hexadecimal, by which the Hub identifies small files."""
     return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()

@@ -22,10 +22,7 @@ from numpy.typing import DTypeLike
 from icrl4aht_data.errors import OptionError
 
 _PLENTY = 2**29  # bytes; smaller arrays are allocated without a check
-_CGROUPS = (  # limit and use of a control group, versions 2 and 1
-    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-)
+_CGROUP = Path("/sys/fs/cgroup")
 
 
 def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray:
@@ -34,21 +31,13 @@ def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray
     Raises:
         OptionError: if memory is short; with the array's name and size.
     """
-    size = array_bytes(shape, dtype)
-    if fits(size):
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    if size < _PLENTY or size <= free_memory():
         with suppress(MemoryError):
             return np.empty(shape, dtype)
-    raise OptionError(f"{what}: takes {gigabytes(size)} of memory, more than is free: read fewer steps at a time")
-
-
-def array_bytes(shape: tuple[int, ...], dtype: DTypeLike) -> int:
-    """Return the size of an array in bytes."""
-    return math.prod(shape) * np.dtype(dtype).itemsize
-
-
-def fits(size: int) -> bool:
-    """Return whether so much memory is free; True without a check for small sizes."""
-    return size < _PLENTY or size <= free_memory()
+    raise OptionError(
+        f"{what}: takes {gigabytes(size)} of memory, more than is free: read fewer steps, or take a smaller batch"
+    )
 
 
 def gigabytes(size: int) -> str:
@@ -58,22 +47,14 @@ def gigabytes(size: int) -> str:
 
 
 def free_memory() -> int:
-    """Return the bytes that this process can still allocate, by the machine's, control group's and process's limits."""
+    """Return the bytes that this process can still allocate, by the machine's and the control group's limits."""
     free = []
     with suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 free.append(int(line.split()[1]) * 1024)
-    for limit, used in _CGROUPS:
-        with suppress(OSError, ValueError):  # the control group is missing, or its limit is "max"
-            free.append(int(Path(limit).read_text()) - int(Path(used).read_text()))
-    with suppress(ImportError, OSError, ValueError):  # Windows has no process limits
-        import resource
-
-        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-        if limit != resource.RLIM_INFINITY:
-            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-            free.append(limit - pages * resource.getpagesize())
+    with suppress(OSError, ValueError):  # the control group is missing, or its limit is "max"
+        free.append(int((_CGROUP / "memory.max").read_text()) - int((_CGROUP / "memory.current").read_text()))
     if free:
         return max(0, min(free))
     try:  # not Linux: half of the machine's memory

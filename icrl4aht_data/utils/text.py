@@ -1,9 +1,8 @@
-"""Formatting of numbers with nouns, and of HTML tables for notebooks."""
+"""Formatting of numbers with nouns, and of lists of names."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from html import escape
+from collections.abc import Sequence
 
 
 def counted_noun(number: int, noun: str, plural: str | None = None) -> str:
@@ -24,27 +23,3 @@ def listed_names(names: Sequence[str]) -> str:
     if len(names) <= _LISTED:
         return ", ".join(names)
     return f"{', '.join(names[: _LISTED - 1])} and {len(names) - _LISTED + 1} others"
-
-
-_WIDEST = 840  # pixels
-
-
-def facts_html(title: str, facts: Mapping[str, str], figure: str = "") -> str:
-    """Return a title, a figure and a table of facts as HTML.
-
-    Args:
-        title: text of the first line.
-        facts: name -> value, one table row each.
-        figure: HTML between the title and the table, for example from `plotting.curve_svg`.
-    """
-    cell = "text-align:left;vertical-align:top;padding:1px 12px 1px 0"
-    table = "margin:4px 0;table-layout:auto"  # notebooks centre tables by default
-    rows = "".join(
-        f'<tr><th scope="row" style="{cell};white-space:nowrap">{escape(name)}</th>'
-        f'<td style="{cell}">{escape(value)}</td></tr>'
-        for name, value in facts.items()
-    )
-    return (
-        f'<div style="max-width:{_WIDEST}px"><strong>{escape(title)}</strong>{figure}'
-        f'<table style="{table}">{rows}</table></div>'
-    )

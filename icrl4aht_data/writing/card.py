@@ -26,7 +26,7 @@ from icrl4aht_data.benchmark.facts import (
     family_order,
     track_of,
 )
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_headroom
+from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headroom
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import ReleaseInfo
@@ -52,14 +52,10 @@ from icrl4aht_data.utils.text import counted_noun
 HEADROOM_PROTOCOL = "published"
 """Evaluation protocol of the headroom shown in cards, which is the paper's."""
 
-CURVES_FIGURE, LAYOUTS_FIGURE, HEADROOM_FIGURE = (
-    f"figures/{name}.png" for name in ("learning_curves", "layouts", "headroom")
-)
+CURVES_FIGURE, LAYOUTS_FIGURE = (f"figures/{name}.png" for name in ("learning_curves", "layouts"))
 """Paths of the figures of a release built for publication."""
 
-_LEAST_RISE, _CLEAR_RISE = 5.0, 10  # thresholds of the rise of returns: a quarter and half of a delivery
-_SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
-_NO_SHARED_ROOM = ("coord_simple", "test_simple")
+_LEAST_RISE = 5.0  # a quarter of a delivery
 _SCHEDULE = {"histories", "episodes", "start", "end", "begin", "finish", "power"}
 
 
@@ -88,7 +84,7 @@ def write_card(root: Path) -> None:
     """
     content = facts(root)
     (root / RELEASE_CARD).write_text(render_card(content), encoding="utf-8")
-    write_json(root / CARD_TABLES, {name: content[name] for name in ("learning", "teammates", "labels", "left_out")})
+    write_json(root / CARD_TABLES, {name: content[name] for name in ("learning", "teammates", "left_out")})
 
 
 def render_card(content: Mapping[str, Any]) -> str:
@@ -117,14 +113,6 @@ def evaluated_on(layouts: Iterable[str]) -> list[str]:
     return tested
 
 
-def size_category(rows: int) -> str:
-    """Return the Hub's size category of a number of rows: n<1K, 1K<n<10K, ..., n>1T."""
-    number = len(str(rows)) - len("1000")
-    if number < 0:
-        return f"n<{_SIZES[0]}"
-    return f"{_SIZES[number]}<n<{_SIZES[number + 1]}" if number < len(_SIZES) - 1 else f"n>{_SIZES[-1]}"
-
-
 @dataclass(frozen=True)
 class _TaskFacts:
     """One task of a release with its histories and provenance."""
@@ -144,18 +132,8 @@ class _TaskFacts:
         return _mean(entry.return_end for entry in self.histories)
 
     @property
-    def rise(self) -> float:
-        """Mean difference between the returns of the last and the first episodes."""
-        return _mean(entry.return_end - entry.return_start for entry in self.histories)
-
-    @property
     def has_weak_labels(self) -> bool:
         return bool(are_labels_weak(self.first.expert_return, self.last))
-
-    @property
-    def has_weak_oracle(self) -> bool:
-        known = self.made.references if self.first.has(FIELDS["oracle_actions"]) else None
-        return known is not None and bool(are_labels_weak(known.oracle, self.last))
 
 
 def facts(root: Path) -> dict[str, Any]:
@@ -186,7 +164,6 @@ def facts(root: Path) -> dict[str, Any]:
     return {
         "info": info,
         "files": files,
-        "size": size_category(info.transitions),
         "configs": _viewer_configs(entries, files),
         "has_states": info.kind in KINDS,
         "tasks": len(tasks),
@@ -198,32 +175,16 @@ def facts(root: Path) -> dict[str, Any]:
         "example": {"split": first.split, "layout": first.layout, "length": length},
         "layouts": _layouts(info, matters),
         "learning": _learning(tasks, "layout", "source", "split"),
-        "learning_by_layout": _learning(tasks, "layout", "source"),
-        "learning_totals": {
-            title: _learning([task for task in tasks if task.first.layout in names], "source")
-            for title, names in _headroom_groups(headroom, info).items()
-        },
         "teammates": teammates,
-        **_behaviours(teammates),
-        "labels": _labels(tasks),
-        "weak": _counts(task for task in tasks if task.has_weak_labels),
-        "weak_oracle": _counts(task for task in tasks if task.has_weak_oracle),
+        "weak": Counter((task.first.layout, task.first.source) for task in tasks if task.has_weak_labels),
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,
-        "test_layouts": tested,
-        "test_headroom": _test_headroom(tested),
-        "splits": _splits(tasks),
-        "arrays": _arrays(info),
-        "no_shared_room": [name for name in _NO_SHARED_ROOM if name in info.layouts],
-        "flat": [
-            f"{task.first.layout} with {task.name} ({task.first.source}, {task.rise:z.1f})"
-            for task in tasks
-            if headroom.get(task.first.layout) and task.rise < _CLEAR_RISE
-        ],
+        "test_headroom": headroom_table(read_headroom(HEADROOM_PROTOCOL), tested),
+        "arrays": [name for name, array in FIELDS.items() if info.kind not in array.absent or name == "obs"],
         **_known_families(tasks),
-        **_populations(tasks, info),
+        "suites": _distinct(tasks, "suite"),
         **_making(tasks),
-        "least": {"rise": _LEAST_RISE, "clear_rise": _CLEAR_RISE, "headroom": LEAST_HEADROOM, "same": SAME_BEHAVIOUR},
+        "least": {"rise": _LEAST_RISE, "headroom": LEAST_HEADROOM, "same": SAME_BEHAVIOUR},
         "texts": {section: card_texts(section) for section in ("sources", "kinds", "arrays")},
         "paper": {"ego": PAPER_EGO_STEPS, "teammate": PAPER_TEAMMATE_STEPS, "teammates": PAPER_TEAMMATES * 4},
         "citation": card_file("citation.bib").read_text(encoding="utf-8").strip(),
@@ -270,11 +231,7 @@ def _learning(tasks: Iterable[_TaskFacts], *names: str) -> list[dict[str, Any]]:
         entries = [entry for task in own for entry in task.histories]
         before = [task.made.filter.before.return_end for task in own if task.made.filter]
         row = dict(zip(names, key, strict=True)) | {
-            "teammates": sorted({entry.teammate_family for entry in entries}, key=_learned_last),
-            "tasks": len(own),
-            "learners": len({(entry.task_id, entry.learner) for entry in entries if entry.source == "ppo"}),
             "histories": len(entries),
-            "transitions": sum(entry.T for entry in entries),
             "first": _mean(entry.return_start for entry in entries),
             "last": _mean(entry.return_end for entry in entries),
             "last_before_filter": _mean(before) if len(before) == len(own) else None,
@@ -316,61 +273,6 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
     return sorted(rows, key=lambda row: (order[row["layout"]], order[row["split"]], _learned_last(row["family"])))
 
 
-def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the numbers of teammates with known behaviour and of distinct behaviours, by split."""
-    found = defaultdict[str, list[tuple[Any, ...]]](list)
-    for row in teammates:
-        if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None:
-            found[row["split"]].append((row["layout"], row["family"], row["nearest_test"]["behaviour"]))
-    counts = {split: (len(found[split]), len(set(found[split]))) for split in SPLITS if split in found}
-    shared = set(found.get("train", ())) & set(found.get("validation", ()))
-    return {"behaviours": counts, "shared_behaviours": len(shared)}
-
-
-def _labels(tasks: Iterable[_TaskFacts]) -> list[dict[str, Any]]:
-    """Return one row per task with the measured returns of its expert."""
-    return [
-        {
-            **{name: getattr(task.first, name) for name in ("task_id", "layout", "source", "split")},
-            "teammate": task.name,
-            "step": task.first.expert_step,
-            "greedy": task.first.expert_return,
-            "sampled": task.first.expert_return_sampled,
-            "last": task.last,
-            "weak": task.has_weak_labels,
-            "weak_oracle": task.has_weak_oracle,
-        }
-        for task in tasks
-        if task.first.expert_return is not None
-    ]
-
-
-def _test_headroom(layouts: Sequence[str]) -> list[list[str]]:
-    """Return the rows of the card's headroom table: returns of the oracle minus those of `stay`, bold with headroom."""
-    cells, rows = read_headroom(HEADROOM_PROTOCOL), []
-    for family in HEURISTICS:
-        known = [cells.get((layout, family)) for layout in layouts]
-        gains = ["" if found is None else f"{found['oracle'] - found['stay']:z.1f}" for found in known]
-        bold = [found is not None and has_headroom(found) for found in known]
-        rows.append([family, *(f"**{gain}**" if mark else gain for gain, mark in zip(gains, bold, strict=True))])
-    return rows
-
-
-def _headroom_groups(headroom: Mapping[str, bool], info: ReleaseInfo) -> dict[str, list[str]]:
-    """Return title -> layouts, for the rows of totals; one group "all" if the headroom of a layout is unknown."""
-    if len(headroom) < len(info.layouts):
-        return {"all": list(info.layouts)}
-    groups: dict[str, list[str]] = {}
-    for layout in sorted(headroom, key=lambda layout: not headroom[layout]):
-        groups.setdefault("with headroom" if headroom[layout] else "without headroom", []).append(layout)
-    return groups
-
-
-def _counts(tasks: Iterable[_TaskFacts]) -> dict[tuple[str, str], int]:
-    """Return the number of tasks of each layout and source."""
-    return Counter((task.first.layout, task.first.source) for task in tasks)
-
-
 def _layouts(info: ReleaseInfo, matters: Mapping[str, Sequence[bool]]) -> list[list[str]]:
     """Return the rows of the card's table of layouts; `matters` says of each teammate whether the ego matters."""
     rows = []
@@ -379,29 +281,6 @@ def _layouts(info: ReleaseInfo, matters: Mapping[str, Sequence[bool]]) -> list[l
         row = [name, f"`{layout.alias}`", f"{layout.width} x {layout.height}", str(layout.obs_shape[-1])]
         row += [f"{found.histories:,}", f"{found.transitions:,}", f"{found.mean_final_return:z.1f}"]
         rows.append([*row, f"{sum(known)} of {len(known)}" if known else "unknown"])
-    return rows
-
-
-def _splits(tasks: Iterable[_TaskFacts]) -> list[list[str]]:
-    """Return the rows of the card's table of splits."""
-    rows = []
-    for (track, split), own in _grouped(tasks, "track", "split").items():
-        histories = [entry for task in own for entry in task.histories]
-        counts = len(own), len(histories), sum(entry.T for entry in histories)
-        layouts = ", ".join(dict.fromkeys(task.first.layout for task in own))
-        rows.append([track, split, layouts, *(f"{count:,}" for count in counts)])
-    return rows
-
-
-def _arrays(info: ReleaseInfo) -> list[list[str]]:
-    """Return the rows of the card's table of arrays."""
-    layout, shapes, rows = get_layout(next(iter(info.layouts))), {"scalar": ",", "state": ", S", "obs": ", 5, 5, C"}, []
-    for name, array in FIELDS.items():
-        is_stored = info.kind not in array.absent
-        if is_stored or name == "obs":
-            stored = str(array.element(layout, info.kind).base) if is_stored else "rendered"
-            shape = f"({array.axis}{shapes[array.row]})"
-            rows.append([f"`{name}`", shape, array.dtype, stored, card_texts("arrays")[name]])
     return rows
 
 
@@ -434,55 +313,20 @@ def _distinct(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
     return [found[text] for text in sorted(found)]
 
 
-def _populations(tasks: Sequence[_TaskFacts], info: ReleaseInfo) -> dict[str, Any]:
-    """Return facts on the training of learned teammates, and the layouts with none or fewer than planned."""
-    own = {task.task.teammate_key: task.first for task in tasks if task.task and task.first.split == "train"}
-    found = Counter((entry.layout, entry.teammate_kind) for entry in own.values())
-    wanted: Counter[tuple[str, str]] = Counter()
-    suites: dict[tuple[int, int, float], dict[str, list[str]]] = {}
-    for suite in _distinct(tasks, "suite"):
-        for layout, names in suite.algorithms.items():
-            wanted |= Counter({(layout, name): suite.train for name in names})
-            populations = suites.setdefault((suite.members, suite.total_steps, suite.threshold), {})
-            populations.setdefault(", ".join(names), []).append(layout)
-    learned = {layout for layout, _ in wanted}
-    return {
-        "suites": suites,
-        "no_learned": [layout for layout in info.layouts if wanted and layout not in learned],
-        "few_learned": [
-            f"{algorithm} on {layout} ({found[layout, algorithm]} of {count})"
-            for (layout, algorithm), count in wanted.items()
-            if layout in info.layouts and found[layout, algorithm] < count
-        ],
-        "teammate_steps": sorted({steps for _, steps, _ in suites}),
-    }
-
-
 def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
-    """Return facts on the generation of histories: learners, kept streams, noise schedules, experts, versions."""
-    streams: dict[tuple[int, float | None], list[int]] = {}
-    for made in (task.made for task in tasks):
-        if made.filter and made.streams_kept:
-            key = made.streams_recorded or 0, made.filter.least_improvement
-            streams.setdefault(key, []).append(made.streams_kept)
+    """Return facts on the generation of histories: egos, kept streams, noise schedules, versions."""
     noise = {json.dumps([task.made.source, task.made.noise]): task.made for task in tasks if task.made.noise}
-    experts = [task.made.expert for task in tasks if task.made.expert is not None]
-    measured = [
-        expert
-        for expert in experts
-        if expert.policy_sha256 and None not in (expert.return_greedy, expert.last_return_greedy)
-    ]
     labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
     versions = {label: ", ".join(map(str, _distinct(tasks, name))) for name, label in labels.items()}
     return {
         "egos": _distinct(tasks, "ego"),
-        "ego_steps": sorted({ego["total_steps"] for ego in _distinct(tasks, "ego")}),
         "learners": [task.made.learners or 1 for task in tasks if task.made.ego],
-        "streams": streams,
+        "streams": {
+            (made.streams_recorded or 0, made.streams_kept, made.filter.least_improvement): None
+            for made in (task.made for task in tasks)
+            if made.filter and made.streams_kept
+        },
         "schedules": [made for made in noise.values() if (made.noise or {}).keys() >= _SCHEDULE],
-        "student_labels": {t.made.expert.action for t in tasks if t.made.source == "student" and t.made.expert},
-        "policies": sum(expert.policy_sha256 is not None for expert in experts),
-        "measured": len(measured),
-        "earlier": sum(expert.return_greedy != expert.last_return_greedy for expert in measured),
+        "has_policies": any(task.made.expert and task.made.expert.policy_sha256 for task in tasks),
         "versions": "; ".join(f"{label} {values}" for label, values in versions.items() if values),
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
@@ -11,17 +10,11 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import check_version
-from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import MANIFEST, PROVENANCE, RELEASE_CARD, SOURCE_CARD
-from icrl4aht_data.utils.files import read_text
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.writing.release import NewTask, write_release
 from icrl4aht_data.writing.release_folder import as_path, check_target
 from icrl4aht_data.writing.stored import release_tasks, stored_task
-
-_OF_ONE_RELEASE = re.compile(r"\A---\n(?s:.*?)\n---\n|^!\[.*\n\n?", re.MULTILINE)
-"""YAML front matter and pictures of a card, which do not work in a combined one."""
 
 
 def combine_releases(
@@ -66,7 +59,6 @@ def combine_releases(
         first.kind,
         tasks,
         data_version=data_version,
-        source_card=_source_card(datasets),
         kept_steps=first.environment.kept_steps,
         left_out=[task for task in left_out if task.task_id not in written],
         overwrite=overwrite,
@@ -87,36 +79,18 @@ def _check_compatible(datasets: Sequence[Dataset]) -> None:
 
 
 def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
-    owners: dict[str, tuple[str, str]] = {}
+    owners: dict[str, Dataset] = {}
     tasks = []
     for dataset in datasets:
         provenance = read_provenance(dataset.origin.file(PROVENANCE))
         for task in release_tasks(dataset):
             histories = dataset.select(dataset.index.query(task_id=task.task_id))
-            source, (owner, other) = histories[0].entry.source, owners.get(task.task_id, ("", ""))
-            if other not in ("", source):
+            owner = owners.setdefault(task.task_id, dataset)
+            if owner is not dataset:
                 raise OptionError(
-                    f"{dataset.origin}: task {task.task_id} is of source {source!r}, but in {owner} of {other!r}: a "
-                    f"task has one source; leave one of them out, or generate it with another seed"
+                    f"{dataset.origin}: task {task.task_id} is also in {owner.origin}; leave one of them out, or "
+                    f"generate it with another seed"
                 )
-            if owner:
-                raise OptionError(f"{dataset.origin}: task {task.task_id} is also in {owner}; leave one of them out")
-            owners[task.task_id] = str(dataset.origin), source
             made = provenance.get(task.task_id, Provenance())
             tasks.append(stored_task(histories, task, made, dataset.info.kind))
     return tasks
-
-
-def _source_card(datasets: Sequence[Dataset]) -> str:
-    """Return a card that lists the releases with the hashes of their manifests, followed by their cards."""
-    parts, cards = [], []
-    for dataset in datasets:
-        listed = read_manifest(dataset.root)  # before hashing: refuses a manifest that is a pipe or too large
-        parts.append(
-            f"* {dataset.root.name}: data version {dataset.info.data_version}, {len(dataset):,} histories, "
-            f"SHA-256 of its manifest {file_hash(dataset.root / MANIFEST)}\n"
-        )
-        names = [RELEASE_CARD] + [name for name in listed if name == SOURCE_CARD]
-        cards += [_OF_ONE_RELEASE.sub("", read_text(dataset.origin.file(name))) for name in names]
-    heading = "# ICRL4AHT learning histories, combined\n\nMade of these releases. Their cards follow.\n\n"
-    return f"{heading}{''.join(parts)}\n" + "\n".join(cards)

@@ -6,10 +6,8 @@ from pathlib import Path
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, PROVENANCE, SOURCE_CARD, Kind
-from icrl4aht_data.utils.files import read_text
+from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, PROVENANCE, Kind
 from icrl4aht_data.writing.release import write_release
 from icrl4aht_data.writing.release_folder import as_path, check_target
 from icrl4aht_data.writing.stored import HistoryProgress, release_tasks, stored_task
@@ -48,7 +46,6 @@ def to_release(
     by_task: dict[str, list[int]] = {}
     for entry in dataset.entries:
         by_task.setdefault(entry.task_id, []).append(entry.history_id)
-    listed = read_manifest(dataset.root)
     numbers = iter(range(1, len(dataset) + 1))
 
     def done() -> None:
@@ -62,7 +59,6 @@ def to_release(
             for name, ids in by_task.items()
         ],
         data_version=dataset.info.data_version,
-        source_card=read_text(dataset.origin.file(SOURCE_CARD)) if SOURCE_CARD in listed else None,
         kept_steps=dataset.info.environment.kept_steps,
         left_out=[task for task in dataset.info.left_out if task.layout in {one.name for one in dataset.layouts}],
         overwrite=overwrite,

@@ -34,7 +34,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
-from icrl4aht_data.writing.stored import HistoryProgress, with_source
+from icrl4aht_data.writing.stored import HistoryProgress
 
 _NAME = re.compile(r"[\w.-]+-v\d+")
 _INFOS = {name: name.removesuffix("s") for name in ACTION_FIELDS if name != "actions"}
@@ -114,9 +114,7 @@ def _describe(dataset: Dataset) -> dict[str, Any]:
         "data_version": dataset.info.data_version,
         "kept_steps": dataset.info.environment.kept_steps,
         "tasks": [asdict(dataset.history_task(entry.history_id)) for entry in first.values()],
-        "provenance": {
-            name: with_source(recorded.get(name, Provenance()), entry.source).to_json() for name, entry in first.items()
-        },
+        "provenance": {name: recorded.get(name, Provenance()).to_json() for name in first},
         "histories": [{name: getattr(entry, name) for name in names} for entry in dataset.entries],
     }
 

@@ -11,10 +11,9 @@ Files without states become a release of observations, because observations do n
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,7 +37,6 @@ from icrl4aht_data.format.schema import (
     Kind,
     episode_ends,
     held_fields,
-    record_field,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.fast_observe import fast_observe
@@ -49,7 +47,7 @@ from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_publish
 from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, as_path, atomic_folder, check_target
-from icrl4aht_data.writing.stored import HistoryProgress, with_source
+from icrl4aht_data.writing.stored import HistoryProgress
 
 PUBLISHED_CHUNK = 4096
 """Steps per chunk in the published files."""
@@ -85,9 +83,9 @@ def to_published(
     """
     target = as_path(target)
     kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
-    sources = {entry.task_id: entry.source for entry in dataset.entries}
+    names = {entry.task_id for entry in dataset.entries}
     recorded = read_provenance(dataset.origin.file(PROVENANCE))
-    provenance = {name: with_source(of_task, sources[name]) for name, of_task in recorded.items() if name in sources}
+    provenance = {name: of_task for name, of_task in recorded.items() if name in names}
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
         with _new_hdf5(folder / HISTORIES_H5) as new, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
@@ -98,7 +96,7 @@ def to_published(
                 line["env_idx"] += history.entry.learner * _streams_each(provenance.get(history.entry.task_id))
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
                 advance(number + 1, len(dataset))
-        tasks = [task for task in read_tasks(dataset.origin.file(TASKS)) if task.task_id in sources]
+        tasks = [task for task in read_tasks(dataset.origin.file(TASKS)) if task.task_id in names]
         if tasks:
             write_tasks(folder / "tasks.jsonl", tasks)
         write_json(folder / "provenance.json", {name: of_task.to_json() for name, of_task in provenance.items()})
@@ -161,8 +159,6 @@ def from_published(
     target: str | Path,
     kind: Kind | None = None,
     *,
-    tasks: Path | None = None,
-    family_map: Mapping[str, str] | None = None,
     data_version: str = "0.1.0",
     kept_steps: int = KEPT_STEPS,
     overwrite: bool = False,
@@ -171,13 +167,10 @@ def from_published(
     """Write a release from files of the published code.
 
     Args:
-        source: a folder with `histories.h5` and `histories_index.jsonl`.
+        source: a folder with `histories.h5` and `histories_index.jsonl`; and with the tasks of the index in
+            `tasks.jsonl`, without which only a release of observations can be made, which knows its tasks by name.
         target: the folder to write.
-        kind: kind of the release; by default "lite" if the groups have state records, else "observations".
-        tasks: a JSONL file with the tasks of the index; by default `tasks.jsonl` in `source`. Optional for a release of
-            observations, which then knows its tasks only by name.
-        family_map: `teammate_family` of the index -> family (rl, H1..H4) or kind of teammate, in addition to
-            `published_index.FAMILY_MAP`.
+        kind: kind of the release; by default "lite" if a group has state records, else "observations".
         data_version: version of the data, SemVer.
         kept_steps: steps of every episode; the last episode of a history may be unfinished.
         overwrite: replace a release at `target`.
@@ -189,11 +182,11 @@ def from_published(
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`.
         PublishedFormatError: if a file is missing or malformed, if a group lacks an array that the kind of release
-            needs, or if two histories have the same group, stream or content; with file and group.
+            needs, or if two histories have the same group or stream; with file and group.
     """
     kept_steps, source, target = check_int("kept_steps", kept_steps, 1), as_path(source), as_path(target)
     check_target(target, overwrite, [source])
-    lines = read_published_index(resolve_inside(source, HISTORIES_INDEX), family_map)
+    lines = read_published_index(resolve_inside(source, HISTORIES_INDEX))
     provenance_path = resolve_inside(source, "provenance.json")
     provenance = read_provenance(provenance_path) if provenance_path.is_file() else {}
     numbers = iter(range(1, len(lines) + 1))
@@ -202,19 +195,17 @@ def from_published(
         file = h5py.File(path, "r")
 
     def load(task: Task, groups: list[_PublishedHistory]) -> Iterator[NewHistory]:
-        seen: dict[bytes, _PublishedHistory] = {}
         made = provenance.get(task.task_id, Provenance())
         for group in groups:
             learner, stream = 0, group.line["env_idx"]
             if (made.learners or 1) > 1:
                 learner, stream = divmod(stream, _streams_each(made))
             yield NewHistory(stream, {name: group.read(name) for name in group.field_names()}, learner)
-            _check_content(group, seen)
             advance(next(numbers), len(lines))
 
     with file:
         present = [_stored_names(file, line["h5_group"]) for line in lines]
-        found: Kind = kind or _stored_kind(file, lines, present)
+        found: Kind = kind or ("lite" if any("state" in (names or ()) for names in present) else OBSERVATIONS)
         histories = [_PublishedHistory(file, line, found, kept_steps) for line in lines]
         for history, names in zip(histories, present, strict=True):
             history.check_arrays(names)
@@ -225,7 +216,7 @@ def from_published(
                 len(members),
                 lambda task=task, members=members: load(task, members),
             )
-            for task, members in _tasks(histories, source, tasks, found)
+            for task, members in _tasks(histories, source, found)
         ]
         write_release(
             target, found, new, data_version=data_version, kept_steps=kept_steps, overwrite=overwrite, sources=[source]
@@ -244,24 +235,13 @@ def _wrap_errors(what: str) -> Iterator[None]:
         raise PublishedFormatError(f"{what}: {error}") from error
 
 
-def _check_content(history: _PublishedHistory, seen: dict[bytes, _PublishedHistory]) -> None:
-    """Check that no earlier history of the task has the same content; `seen` maps hashes to the earlier ones."""
-    digest = hashlib.sha256(b"".join(history.read(name).tobytes() for name in ("actions", "rewards"))).digest()
-    other = seen.setdefault(digest, history)
-    record = record_field(history.kind).name
-    if other is not history and np.array_equal(other.read(record), history.read(record)):
-        raise PublishedFormatError(
-            f"{history.where}: has the content of group {other.line['h5_group']}, of the same task; leave one out"
-        )
-
-
 def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenance:
-    """Return provenance with notes about renamed teammates and padded views."""
-    notes = dict(history.line.get("published", {}))
-    if history.short and history.kind == OBSERVATIONS:
-        layout = get_layout(history.line["layout"])
-        notes |= {"obs_shape": history.line["obs_shape"], "padding": PADDING.format(rows=layout.height)}
-    return replace(provenance, other={**provenance.other, "published": notes}) if notes else provenance
+    """Return provenance with a note about padded views."""
+    if not (history.short and history.kind == OBSERVATIONS):
+        return provenance
+    rows = get_layout(history.line["layout"]).height
+    notes = {"obs_shape": history.line["obs_shape"], "padding": PADDING.format(rows=rows)}
+    return replace(provenance, other={**provenance.other, "published": notes})
 
 
 def _stored_names(file: h5py.File, group: str) -> set[str] | None:
@@ -271,30 +251,15 @@ def _stored_names(file: h5py.File, group: str) -> set[str] | None:
         return {name for name in FIELDS if find(found, name)} if isinstance(found, h5py.Group) else None
 
 
-def _stored_kind(file: h5py.File, lines: list[dict[str, Any]], present: list[set[str] | None]) -> Kind:
-    """Return "lite" if all groups have states, "observations" if none has."""
-    named = zip((line["h5_group"] for line in lines), present, strict=True)
-    has_state = {group: "state" in names for group, names in named if names is not None}
-    if len(set(has_state.values())) == 2:
-        without = next(group for group, has in has_state.items() if not has)
-        raise PublishedFormatError(
-            f"{file.filename}, group {without}: missing state, which other groups have; convert without states by "
-            f"`convert --to observations`"
-        )
-    return "lite" if all(has_state.values()) else OBSERVATIONS
-
-
-def _tasks(
-    histories: list[_PublishedHistory], source: Path, path: Path | None, kind: Kind
-) -> list[tuple[Task, list[_PublishedHistory]]]:
+def _tasks(histories: list[_PublishedHistory], source: Path, kind: Kind) -> list[tuple[Task, list[_PublishedHistory]]]:
     """Return the tasks of the index with their histories, in the order of the index."""
     by_task: dict[str, list[_PublishedHistory]] = {}
     for history in histories:
         by_task.setdefault(history.line["task_id"], []).append(history)
-    found = path or resolve_inside(source, "tasks.jsonl")
+    found = resolve_inside(source, "tasks.jsonl")
     if found.is_file():
         known = {task.task_id: task for task in read_tasks(found)}
-    elif kind == OBSERVATIONS and path is None:
+    elif kind == OBSERVATIONS:
         known = {name: named_task(members[0].line) for name, members in by_task.items()}
     else:
         raise PublishedFormatError(f"{found}: missing; give a file with the tasks that the index names")

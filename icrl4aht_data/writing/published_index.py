@@ -7,7 +7,6 @@ the heuristic.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -15,7 +14,7 @@ import msgspec
 
 from icrl4aht_data.benchmark.facts import FAMILIES, HEURISTIC_KINDS, KIND_FAMILIES
 from icrl4aht_data.benchmark.tasks import named_task
-from icrl4aht_data.errors import Icrl4ahtError, OptionError, PublishedFormatError, unknown
+from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError, unknown
 from icrl4aht_data.format.schema import ENTRY_HINTS, Entry, check_name
 from icrl4aht_data.utils.files import parse_json, read_lines
 
@@ -28,7 +27,7 @@ _Line = msgspec.defstruct("_Line", [(name, _HINTS[name]) for name in PUBLISHED_F
 _KINDS = {"ippo": "rl"} | KIND_FAMILIES
 """Name of an algorithm or heuristic -> family."""
 
-FAMILY_MAP = (
+_FAMILY_MAP = (
     {name: name for name in FAMILIES} | {name: name for name in _KINDS} | {"recipe_aware": "recipe_aware_button"}
 )
 """`teammate_family` in published files -> family or kind of teammate in this package."""
@@ -37,33 +36,14 @@ _GENERAL = {"rl": ("rl",), "heuristic": tuple(HEURISTIC_KINDS.values())}
 """`teammate_kind` in published files -> possible families."""
 
 
-def parse_family_map(pairs: tuple[str, ...]) -> dict[str, str]:
-    """Parse command-line pairs OLD=NEW as a dict.
-
-    Raises:
-        OptionError: if a text is not such a pair.
-        UnknownNameError: if NEW is neither a family nor a kind of teammate.
-    """
-    found = {}
-    for pair in pairs:
-        old, equals, new = pair.partition("=")
-        if not (old and equals and new):
-            raise OptionError(f"{pair!r}: expected OLD=NEW, such as ippo=fcp")
-        if new not in FAMILIES and new not in _KINDS:
-            raise unknown("family or kind of teammates", new, (*FAMILIES, *_KINDS))
-        found[old] = new
-    return found
-
-
-def read_published_index(path: Path, family_map: Mapping[str, str] | None = None) -> list[dict[str, Any]]:
+def read_published_index(path: Path) -> list[dict[str, Any]]:
     """Read `histories_index.jsonl`.
 
     Args:
         path: the file.
-        family_map: `teammate_family` of the file -> family or kind of teammate, in addition to `FAMILY_MAP`.
 
     Returns:
-        The lines as dicts. If names were translated, "published" has the original ones.
+        The lines as dicts.
 
     Raises:
         PublishedFormatError: if a field is missing or invalid, or if two lines have the same group, or the same stream
@@ -77,7 +57,7 @@ def read_published_index(path: Path, family_map: Mapping[str, str] | None = None
             msgspec.convert(line, _Line)
             for name in PUBLISHED_FIELDS:
                 check_name(str(line[name]))
-            line = _translate(line, FAMILY_MAP | dict(family_map or {}))
+            line = _translate(line)
             named_task(line)
             for key, what in (
                 (line["h5_group"].strip("/"), f"group {line['h5_group']!r}"),
@@ -93,13 +73,13 @@ def read_published_index(path: Path, family_map: Mapping[str, str] | None = None
     return lines
 
 
-def _translate(line: dict[str, Any], family_map: Mapping[str, str]) -> dict[str, Any]:
+def _translate(line: dict[str, Any]) -> dict[str, Any]:
     """Return a line with family and kind of the teammate translated to the paper's names."""
     family, kind = line["teammate_family"], line["teammate_kind"]
-    new = family_map.get(family) or family_map.get(family.lower())
+    new = _FAMILY_MAP.get(family) or _FAMILY_MAP.get(family.lower())
     if new is None:
-        error = unknown("teammate_family", family, family_map)
-        raise PublishedFormatError(f"{error} Say what it is by --family-map {family}=NEW")
+        error = unknown("teammate_family", family, _FAMILY_MAP)
+        raise PublishedFormatError(f"{error} Replace it in the index by one of these")
     new_family, new_kind = (new, kind) if new in FAMILIES else (_KINDS[new], new)
     if kind in _GENERAL:
         if new_family not in _GENERAL[kind]:
@@ -108,6 +88,4 @@ def _translate(line: dict[str, Any], family_map: Mapping[str, str]) -> dict[str,
         new_kind = named if new in FAMILIES else new
     elif new not in FAMILIES and family in FAMILIES:
         new_kind = kind
-    translated = {"teammate_family": new_family, "teammate_kind": new_kind}
-    original = {"teammate_family": family, "teammate_kind": kind}
-    return line | translated | ({"published": original} if translated != original else {})
+    return line | {"teammate_family": new_family, "teammate_kind": new_kind}

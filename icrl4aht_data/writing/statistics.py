@@ -8,28 +8,14 @@ from operator import mul
 from typing import Any
 
 import numpy as np
-from rich import filesize
 from rich.console import Console
 
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.format.info import LayoutStatistics, ReleaseInfo
+from icrl4aht_data.format.info import LayoutStatistics
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import Entry
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.utils.templates import markdown_table
-
-_ROWS = {
-    "original_transitions": "Original transitions",
-    "filtered_transitions": "Filtered transitions",
-    "history_length": "History length",
-    "teammates": "Num. teammates",
-    "independent_teammates": "Checkpoints of one policy counted once",
-    "steps_per_episode": "Steps per episode",
-    "obs_shape": "Obs. shape",
-    "actions": "Num. actions",
-    "mean_final_return": "Mean final return",
-    "disk_bytes": "Disk size (compressed)",
-}
 
 
 def layout_statistics(
@@ -81,16 +67,6 @@ def _policy(task: Task) -> str:
     return f"{checkpoint.rpartition('/')[0]} {task.teammate.get('base_seed')}"
 
 
-def print_statistics(info: ReleaseInfo, console: Console) -> None:
-    """Print the statistics in a release's info, one row per property and one column per layout."""
-    rows = [
-        [label, *(_in_words(name, getattr(found, name)) for found in info.statistics.values())]
-        for name, label in _ROWS.items()
-    ]
-    _print(f"{info.kind} release {info.data_version}", console)
-    _print(markdown_table(["property", *info.statistics], rows, right=len(info.statistics)), console)
-
-
 def print_learning(content: Mapping[str, Any], console: Console) -> None:
     """Print how much returns rise by layout and source, and the tasks that were left out.
 
@@ -99,12 +75,8 @@ def print_learning(content: Mapping[str, Any], console: Console) -> None:
         console: console to print to.
     """
     learning: list[dict[str, Any]] = content["learning"]
-    totals = [
-        row | {"layout": title, "split": "all"} for title, own in content["learning_totals"].items() for row in own
-    ]
     _print("Learning, by layout and source:", console)
-    rows = [[_cell(row[name]) for name in learning[0]] for row in (*learning, *totals)]
-    _print(markdown_table(list(learning[0]), rows), console)
+    _print(markdown_table(list(learning[0]), [list(map(_cell, row.values())) for row in learning]), console)
     for task in content["left_out"]:
         source = f" ({task['source']})" if task["source"] else ""
         _print(f"left out: {task['layout']} with {task['teammate']}{source}: {task['reason']}", console)
@@ -117,16 +89,6 @@ def _print(text: str, console: Console) -> None:
 def _cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:z.2f}"
-    return " ".join(value) if isinstance(value, list) else f"{value or ''}"
-
-
-def _in_words(name: str, value: Any) -> str:
-    if value is None:
-        return "unknown"
-    if name == "history_length":
-        return f"{value[0]:,}" if value[0] == value[1] else f"{value[0]:,} to {value[1]:,}"
-    if name == "obs_shape":
-        return f"({', '.join(map(str, value))})"
-    if name == "disk_bytes":
-        return filesize.decimal(value)
-    return f"{value:,}"
+    if isinstance(value, list | tuple):
+        return " ".join(map(_cell, value))
+    return "unknown" if value is None else f"{value:,}" if isinstance(value, int) else value

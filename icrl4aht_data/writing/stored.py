@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks
 from icrl4aht_data.dataset import Dataset
@@ -46,9 +45,4 @@ def stored_task(
     files = checkpoint_files(dataset.root / TEAMMATES, task, dataset.root)
     if provenance.expert is not None and (sha256 := provenance.expert.policy_sha256) is not None:
         files |= expert_files(dataset.origin.below(expert_folder(sha256)), sha256, dataset.root)
-    return NewTask(task, with_source(provenance, dataset.entries[0].source), len(dataset), load, files)
-
-
-def with_source(provenance: Provenance, source: str) -> Provenance:
-    """Return provenance with the histories' source, which format version 3 stores only in the index."""
-    return provenance if source == (provenance.source or "ppo") else replace(provenance, source=source)
+    return NewTask(task, provenance, len(dataset), load, files)

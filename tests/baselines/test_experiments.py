@@ -220,12 +220,16 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
     monkeypatch.setattr(experiments, "run_experiment", note_call)
     small = f"--root {release} --steps 1 --batch-size 2 --tasks 1 --episodes 3 --family H4 --no-gifs --layers 2 "
     small += "--warmup 0.5 --teammate-family rl --algorithm fcp --algorithm brdiv"
-    for command in ("ablate ta --method ad --layout cramped_up --only ta", "tracks --size tiny"):
+    for command in (
+        "ablate ta --method ad --layout cramped_up --only ta",
+        "tracks --size tiny --layout all --channels own",
+    ):
         result = CliRunner().invoke(cli, f"research {command} {small}", catch_exceptions=False)
         assert result.exit_code == 0 and "left out: nothing" in result.output, result.output
     (name, plan, out), (other, tracks, folder) = calls
     assert (name, out, other, folder) == ("ablate ta", Path("runs/ablate-ta"), "tracks", Path("runs/tracks"))
     assert (plan.size, tracks.size) == ("small", "tiny")
+    assert (tracks.layouts, tracks.histories["channels"]) == (("all",), "own")
     assert plan == dataclasses.replace(
         SMALL,
         root=str(release),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from icrl4aht_generation.teammates.instances import published_tasks
 from benchmarks import bench_collect, bench_env, bench_learn, bench_loader
 from benchmarks.bench_learn import published_batches
 from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import to_published
 
 
@@ -31,7 +33,10 @@ def check_ratio(line: dict[str, Any], peer: str) -> None:
 
 
 @pytest.mark.slow
-def test_collection(built):
+def test_collection(built, tmp_path, monkeypatch):
+    """Sizes are measured on the histories of one layout."""
+    root = to_release(load_icrl4aht(layout="demo_wide"), tmp_path / "part", "lite")
+    monkeypatch.setattr(bench_collect, "load_icrl4aht", partial(load_icrl4aht, root))
     speed, size = run(bench_collect, f"speed bytes --profile {built / 'tiny.toml'} --updates 3 --streams 1")
     assert speed["recorded_transitions_per_second"] > 0
     assert 0 < speed["recording_and_writing_share"] < 1

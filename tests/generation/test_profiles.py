@@ -13,7 +13,7 @@ from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.profiles import FOLDER, Profile, load_profile, profile_names
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS
+from icrl4aht_data.benchmark.facts import ALGORITHMS, PREFERENCE_LAYOUTS, SCRIPTED_SOURCES, TRACKS
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, task_fields, task_id, write_tasks
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 
@@ -67,8 +67,10 @@ def test_shipped_profiles_load(name):
     works = profile.works()
     assert len({work.name for work in works}) == len(works)
     for work in works:
-        assert work.task.layout.name in TRACKS[work.task.track]["train"]
-        assert work.task.split == "train" or (work.task.split, work.source) == ("validation", "noise")
+        layouts = PREFERENCE_LAYOUTS if work.source == "search" else TRACKS[work.task.track]
+        assert work.task.layout.name in layouts["train"]
+        assert work.task.split == "train" or (work.task.split == "validation" and work.source in SCRIPTED_SOURCES)
+        assert (work.task.recipes is not None) == (work.source == "search")
 
 
 def test_paper_profile_has_the_papers_numbers():
@@ -242,6 +244,9 @@ H3 = 'families = ["assembly_line"]'
         ("rollout = 40", 'rollout = 40\nlearning_rate = "fast"', "learning_rate"),
         ("gru = 8", "gru = 8.5", "gru"),
         ("presets =", 'sources = ["ppo", "nois"]\npresets =', "nois"),
+        ("presets =", 'sources = ["ppo", "search"]\npresets =', r"tasks\.preference = \[\]"),
+        ("presets =", 'preference = ["all"]\npresets =', r"tasks\.preference = \['all'\].*expected .* source search"),
+        ("presets =", 'preference = ["demo_wide"]\npresets =', "preference.*demo_wide"),
         ("presets =", "learners = 0\npresets =", "learners"),
         ("[release]", "[noise]\nstart = 1.5\n[release]", "start"),
         ("[release]", "[noise]\nend = [0.3, 0.1]\n[release]", "end"),

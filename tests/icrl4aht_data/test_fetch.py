@@ -24,10 +24,10 @@ from click.testing import CliRunner
 from huggingface_hub import file_download
 from huggingface_hub.utils import _http
 
-from icrl4aht_data import clients, download, load_icrl4aht, verify_release
-from icrl4aht_data.clients import check_credentials, without_credentials
+from icrl4aht_data import clients, load_icrl4aht, verify_release
+from icrl4aht_data.clients import without_credentials
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.download import fetch_planned, plan_download, repair
+from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.errors import (
     Icrl4ahtError,
     IndexFormatError,
@@ -161,13 +161,14 @@ def test_a_download_of_a_part_and_then_of_the_rest(kind, lite, tmp_path):
         plan = plan_download(url, to=target, layout="demo_wide")
         assert sum(name.endswith(".h5") for name in plan.files) == 1
         advanced: list[int] = []
-        fetched = fetch_planned(plan, advanced.append)
-        assert fetched == sum(advanced) == plan.size == sum(plan.files[name] for name in plan.absent) > 0
-        assert verify_release(target).ok, "it has the part that was requested"
+        fetch_planned(plan, advanced.append)
+        assert sum(advanced) == plan.size == sum(plan.files[name] for name in plan.absent) > 0
+        assert verify_release(target, layout="demo_wide").ok
+        assert verify_release(target).files_at_fault >= {SHARD, TABLE}
         fetch_planned(plan_download(url, to=target))
         assert plan_download(url, to=target).size == 0
         report = verify_release(url, level="deep", layout="demo_wide")
-        assert report.ok and report.fetched_bytes > 0, report.findings
+        assert report.ok, report.findings
         assert verify_release(url, level="quick").ok
     assert verify_release(target, level="deep").notes == []
     assert contents(target) == contents(lite[0])
@@ -400,78 +401,20 @@ def test_damaged_manifests(kind, lite, tmp_path):
             use(url)
     with pytest.raises(IndexFormatError, match="empty: expected a line for each file"):
         load_icrl4aht(root)
-    with served(kind, lite[0]) as (url, server):
-        assert server is not None
+    with http_server(lite[0]) as server:
         server.faults.next(Flip(70), path=f"*{MANIFEST}")
         with pytest.raises(Icrl4ahtError):
-            fetch_planned(plan_download(url))
-        assert_equal(batch(url), batch(lite[0]))
+            fetch_planned(plan_download(server.url))
+        assert_equal(batch(server.url), batch(lite[0]))
 
 
-def damage_nothing_else(root: Path, names: tuple[str, ...]) -> None:
-    for name in names:
-        if name == MANIFEST:
-            (root / name).write_text("nonsense\n")
-        elif name.startswith("missing "):
-            (root / name.removeprefix("missing ")).unlink()
-        else:
-            flip_bit(root / name, (root / name).stat().st_size // 2, 3)
-
-
-@pytest.mark.parametrize(
-    "damaged",
-    [(SHARD,), (f"missing {SHARD}",), (HISTORIES, INFO), (TABLE, SHARD), (MANIFEST,), (MANIFEST, SHARD, INFO)],
-)
-@pytest.mark.parametrize("kind", ["http", "hub"])
-def test_repair(kind, damaged, lite, tmp_path):
-    root, run = tmp_path / "copy", CliRunner()
-    with served(kind, lite[0]) as (url, _):
-        fetch_planned(plan_download(url, to=root))
-        damage_nothing_else(root, damaged)
-        assert run.invoke(cli, ["verify", str(root), "--json"]).exit_code == 1
-        result = run.invoke(cli, ["verify", str(root), "--repair", "--json"])
-        assert result.exit_code == 0, result.output
-        assert json.loads(result.output)["repaired"]
-    assert contents(root) == contents(lite[0])
-
-
-def test_repair_needs_the_right_source(lite, full, tmp_path, monkeypatch):
-    root = tmp_path / "copy"
-    shutil.copytree(lite[0], root)
-    with pytest.raises(OptionError, match="needs the address of a complete copy, found None: give --from"):
-        repair(root, ["README.md"])
-    with http_server(full[0]) as server, pytest.raises(OptionError, match="it has another release or version"):
-        repair(root, ["README.md"], source=server.url)
-    flip_bit(root / SHARD, 500)
-    before = contents(root)
-    with http_server(lite[0]) as server:
-        server.faults.next(Flip(3), path="*.h5")
-        outcome, _ = repair(root, [SHARD], source=server.url)
-        assert "expected sha256" in str(outcome[SHARD]) and contents(root) == before, "the damaged file is kept"
-        monkeypatch.setenv("ICRL4AHT_REMOTE", server.url)
-        assert repair(root, [SHARD])[0] == {SHARD: None}
-    assert contents(root) == contents(lite[0])
-
-
-def test_a_note_is_valid_for_one_folder_and_release(lite, tmp_path, data):
-    target = tmp_path / "mine"
-    with http_server(lite[0]) as server:
-        fetch_planned(plan_download(server.url, to=target, layout="demo_wide"))
-    shutil.copytree(target, tmp_path / "copy")
-    assert verify_release(target).ok
-    assert verify_release(tmp_path / "copy").files_at_fault == {SHARD, TABLE}
-    for note in data.glob("downloads/*.json"):
-        note.write_text('{"url": 3}')
-    assert download.read_note(target) is None and SHARD in verify_release(target).files_at_fault
-
-
-def test_verification_reports_every_damaged_remote_file(lite, tmp_path):
+def test_verification_reports_a_damaged_remote_file(lite, tmp_path):
     root = tmp_path / "served"
     shutil.copytree(lite[0], root)
-    for name in ("README.md", SHARD):
-        flip_bit(root / name)
+    flip_bit(root / SHARD)
     with http_server(root) as server:
-        assert verify_release(server.url).files_at_fault == {"README.md", SHARD}
+        (finding,) = verify_release(server.url).findings
+    assert f"{SHARD}: expected sha256" in finding.problem
 
 
 @pytest.mark.parametrize(
@@ -517,15 +460,6 @@ def test_the_token_is_sent_to_the_hub_only(lite):
 )
 def test_texts_without_credentials(text, expected):
     assert without_credentials(text) == expected
-
-
-def test_unencoded_credentials_are_refused_and_hidden():
-    for address in ("http://user:hunter2/RET@127.0.0.1:9/x", "http://user:1/hunter2@127.0.0.1:9/x"):
-        with pytest.raises(OptionError, match="percent-encode the user name and password") as caught:
-            load_icrl4aht(address)
-        assert "hunter2" not in str(caught.value)
-    for address in ("https://h.test/a@v1", "http://127.0.0.1:80/a@v1", "https://u:p%2F@h.test:8/x", "s3://bucket/x@1"):
-        check_credentials(address)
 
 
 def test_credentials_in_an_address_are_used_and_never_kept_or_shown(lite, tmp_path):

@@ -1,4 +1,8 @@
-"""A user's script with Grain, PyTorch and JAX; `test_shown.py` runs and type-checks it."""
+"""A user's script with Grain, PyTorch and JAX; `test_shown.py` runs it, and `make check` checks its types."""
+
+# pyright: reportUnnecessaryTypeIgnoreComment=error
+
+from typing import TYPE_CHECKING
 
 import grain
 import jax
@@ -24,6 +28,8 @@ print(history["rewards"].sum(), [episode.rewards.sum() for episode in ds.sample_
 sampler = train.ad(batch_size=8, length=50, seed=0)
 batch: ADBatch[np.ndarray] = sampler[np.int64(0)]
 print(batch, batch.obs.astype(np.float32).mean(), batch.is_first.sum())
+if TYPE_CHECKING:  # an error that the checker must find, as arrays of NumPy have no `at`
+    print(batch.obs.at)  # pyright: ignore[reportAttributeAccessIssue]
 
 for device_batch in sampler.batches(stop=2, device=jax.devices()[0]):
     logits: jax.Array = jnp.zeros((*device_batch.prev_actions.shape, 6))

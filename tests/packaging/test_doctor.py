@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import os
 import shutil
 import subprocess
 import sys
-from collections import namedtuple
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +17,7 @@ from packaging.requirements import Requirement
 
 from icrl4aht_data.commands import doctor
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.dataset import MINI
-from icrl4aht_data.format.info import read_info
 from icrl4aht_data.utils.install_hints import EXTRAS, RESTORE, install_command
-from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import SHARD
 
 
@@ -33,7 +28,6 @@ def elsewhere(tmp_path, monkeypatch) -> Path:
         monkeypatch.setenv(f"ICRL4AHT_{name}_DIR", str(tmp_path / name.lower()))
     for name in ("ICRL4AHT_OFFLINE", "HF_HUB_OFFLINE", "ICRL4AHT_REMOTE", "ICRL4AHT_CACHE_BYTES"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setattr(doctor, "_query_jax", lambda: '["cpu", ["cpu"]]')
     return tmp_path
 
@@ -56,27 +50,17 @@ def problems() -> dict[str, str]:
 def test_no_problems(elsewhere):
     facts, text = run_doctor()
     assert facts["ok"], facts["problems"]
-    info = read_info(MINI)
     for expected in (
-        f"found {importlib.metadata.version('icrl4aht-data')}, folder {MINI.parent}",
-        f"found {h5py.version.hdf5_version}, expected >=1.10.5",
-        "expected >=0.8, extra baselines",
-        "backend cpu",
-        f"path {elsewhere / 'cache'}, set by ICRL4AHT_CACHE_DIR",
-        "exists no, writable yes",
+        f"icrl4aht-data: {importlib.metadata.version('icrl4aht-data')}",
+        f"HDF5: {h5py.version.hdf5_version}",
+        '"backend": "cpu"',
+        f'cache: {{"path": "{elsewhere / "cache"}"',
         "no problems found",
     ):
         assert expected in text
     assert not list(elsewhere.iterdir()), "the doctor creates nothing"
-    assert facts["bundled"] == {
-        "ok": True,
-        "data_version": info.data_version,
-        "format_version": info.format_version,
-        "kind": "lite",
-        "histories": info.histories,
-    }
-    assert facts["folders"]["data"]["set_by"] == "ICRL4AHT_DATA_DIR"
-    assert facts["packages"]["numpy"]["extra"] is None
+    assert facts["bundled"] == {"ok": True}
+    assert facts["packages"]["numpy"] == importlib.metadata.version("numpy")
     assert facts["devices"]["jax"] == {"backend": "cpu", "devices": ["cpu"]}
     assert facts["network"] == {"offline": [], "remote": None}
 
@@ -89,34 +73,6 @@ def test_jax_is_imported_in_another_process(elsewhere):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "'jax': {'backend': " in done.stdout
     assert done.stdout.endswith("False\n")
-
-
-def test_sources_of_folders(elsewhere, monkeypatch):
-    for name in ("ICRL4AHT_CACHE_DIR", "ICRL4AHT_DATA_DIR", "XDG_DATA_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(elsewhere / "xdg"))
-    monkeypatch.setenv("HOME", str(elsewhere))
-    facts, text = run_doctor()
-    cache, data = facts["folders"]["cache"], facts["folders"]["data"]
-    assert (cache["path"], cache["set_by"]) == (str(elsewhere / "xdg/icrl4aht"), "XDG_CACHE_HOME")
-    assert (data["path"], data["set_by"]) == (str(elsewhere / ".local/share/icrl4aht"), None)
-    assert f"path {elsewhere / '.local/share/icrl4aht'}, variable ICRL4AHT_DATA_DIR" in text
-
-
-def test_content_of_folders(elsewhere):
-    (elsewhere / "cache" / "set").mkdir(parents=True)
-    (elsewhere / "cache" / "set" / "state.npy").write_bytes(bytes(10_000))
-    (elsewhere / "cache" / ".other.partial-x").mkdir()
-    part = elsewhere / "data" / "host-1" / "0" / ".partial-x" / "data"
-    part.mkdir(parents=True)
-    (part / "shard.h5").write_bytes(bytes(5_000))
-    facts, text = run_doctor()
-    cache, data = facts["folders"]["cache"], facts["folders"]["data"]
-    assert cache["bytes"] >= 10_000
-    assert cache["left_over"] == [str(elsewhere / "cache" / ".other.partial-x")]
-    assert data["bytes"] >= data["in_part"] >= 5_000
-    assert "limit 100,000,000,000" in text
-    assert str(elsewhere / "cache" / ".other.partial-x") in text
 
 
 def test_folders_that_cannot_be_written(elsewhere, monkeypatch):
@@ -133,14 +89,6 @@ def test_folders_that_cannot_be_written(elsewhere, monkeypatch):
     assert f"{elsewhere / 'data'}: the data folder cannot be written: Permission denied" in problems()
 
 
-def test_disk_nearly_full(elsewhere, monkeypatch):
-    usage = namedtuple("usage", ["total", "used", "free"])
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, 5_000))
-    found = problems()
-    assert f"{elsewhere / 'data'}: the disk of the data folder is nearly full: 5,000 bytes are free" in found
-    assert len(found) == 3, "cache, data and the Hub's"
-
-
 @pytest.mark.parametrize("value", ["many", "-5"])
 def test_invalid_settings(elsewhere, monkeypatch, value):
     monkeypatch.setenv("ICRL4AHT_CACHE_BYTES", value)
@@ -154,7 +102,7 @@ def test_offline_is_no_problem(elsewhere, monkeypatch):
     monkeypatch.setenv("ICRL4AHT_OFFLINE", "1")
     facts, text = run_doctor()
     assert facts["ok"] and facts["network"]["offline"] == ["ICRL4AHT_OFFLINE"]
-    assert "offline  ICRL4AHT_OFFLINE" in text
+    assert 'offline: ["ICRL4AHT_OFFLINE"]' in text
 
 
 def test_damaged_bundled_release(elsewhere, monkeypatch, damaged):
@@ -178,16 +126,12 @@ def test_versions_that_are_not_accepted(elsewhere, monkeypatch):
         return found
 
     monkeypatch.setattr(doctor, "version", version)
-    monkeypatch.setattr(h5py.version, "hdf5_version", "1.8.3")
-    monkeypatch.setattr(doctor.platform, "python_version", lambda: "3.10.4")
     found = problems()
-    assert found.pop("HDF5 1.8.3: expected >=1.10.5") == "pip install -U --force-reinstall h5py"
-    assert found.pop("Python 3.10.4: expected >=3.11") == "create an environment with such a Python"
     assert found.pop("numpy 1.26.4: expected >=2.1") == "pip install -U 'numpy>=2.1'"
     assert set(found) == {"matplotlib 3.0: expected >=3.9", "rich is not installed: expected >=13"}, (
         "extras are optional"
     )
-    assert f"extra plot, install {install_command('plot')}" in run_doctor()[1]
+    assert f"pillow: not installed: {install_command('plot')}" in run_doctor()[1]
 
 
 def test_broken_jax(elsewhere, monkeypatch):
@@ -222,17 +166,5 @@ def test_package_that_is_not_installed(elsewhere, monkeypatch):
     def missing(name: str) -> None:
         raise importlib.metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(doctor, "metadata", missing)
+    monkeypatch.setattr(doctor, "version", missing)
     assert problems() == {"icrl4aht-data: not installed": "pip install icrl4aht-data, or -e . in a checkout"}
-
-
-def test_missing_module_names_its_extra(tmp_path):
-    """A process without flax, as where only the reader is installed."""
-    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['flax'] = None\n")
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, ROOT, ROOT / "generation", ROOT / "baselines")))
-    }
-    command = [sys.executable, "-m", "icrl4aht_data", "research", "speed", "--profile", "smoke"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr.endswith(f"error: this needs flax, which is not installed: {install_command('baselines')}\n")

@@ -12,10 +12,9 @@ import pytest
 from icrl4aht_generation.jobs import ray_executor as on_ray
 from icrl4aht_generation.jobs.options import QueueOptions
 
-from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli, run
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.errors import EmptySelectionError, OptionError, UnknownNameError
+from icrl4aht_data.errors import OptionError
 from tests.helpers.paths import ROOT
 
 
@@ -46,19 +45,22 @@ list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
 list --source nois | unknown source 'nois'; valid: ppo, noise, student. Did you mean 'noise'?
 verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
 verify --deeep | No such option
-verify --from x | --from is the source of a repair: give --repair with it
 show 158 | 158: no such folder; give a history's id as --history 158
 show --history -1 | -1 is not in the range x>=0
 show --history 9999 | this selection has no history [9999], ids are within 0..
+browse --port 0 | --port is for the server: give --serve with it
+browse --overwrite --serve | --overwrite replaces a file: give --out FILE with it
+browse --out page.txt | page.txt: expected a name that ends in .html
+browse --out none/page.html | no folder none: make it first, or give another path
+browse --histories 0 | 0 is not in the range x>=1
 show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
 show --plot none/curves.png | no folder none: make it first, or give another path
 download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 download s3://a/b --to file | 'file' is a file
 convert --out out | give the form to convert to: --to full, lite, observations, published,
-convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps are for published files
+convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps is for published files
 convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
-convert {MINI} --out out --to lite --tasks none | 'none' does not exist
 release build a b --out c | unexpected extra argument
 upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
 generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, small, smoke.
@@ -71,7 +73,8 @@ train ad --layout demo_wide --batch-size 0 | batch_size = '0': expected `int` >=
 train ad --layout demo_wide --learning-rate nan | learning_rate = 'nan': expected `float` > 0
 train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
-train rl2 --layout demo_wide --context 5 | --context: not with rl2, which learns by playing
+train rl2 --layout demo_wide --size tiny | --size: not with rl2, which learns by playing
+train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: not with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
 collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
 collect --agent stay --out c --noise 2 0 | noise = '2': expected `float` <= 1
@@ -85,6 +88,8 @@ evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent none --out e | A trained model is named by its folder
 evaluate --agent empty --out e | empty: not a run: config.json is missing
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
+evaluate --agent stay --out e --split train | unknown split 'train'; valid: test, validation
+evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --split: not with --manifest
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
 research headroom --protocol x | unknown protocol 'x'; valid: published, seeded.
@@ -93,10 +98,9 @@ train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """
 
 FAILED = """
-list none | none: no release here, expected meta/info.json in it; there is no such folder: check
+list none | none: no release here, expected meta/info.json in it; give the folder of a release
 list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
-list outer | outer: no release here, expected meta/info.json in it; did you mean outer/lite?
-list --split test | no history has split=['test']. This release has train on coord_simple,
+list --split test | no history has split=['test']. This release has split train, validation; layout
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
 convert {MINI} --out file/x --to lite | file: File exists; a file is where a folder is needed
@@ -136,13 +140,6 @@ def test_bad_input_has_a_message_and_an_exit_code(say, arguments, message, code)
 def test_empty_arguments_are_refused(say):
     assert say("list", "")[1].endswith("expected a folder, found an empty text")
     assert say("release", "build", "--out", "")[1].endswith("expected a folder, found an empty text")
-
-
-def test_verify_raises_for_unknown_names():
-    with pytest.raises(UnknownNameError, match="unknown layout 'demo_wied'"):
-        verify_release(layout="demo_wied")
-    with pytest.raises(EmptySelectionError):
-        verify_release(split="test")
 
 
 @pytest.mark.parametrize(

@@ -266,22 +266,6 @@ def test_the_reader_works_without_extras(installed, wheel, tmp_path):
     assert not list(tmp_path.glob("*.png"))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "extra"),
-    [
-        (("plan",), "baselines"),
-        (("evaluate", "--agent", "stay", "--out", "results"), "baselines"),
-        (("train", "ad", "--layout", "demo_wide", "--out", "run"), "baselines"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else value[0],
-)
-def test_commands_name_the_missing_extra(installed, wheel, tmp_path, arguments, extra):
-    run = runner(installed, tmp_path)
-    assert arguments[0] in run("icrl4aht-data", "--help")
-    assert run("icrl4aht-data", *arguments, code=1).endswith(f": {hinted(extra)}\n")
-    assert not list(tmp_path.iterdir())
-
-
 def test_folders_of_a_lab_do_not_hide_ours(installed, tmp_path):
     """A lab's own packages `baselines` and `generation` are imported where they are found first; ours stay usable."""
     for name in ("baselines", "generation"):

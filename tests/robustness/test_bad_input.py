@@ -16,7 +16,6 @@ from icrl4aht_data.errors import (
     Icrl4ahtError,
     IndexFormatError,
     RootNotFoundError,
-    ShardCorruptError,
     ShardMismatchError,
     ShardMissingError,
     ShardTruncatedError,
@@ -69,7 +68,7 @@ def test_unknown_field_of_a_history(lite):
 
 @pytest.mark.parametrize("options", [{"split": "test"}, {"layout": "coord_ring"}, {"teammate_family": "rl"}])
 def test_a_valid_filter_without_data_says_what_exists(lite, options):
-    with pytest.raises(EmptySelectionError, match="has train on coord_simple, demo_wide with H4"):
+    with pytest.raises(EmptySelectionError, match="has split train; layout coord_simple, demo_wide; teammate_family"):
         load_icrl4aht(lite[0], **options)
 
 
@@ -82,8 +81,7 @@ def test_no_release_here(tmp_path):
     ("version", "error", "what_to_do"),
     [
         (6, FormatTooNewError, "pip install -U icrl4aht-data"),
-        (1, FormatTooOldError, "fetch the release again"),
-        (3, FormatTooOldError, "convert it to version 4 with `icrl4aht-data convert` of commit 71f723c"),
+        (3, FormatTooOldError, "fetch a newer version of the release"),
     ],
 )
 def test_other_format_versions(damaged, version, error, what_to_do):
@@ -145,12 +143,6 @@ def test_a_missing_index_line(damaged):
         load(damaged)
 
 
-def test_missing_index(damaged):
-    (damaged / "meta" / "histories.jsonl").unlink()
-    with pytest.raises(IndexFormatError, match=r"histories\.jsonl: missing"):
-        load_icrl4aht(damaged)
-
-
 def test_binary_index(damaged):
     (damaged / "meta" / "histories.jsonl").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(IndexFormatError, match="not UTF-8"):
@@ -170,21 +162,6 @@ def test_truncated_shard(damaged, share):
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
     with pytest.raises(ShardTruncatedError, match=r"truncated: has \d+ bytes, but chunk \d+ of \w+ in history \d+"):
         read_all(damaged)
-
-
-def test_every_flipped_bit_in_a_chunk_is_caught(damaged):
-    path = damaged / SHARD
-    data = path.read_bytes()
-    table = np.load(damaged / chunk_table_name(SHARD))
-    rng = np.random.default_rng(0)
-    for row in rng.choice(np.count_nonzero(table["rows"]), 40):
-        spoiled = bytearray(data)
-        spoiled[int(table["offset"][row] + rng.integers(table["size"][row]))] ^= 1 << rng.integers(8)
-        path.write_bytes(spoiled)
-        with pytest.raises(ShardCorruptError, match=r"chunk \d+ of \w+ in history \d+ \(bytes .*: expected crc32"):
-            read_all(damaged)
-    path.write_bytes(data)
-    read_all(damaged)
 
 
 def test_index_and_shard_disagree(damaged):

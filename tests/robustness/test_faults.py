@@ -119,7 +119,7 @@ def small(tmp_path_factory) -> DamagedCopy:
 
 @pytest.mark.parametrize("count", [9, pytest.param(90, marks=SLOW)])
 def test_no_reading_believes_a_flipped_bit(small, caches, count):
-    """Every file of the release has its turn, and every cache mode. test_verify.py flips 1,000 bits."""
+    """Every file of the release has its turn, and every cache mode. test_verify.py flips hundreds of bits."""
     rng, paths = np.random.default_rng(1), sorted(path for path in small.root.rglob("*") if path.is_file())
     modes: list[CacheMode] = ["ram", "stream", "mmap"]
     for number in range(count):

@@ -8,8 +8,6 @@ from typing import Literal
 import msgspec
 import yaml
 
-Size = Literal["n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "10M<n<100M", "100M<n<1B"]
-
 
 class _DataFiles(msgspec.Struct, forbid_unknown_fields=True):
     split: str
@@ -30,7 +28,6 @@ class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
     pipeline_tag: str = ""
     pretty_name: str = ""
     task_categories: list[str] = []
-    size_categories: list[Size] = []
     configs: list[_Config] = []
 
 

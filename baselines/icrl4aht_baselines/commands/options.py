@@ -22,7 +22,18 @@ from icrl4aht_baselines.training.options import (
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options, topic
-from icrl4aht_data.commands.options import COUNT, COUNT_OR_NONE, FAMILY, LAYOUT, SEED, TRACK, Folder, Names, Root
+from icrl4aht_data.commands.options import (
+    COUNT,
+    COUNT_OR_NONE,
+    FAMILY,
+    LAYOUT,
+    SEED,
+    TRACK,
+    Folder,
+    Names,
+    ReleaseLayoutName,
+    Root,
+)
 from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.options import Positive
@@ -72,7 +83,9 @@ class HostPort(click.ParamType):
 
 
 EGO_NAME = EgoName("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names())
-TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], lambda: [ALL_LAYOUTS, *LAYOUT.offered()])
+TRAINING_LAYOUT = ReleaseLayoutName(
+    "layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], lambda: [ALL_LAYOUTS, *LAYOUT.offered()]
+)
 METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())
 _HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
 _playing = lazy_attribute("icrl4aht_baselines.methods.registry", "PLAYING")
@@ -177,7 +190,7 @@ def add_options(command: Any, options: Iterable[Callable[[Any], Any]]) -> Any:
     return functools.reduce(lambda decorated, option: option(decorated), reversed([*options]), command)
 
 
-_NO_FILTERS = ("order", "queries", "labels", "every", "held_out", "channels", "mirror", "hide_recipe")
+_NO_FILTERS = ("order", "queries", "labels", "every", "first", "held_out", "channels", "mirror", "hide_recipe")
 history_filters = dataclass_options(HistoryOptions, "filters", exclude=_NO_FILTERS)
 """Options that filter histories; the command receives them as the dict `filters`."""
 
@@ -331,7 +344,7 @@ def variant_names(command: str) -> Names:
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
 
 
-_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "mirror", "hide_recipe")
+_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "first", "mirror", "hide_recipe")
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:

@@ -69,9 +69,6 @@ ABOUT = (
 )
 
 
-MODEL = ModelOptions(**RL2_SETTINGS["model"])
-"""Architecture of best responses, that of the bundled rl2 models."""
-
 PLAY = PlayOptions(task_end=1.0)
 """Options of playing: each episode is a task of its own, since nothing is to be found out."""
 
@@ -156,12 +153,19 @@ class TrainingJob:
         raise NotImplementedError
 
     @property
+    def model(self) -> ModelOptions:
+        """Architecture of the ego, that of the bundled rl2 models but for its width."""
+        return ModelOptions(**{**RL2_SETTINGS["model"], "width": self.options.width})
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What the result depends on."""
+        options = asdict(self.options)
+        del options["width"]  # an option of the model
         return {
             "seed": self.seed,
-            "options": asdict(self.options),
-            "model": asdict(MODEL),
+            "options": options,
+            "model": asdict(self.model),
             "play": asdict(PLAY),
             "code_version": version("icrl4aht-data"),
         }
@@ -226,7 +230,8 @@ class TrainingJob:
             params: initial parameters; drawn by the seed by default.
             told: number of tasks, for an ego that is told in every step which one it plays; otherwise 0.
         """
-        method = get_method("rl2")(MODEL, overcooked_world(layouts, MODEL.encoder, canonical=True, partners=told))
+        model = self.model
+        method = get_method("rl2")(model, overcooked_world(layouts, model.encoder, canonical=True, partners=told))
         options = self.options.training(self.seed)
         trainer = PlayTrainer(method, options, PLAY, groups)
 
@@ -256,6 +261,7 @@ class ResponseJob(TrainingJob):
     def name(self) -> str:
         """Task and seed, and the model that it starts from."""
         start = f"-{self.options.init}" if self.options.init else ""
+        start += f"-w{self.options.width}" if self.options.width != 128 else ""
         return f"{self.behaviour.tasks[0].task_id}{start}-s{self.seed}"
 
     @property
@@ -316,7 +322,14 @@ def trained_response(job: ResponseJob) -> TrainedResponse:
     acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
     steps = job.options.updates * job.options.tasks * KEPT_STEPS
     return TrainedResponse(
-        job.seed, steps, earned["return"], earned["choice"], acting, result["slope"], job.options.init or ""
+        seed=job.seed,
+        steps=steps,
+        width=job.options.width,
+        mean_return=earned["return"],
+        choice=earned["choice"],
+        acting=acting,
+        slope=result["slope"],
+        init=job.options.init or "",
     )
 
 
@@ -324,9 +337,9 @@ def best_of(behaviour: Behaviour, trainings: Iterable[TrainedResponse]) -> BestR
     """Return the best response to a behaviour.
 
     The best training is that with the highest return on the episodes to choose by; B is its return on the others. Of
-    trainings with the same seed, start and steps the last one counts.
+    trainings with the same seed, start, steps and width the last one counts.
     """
-    task, seeds = behaviour.tasks[0], {(one.init, one.steps, one.seed): one for one in trainings}
+    task, seeds = behaviour.tasks[0], {(one.init, one.steps, one.width, one.seed): one for one in trainings}
     best = chosen_training(seeds.values())
     return BestResponse(
         layout=task.layout.name,
@@ -396,7 +409,7 @@ def responses_table(path: Path) -> str:
         returns, best = [seed.mean_return for seed in one.seeds], chosen_training(one.seeds)
         numbers = ", ".join(task.rsplit("_", 3)[1] for task in one.tasks)
         spread = f"{min(returns):.1f} to {max(returns):.1f}" if len(returns) > 1 else ""
-        training = [str(len(returns)), f"{best.steps:,}", f"{best.slope or 0.0:+.1f}"]
+        training = [str(len(returns)), f"{best.steps:,}", str(best.width), f"{best.slope or 0.0:+.1f}"]
         body.append([one.layout, one.split, f"{one.family} {numbers}", f"{one.best:.1f}", one.agent, spread, *training])
-    header = ["layout", "split", "teammates", "B", "of", "trainings", "number", "steps", "rise"]
+    header = ["layout", "split", "teammates", "B", "of", "trainings", "number", "steps", "width", "rise"]
     return markdown_table(header, body)

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from icrl4aht_generation.collection.curate import oracle_labels
-from icrl4aht_generation.collection.noise_rollout import noise_schedules
+from icrl4aht_generation.collection.scripted_rollout import noise_schedules
 from icrl4aht_generation.learners.resume import differing_settings, xla_threads
 from icrl4aht_generation.policy import Policy, sometimes_random
 from icrl4aht_generation.profiles.noise_config import NoiseConfig

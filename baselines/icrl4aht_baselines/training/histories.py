@@ -136,8 +136,8 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
         The chosen histories, and those of split validation that agree with the choice, if there are any.
     """
     every = ALL_LAYOUTS in histories.layouts
+    release = load_icrl4aht(histories.root, obs="uint8")  # first, since it may carry layouts of its own
     names = None if every else [get_layout(name).name for name in histories.layouts]
-    release = load_icrl4aht(histories.root, obs="uint8")
     found = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
     differ = len({layout.obs_shape for layout in found.layouts}) > 1
     channels = histories.channels or ("canonical" if every or differ else "own")
@@ -219,13 +219,15 @@ def _sampler(
     labels: Labels | None,
 ) -> Any:
     """Return the sampler of a part of the histories."""
-    every = histories.every
-    steps = int(dataset.column("episodes").min()) // every * dataset.info.environment.kept_steps
+    every, episodes = histories.every, int(dataset.column("episodes").min())
+    first = min(histories.first or episodes, episodes)
+    steps = first // every * dataset.info.environment.kept_steps
     shared: Any = {
         "batch_size": options.batch_size,
         "seed": options.seed,
         "teammate_actions": model.teammate_actions,
         "labels": labels,
+        "episodes": (0, first) if histories.first else None,
         "process_index": jax.process_index(),
         "process_count": jax.process_count(),
     }
@@ -242,7 +244,7 @@ def _sampler(
     if options.context > steps:
         raise OptionError(
             f"context = {options.context}: the shortest history of {dataset!r} has {steps} steps for a window, with "
-            f"every = {every}; take fewer, or choose longer histories"
+            f"every = {every} and first = {histories.first or 'all'}; take fewer, or choose longer histories"
         )
     return dataset.ad(length=options.context, every=every, **shared)
 

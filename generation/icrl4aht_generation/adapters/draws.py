@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from icrl4aht_data.benchmark.facts import SCRIPTED_SOURCES
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_generation.collection.noise_rollout import noisy_episode_keys
+from icrl4aht_generation.collection.scripted_rollout import scripted_episode_keys
 from icrl4aht_generation.collection.task import learner_key
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.ego import stream_keys
@@ -41,8 +42,8 @@ def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[
     entry = dataset.index.entry(history_id)
     task, number = dataset.history_task(history_id), episode
     ego = dataset.provenance.get(task.task_id, Provenance()).ego
-    if entry.source == "noise":  # noise histories play each episode in an environment of its own
-        key, number = noisy_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
+    if entry.source in SCRIPTED_SOURCES:  # a script plays each episode in an environment of its own
+        key, number = scripted_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
     elif entry.source == "ppo" and ego is not None:
         key = stream_keys(learner_key(Work(task, learner=entry.learner)), ego["environments"])[entry.env_idx]
     else:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from icrl4aht_generation.collection.noise import play_histories
+from icrl4aht_generation.collection.scripted import play_histories
+from icrl4aht_generation.collection.scripted_rollout import scripted_pieces
 from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, UpdateCallback, learn_histories
 from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing, partial_folder, publish_artefact
 from icrl4aht_generation.jobs.job import OnUpdate
@@ -13,7 +14,7 @@ from icrl4aht_generation.learners.resume import run_lock
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.work import Work
 
-_MAKERS = {"ppo": learn_histories, "noise": play_histories}
+_MAKERS = {"ppo": learn_histories, "noise": play_histories, "search": play_histories}
 """Source -> function that makes an artefact in its partial folder, or resumes it there."""
 
 
@@ -33,7 +34,7 @@ def run_task(
         work: the unit of work.
         profile: hyper-parameters, sizes and schedules.
         folder: the artefact.
-        on_update: called after each update, or each noise history.
+        on_update: called after each update, or each piece that a script plays.
         suite: folder of the learned teammates, if the task's is one.
         wait: whether to wait for another process that works on it.
         save_seconds: least time between two saves.
@@ -90,8 +91,10 @@ class CollectionJob:
 
     @property
     def updates(self) -> int:
-        """Updates of the ego, or of the noise."""
-        return self.profile.updates(self.work)
+        """Updates of the ego, or pieces that a script plays."""
+        if self.work.source == "ppo":
+            return self.profile.ego_on(self.work.task.layout.name).updates
+        return len(scripted_pieces(self.work.source, self.profile.scripted[self.work.source]))
 
     @property
     def xla_threads(self) -> int | None:

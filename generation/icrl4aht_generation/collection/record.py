@@ -12,8 +12,8 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_generation.learners.rollout import Rollout
 
-NOISE_ARRAYS = ("oracle_actions", "noise")
-"""Further arrays of artefacts of the source `noise`, see `collection.noise`."""
+SCRIPT_ARRAYS = ("script_actions", "noise")
+"""Further arrays of artefacts whose histories a script plays, see `collection.scripted`."""
 
 
 class HistoryArrays(NamedTuple):

@@ -26,12 +26,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from icrl4aht_data.benchmark.facts import SCRIPTED_SOURCES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import DiskFullError, IndexFormatError
 from icrl4aht_data.format.cached_arrays import new_mapped_array
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
-from icrl4aht_generation.collection.record import NOISE_ARRAYS, HistoryArrays, array_shapes, record_rollout
+from icrl4aht_generation.collection.record import SCRIPT_ARRAYS, HistoryArrays, array_shapes, record_rollout
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
@@ -64,8 +65,9 @@ def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
         "learner": work.learner,
         "code_version": version("icrl4aht-data"),
     }
-    if work.source == "noise":
-        return common | {"noise": json.loads(json.dumps(asdict(profile.noise)))}  # lists, as in the file, not tuples
+    if work.source in SCRIPTED_SOURCES:
+        config = profile.scripted[work.source]
+        return common | {"noise": json.loads(json.dumps(asdict(config)))}  # lists, as in the file, not tuples
     ego = profile.ego_on(work.task.layout.name)
     return common | {"ego_hash": json_hash(asdict(ego)), "checkpoint_updates": list(checkpoint_updates(ego))}
 
@@ -73,8 +75,8 @@ def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
 def hashed_files(work: Work, profile: Profile) -> list[str]:
     """Return the files whose hashes an artefact's metadata has, sorted."""
     files = {METRICS, *(f"{name}.npy" for name in HistoryArrays._fields)}
-    if work.source == "noise":
-        return sorted(files | {f"{name}.npy" for name in NOISE_ARRAYS})
+    if work.source in SCRIPTED_SOURCES:
+        return sorted(files | {f"{name}.npy" for name in SCRIPT_ARRAYS})
     count = len(checkpoint_updates(profile.ego_on(work.task.layout.name)))
     checkpoints = [checkpoint_path(Path(), number) for number in range(count)]
     return sorted(files | {(path / name).as_posix() for path in checkpoints for name in (POLICY_WEIGHTS, POLICY_CARD)})

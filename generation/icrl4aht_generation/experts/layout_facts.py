@@ -122,19 +122,42 @@ def _far(steps: np.ndarray, far: int) -> np.ndarray:
 
 
 def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
-    """Return `LayoutFacts.ways`, by relaxing all ways until none becomes shorter."""
-    cells, room = np.arange(layout.cells), layout.rooms[EGO]
-    ends = np.repeat(layout.moves[None, room, :4].astype(int), len(obstacles), axis=0)  # (O, room, actions)
-    ends = np.where(ends == obstacles[:, None, None], room[:, None], ends)
-    # Ways end where a cell is faced, so turning counts as a step, like walking.
-    faces = layout.ahead[ends, FACING_OF][..., None] == cells  # (O, room, actions, cells)
+    """Return `LayoutFacts.ways`: walk as near as possible, then make the move that ends facing the cell."""
+    room = layout.rooms[EGO].astype(int)
+    position = np.zeros(layout.cells, int)  # of a cell in the room
+    position[room] = range(len(room))
+    moves = layout.moves[room, :4].astype(int)
+    ends = np.where(moves == obstacles[:, None, None], room[:, None], moves)  # (O, room, actions)
+    steps = _walking_steps(position[ends])
     ways = np.full((len(obstacles), layout.cells, layout.cells), NOWHERE - 1, np.uint8)
-    while True:  # the tables are small, and are computed once per layout
-        after = np.where(faces, 0, ways[np.arange(len(obstacles))[:, None, None], ends])
-        shorter = np.minimum(ways[:, room], after.min(axis=2) + 1)
-        if np.array_equal(shorter, ways[:, room]):
-            return np.where(ways == NOWHERE - 1, NOWHERE, ways)
-        ways[:, room] = shorter
+    for action in range(4):
+        end = ends[..., action]
+        faced = layout.ahead[end, FACING_OF[action]].astype(int)
+        # Two cells at most lead to facing the same one: one from which the agent walks, one where it only turns.
+        for walks in (False, True):
+            obstacle, start = np.nonzero((end != room) == walks)
+            own = obstacle[:, None], room, faced[obstacle, start][:, None]
+            ways[own] = np.minimum(ways[own], steps[obstacle, :, start] + 1)
+    return np.where(ways == NOWHERE - 1, NOWHERE, ways)
+
+
+def _walking_steps(ends: np.ndarray) -> np.ndarray:
+    """Return the steps from each cell of a room to each other one, uint8 (O, room, room), at most NOWHERE - 2.
+
+    Args:
+        ends: number of the cell in the room to which a move leads, int (O, room, actions).
+    """
+    steps = np.where(np.eye(ends.shape[1], dtype=bool), 0, np.uint8(NOWHERE - 2))
+    steps = np.tile(steps.astype(np.uint8), (len(ends), 1, 1))
+    each = np.arange(len(ends))[:, None]
+    while True:  # until no way becomes shorter
+        shorter = steps
+        for action in range(ends.shape[2]):
+            after = steps[each, ends[..., action]]
+            shorter = np.minimum(shorter, np.minimum(after, NOWHERE - 3) + 1)
+        if np.array_equal(shorter, steps):
+            return steps
+        steps = shorter
 
 
 def _hindrance(layout: Layout, tables: Tables) -> np.ndarray:
@@ -152,6 +175,5 @@ def _hindrance(layout: Layout, tables: Tables) -> np.ndarray:
         ends = np.flatnonzero(np.isin(layout.kinds, kinds)[layout.ahead].any(axis=1) & layout.walkable)
         for mate in layout.rooms[TEAMMATE]:
             steps = tables.first_step[mate, ends[ends != mate]]
-            for ahead in layout.moves[mate, steps]:
-                hindrance[carries, mate] += near[ahead]
+            hindrance[carries, mate] += near[layout.moves[mate, steps]].sum(axis=0, dtype=np.int16)
     return hindrance

@@ -25,7 +25,6 @@ from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.cells import COOKED, FACING_OF, NOWHERE, PLATE, POT, WALL
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack
-from icrl4aht_data.overcooked.tables import stack_tables
 from icrl4aht_generation.experts.layout_facts import FAR, NEVER, LayoutFacts, stack_facts, study_layout
 from icrl4aht_generation.paths import Scene
 from icrl4aht_generation.policy import Policy, Situation
@@ -74,7 +73,7 @@ def oracle(layout: Layout | Sequence[Layout]) -> Policy:
 
 def oracle_params(layouts: Sequence[Layout]) -> Any:
     """Return the parameters of `SITUATION_ORACLE` for some layouts: their facts, and an empty state record."""
-    return stack_facts(layouts), np.zeros(record_size(stack_tables(layouts)), np.uint8)
+    return stack_facts(layouts), np.zeros(record_size(*layouts), np.uint8)
 
 
 @lru_cache(maxsize=64)

@@ -28,6 +28,9 @@ from icrl4aht_generation.policy import Policy, Situation
 _FLAGS = np.uint8(PLATE | COOKED)
 _NO_DISH = 0
 
+MOST_DISHES = 10
+"""D: dishes of three pieces that can be made of three ingredients."""
+
 
 class SearchMemory(NamedTuple):
     """Memory of the ego, which is kept from one episode to the next.
@@ -52,10 +55,23 @@ class SearchMemory(NamedTuple):
 def searcher(layouts: Layout | Sequence[Layout]) -> Policy:
     """Return the scripted ego for one layout or several, in the order of their numbers in the environment."""
     known = [layouts] if isinstance(layouts, Layout) else list(layouts)
-    dishes = [possible_recipes(layout) for layout in known]
-    most = max(map(len, dishes))
-    padded = np.array([[*own, *[_NO_DISH] * (most - len(own))] for own in dishes], np.uint8)
-    return Policy({"oracle": oracle_params(known), "dishes": padded}, _begin, _act, "situation")
+    return SITUATION_SEARCHER._replace(params={"oracle": oracle_params(known), "dishes": padded_dishes(known)})
+
+
+def padded_dishes(layouts: Sequence[Layout]) -> np.ndarray:
+    """Return the item bytes of the dishes that can be made on each layout, uint8 (layouts, D), padded with 0."""
+    dishes = np.full((len(layouts), MOST_DISHES), _NO_DISH, np.uint8)
+    for own, layout in zip(dishes, layouts, strict=True):
+        possible = possible_recipes(layout)
+        own[: len(possible)] = possible
+    return dishes
+
+
+def with_taken(memory: OracleMemory | SearchMemory, action: Int[Array, "*B"]) -> Any:
+    """Return the memory of the oracle or the searcher after another action than its own was taken."""
+    if isinstance(memory, SearchMemory):
+        return memory._replace(oracle=memory.oracle._replace(action=action))
+    return memory._replace(action=action)
 
 
 def _begin(params: Any, key: Key[Array, ""]) -> SearchMemory:
@@ -75,6 +91,10 @@ def _act(params: Any, memory: SearchMemory, view: Situation, key: Key[Array, ""]
     record = view.record.at[columns(view.tables).recipe].set(believed)
     action, oracle = SITUATION_ORACLE.act((facts, blank), memory.oracle, view._replace(record=record), key)
     return action, memory._replace(oracle=oracle)
+
+
+SITUATION_SEARCHER = Policy((), _begin, _act, "situation")
+"""The ego for any layouts; its parameters are a dictionary of `oracle_params` and `padded_dishes` of these."""
 
 
 def _learn(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"]) -> SearchMemory:

@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from rich import filesize
 
-from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, SCRIPTED_SOURCES
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.system import usable_cores
-from icrl4aht_generation.collection.noise import noise_bytes
 from icrl4aht_generation.collection.record import array_shapes
+from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.learners.network import ActorCritic
@@ -36,6 +36,8 @@ BYTES: dict[tuple[Kind, str], float] = {
     ("full", "ppo"): 9.23,
     ("lite", "noise"): 2.55,
     ("full", "noise"): 12.01,
+    ("lite", "search"): 2.55,
+    ("full", "search"): 12.01,
 }
 """Bytes of a transition in a release, by kind and source, measured on the bundled release."""
 
@@ -44,6 +46,9 @@ ENVIRONMENT_STEPS_PER_SECOND = 180_000.0
 
 COMPILE_SECONDS = 30.0
 """Programs of a task or a population, on 2 CPU cores."""
+
+SCRIPTED_SECONDS = 1.0
+"""Writing a task of scripted histories; its program is compiled once for a family of teammates."""
 
 _GRADIENT = 3.1  # time of a gradient step in forward passes: measured with the networks of `smoke` and `paper`
 
@@ -62,16 +67,16 @@ class RebuildCost:
         tasks: number of tasks.
         learners: number of egos that learn.
         environment_steps: environment steps of all of them.
-        noise_histories: number of noise histories.
-        noise_transitions: number of their transitions.
-        recorded_transitions: transitions of all streams and noise histories, before the stream filter.
+        scripted_histories: number of histories that a script plays.
+        scripted_transitions: number of their transitions.
+        recorded_transitions: transitions of all streams and scripted histories, before the stream filter.
         kept_transitions: transitions after the stream filter, at most.
         artefact_bytes: size of the artefacts of all tasks.
         lite_bytes, full_bytes: sizes of a lite and of a full release.
         device: the device on which the networks were measured.
         steps_per_second: speed of egos that learn, the mean of all; None without egos.
         teammate_hours: hours to train all populations on one device.
-        noise_hours: hours to play all noise histories on one device.
+        scripted_hours: hours to play all scripted histories on one device.
         hours_on_one: hours of the complete rebuild on one device.
         devices: number of devices.
         hours_on_devices: hours of the complete rebuild on this number of devices.
@@ -83,8 +88,8 @@ class RebuildCost:
     tasks: int
     learners: int
     environment_steps: int
-    noise_histories: int
-    noise_transitions: int
+    scripted_histories: int
+    scripted_transitions: int
     recorded_transitions: int
     kept_transitions: int
     artefact_bytes: int
@@ -93,7 +98,7 @@ class RebuildCost:
     device: str
     steps_per_second: float | None
     teammate_hours: float
-    noise_hours: float
+    scripted_hours: float
     hours_on_one: float
     devices: int
     hours_on_devices: float
@@ -117,29 +122,37 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
         profile: the profile.
         devices: number of devices that share the tasks.
     """
-    layouts = {name: get_layout(name) for name in profile.layouts}
-    tasks = {source: {name: profile.tasks_on(name, source) for name in layouts} for source in profile.sources}
+    tasks = {
+        source: {name: profile.tasks_on(name, source) for name in profile.layouts_of(source)}
+        for source in profile.sources
+    }
     egos = [
-        (layouts[name], profile.ego_on(name))
+        (get_layout(name), profile.ego_on(name))
         for name, count in tasks.get("ppo", {}).items()
         for _ in range(count * profile.learners)
     ]
-    noise = [layouts[name] for name, count in tasks.get("noise", {}).items() for _ in range(count)]
+    scripted = [
+        (source, get_layout(name), profile.scripted[source])
+        for source in SCRIPTED_SOURCES
+        for name, count in tasks.get(source, {}).items()
+        for _ in range(count)
+    ]
     runs = population_runs(profile, profile.algorithms, 0)
 
     steps = sum(ego.updates * ego.steps_per_update for _, ego in egos)
     playing = [ego.updates * ego.steps_per_update * step_seconds(ego) for _, ego in egos]
-    noise_transitions = profile.noise.histories * profile.noise.episodes * KEPT_STEPS
-    noise_seconds = noise_transitions / ENVIRONMENT_STEPS_PER_SECOND + COMPILE_SECONDS
-    seconds = [played + COMPILE_SECONDS for played in playing] + [noise_seconds] * len(noise)
+    transitions = [config.histories * config.episodes * KEPT_STEPS for _, _, config in scripted]
+    scripted_seconds = [count / ENVIRONMENT_STEPS_PER_SECOND + SCRIPTED_SECONDS for count in transitions]
+    seconds = [played + COMPILE_SECONDS for played in playing] + scripted_seconds
     teammate_seconds = sum(run.steps * step_seconds(run.config) + COMPILE_SECONDS for run in runs)
     kept = {
         "ppo": sum(
             count * profile.keep * profile.ego_on(name).episodes * KEPT_STEPS
             for name, count in tasks.get("ppo", {}).items()
         ),
-        "noise": len(noise) * noise_transitions,
     }
+    for (source, _, _), count in zip(scripted, transitions, strict=True):
+        kept[source] = kept.get(source, 0) + count
     sizes = {kind: round(sum(kept[source] * BYTES[kind, source] for source in kept)) for kind in KINDS}
     device = jax.devices()[0]
     return RebuildCost(
@@ -149,17 +162,17 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
         tasks=sum(sum(counts.values()) for counts in tasks.values()),
         learners=len(egos),
         environment_steps=steps,
-        noise_histories=len(noise) * profile.noise.histories,
-        noise_transitions=kept["noise"],
-        recorded_transitions=sum(ego.environments * ego.episodes * KEPT_STEPS for _, ego in egos) + kept["noise"],
+        scripted_histories=sum(config.histories for _, _, config in scripted),
+        scripted_transitions=sum(transitions),
+        recorded_transitions=sum(ego.environments * ego.episodes * KEPT_STEPS for _, ego in egos) + sum(transitions),
         kept_transitions=sum(kept.values()),
-        artefact_bytes=artefact_bytes(egos) + sum(noise_bytes(layout, profile.noise) for layout in noise),
+        artefact_bytes=artefact_bytes(egos) + sum(scripted_bytes(layout, config) for _, layout, config in scripted),
         lite_bytes=sizes["lite"],
         full_bytes=sizes["full"],
         device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
         steps_per_second=round(steps / sum(playing), 1) if egos else None,
         teammate_hours=round(teammate_seconds / 3600, 2),
-        noise_hours=round(len(noise) * noise_seconds / 3600, 2),
+        scripted_hours=round(sum(scripted_seconds) / 3600, 2),
         hours_on_one=round((teammate_seconds + sum(seconds)) / 3600, 2),
         devices=devices,
         # Each round of tasks takes as long as its longest.

@@ -10,14 +10,14 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 from msgspec import Meta, Struct
 
-from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, REBUILT_SOURCES
+from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, PREFERENCE_LAYOUTS, REBUILT_SOURCES
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import add_layouts, get_layout
 from icrl4aht_data.utils.options import Count, Natural, replace_options
 from icrl4aht_generation.layouts.families import generate_layouts
 from icrl4aht_generation.learners.config import PPOConfig
-from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.profiles.profile import Profile, SampledConfig, TeammateConfig
 
 FOLDER = Path(__file__).parent
@@ -66,6 +66,7 @@ class _Tasks(Struct, forbid_unknown_fields=True):
     presets: _Names = ()
     sampled: _Sampled | None = None
     algorithms: _Names | dict[str, _Names] = ()
+    preference: _Names = ()
 
 
 class _ProfileFile(Struct, forbid_unknown_fields=True):
@@ -76,6 +77,7 @@ class _ProfileFile(Struct, forbid_unknown_fields=True):
     ego: dict[str, Any] = {}
     teammates: dict[str, Any] = {}
     noise: dict[str, Any] = {}
+    search: dict[str, Any] = {}
     xla_threads: Count | None = None
 
 
@@ -123,9 +125,16 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
     for one in tasks.generated:
         found = generate_layouts(one.family, one.seed, one.count, split=one.split)
         layouts += tuple(layout.name for layout in add_layouts(found))
-    if not layouts:
-        raise OptionError("tasks.layouts: none, expected layouts there or in tasks.generated")
     _known("source", "tasks.sources", sources, REBUILT_SOURCES)
+    if not layouts and sources != ("search",):
+        raise OptionError("tasks.layouts: none, expected layouts there or in tasks.generated")
+    preference = PREFERENCE_LAYOUTS["train"] if tasks.preference == ("all",) else tasks.preference
+    _known("layout of the track preference", "tasks.preference", preference, PREFERENCE_LAYOUTS["train"])
+    if bool(preference) != ("search" in sources):
+        raise OptionError(
+            f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: expected layouts of the "
+            f"track preference with the source search, and none without it"
+        )
     ego = dict(content.ego)
     of_layouts = _by_layout("ego.layouts", ego.pop("layouts", {}), layouts)
     egos = replace_options(PPOConfig(), ego, "ego.")
@@ -138,6 +147,8 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         ego_layouts={each: replace_options(egos, of, f"ego.layouts.{each}.") for each, of in of_layouts.items()},
         teammates=_teammates(content.teammates),
         noise=replace_options(NoiseConfig(), content.noise, "noise."),
+        search=replace_options(SEARCH, content.search, "search."),
+        preference=_distinct("tasks.preference", preference),
         data_version=check_version(release.data_version),
         keep=release.keep if "ppo" in sources else 0,
         layouts=layouts,

@@ -53,3 +53,8 @@ class NoiseConfig:
             raise OptionError(f"begin = {list(self.begin)}: expected it to end before finish = {list(self.finish)}")
         if self.start[0] < self.end[1]:
             raise OptionError(f"start = {list(self.start)}: expected no value below those of end = {list(self.end)}")
+
+
+SEARCH = NoiseConfig(start=(0.0, 0.2), begin=(1.0, 1.0))
+"""Default of the source `search`: each history has one chance of a random action until its last episode, so that the
+number of an episode does not tell how well it is played."""

@@ -11,17 +11,19 @@ from icrl4aht_data.benchmark.facts import (
     LAYOUT_NAMES,
     PAPER_TEAMMATE_STEPS,
     PAPER_TEAMMATES,
+    PREFERENCE,
+    PREFERENCE_LAYOUTS,
     SOURCES,
     track_of,
 )
-from icrl4aht_data.benchmark.tasks import Task, make_task
+from icrl4aht_data.benchmark.tasks import Task, make_task, manifest_path, read_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import json_hash
 from icrl4aht_data.utils.options import Count, Natural, Option, check_options, replace_options
 from icrl4aht_generation.layouts.families import split_of
 from icrl4aht_generation.learners.config import PPOConfig
-from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.draws import drawn_teammates
 from icrl4aht_generation.teammates.registry import heuristic_teammate
@@ -102,13 +104,16 @@ class Profile:
         data_version: version of the release, SemVer.
         keep: streams of each task that the release keeps, best first.
         layouts: names of the layouts.
-        sources: how histories are made: "ppo", "noise" or both.
+        sources: how histories are made: "ppo", "noise" and "search", one or more.
         learners: independent learners of each task of the source "ppo".
         presets: teammates by the heuristic H4 `utility_greedy`, on every layout and of every source.
         sampled: teammates by heuristics with sampled parameters.
         algorithms: layout -> algorithms of its learned teammates.
         ego_layouts: layout -> hyper-parameters of its egos, where they differ from `ego`.
         noise: histories of the source "noise".
+        search: histories of the source "search".
+        preference: layouts of the source "search": it has their training and validation tasks of the track
+            `preference`, and the other sources have none of these.
         policies: whether the release has the policies that label its histories.
         oracle_actions: whether the release has the scripted oracle's action at every step.
         least_improvement: how much a stream's end must exceed its start to be kept; None keeps the best in any case.
@@ -133,6 +138,8 @@ class Profile:
     algorithms: dict[str, tuple[str, ...]] = field(default_factory=dict)
     ego_layouts: dict[str, PPOConfig] = field(default_factory=dict)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
+    search: NoiseConfig = SEARCH
+    preference: tuple[str, ...] = ()
     policies: bool = False
     oracle_actions: bool = False
     least_improvement: float | None = None
@@ -166,9 +173,14 @@ class Profile:
         """Return the hyper-parameters of the egos on a layout (short name)."""
         return self.ego_layouts.get(layout, self.ego)
 
-    def updates(self, work: Work) -> int:
-        """Return the units of progress: updates of a learner, or histories of the source "noise"."""
-        return self.ego_on(work.task.layout.name).updates if work.source == "ppo" else self.noise.histories
+    @property
+    def scripted(self) -> dict[str, NoiseConfig]:
+        """Histories of the sources that a script plays."""
+        return {"noise": self.noise, "search": self.search}
+
+    def layouts_of(self, source: str) -> tuple[str, ...]:
+        """Return the names of a source's layouts."""
+        return self.preference if source == "search" else self.layouts
 
     def works(self, learned: Sequence[Task] = ()) -> list[Work]:
         """Return the units of work, by source and layout.
@@ -181,8 +193,8 @@ class Profile:
         """
         works = []
         for source in self.sources:
-            for layout in self.layouts:
-                own = [task for task in learned if task.layout.name == layout]
+            for layout in self.layouts_of(source):
+                own = [task for task in learned if task.layout.name == layout and source != "search"]
                 tasks = [*self._heuristic_tasks(layout, source), *(_of_source(task, source) for task in own)]
                 works += [Work(task, source, learner) for task in tasks for learner in range(self._learners(source))]
         return works
@@ -213,10 +225,17 @@ class Profile:
 
     def tasks_on(self, layout: str, source: str) -> int:
         """Return the number of tasks of a source on a layout, if every population has enough good teammates."""
-        learned = len(self.algorithms.get(layout, ())) * self.teammates.train
+        learned = len(self.algorithms.get(layout, ())) * self.teammates.train * (source != "search")
         return len(self._heuristic_tasks(layout, source)) + learned
 
     def _heuristic_tasks(self, layout: str, source: str) -> list[Task]:
+        if source == "search":
+            first = _first_seed(source) + PREFERENCE_LAYOUTS["train"].index(layout) * _LAYOUT_SEEDS
+            own = [task for task in _preference_tasks() if task.layout.name == layout]
+            return [
+                make_task(task.track, task.split, layout, task.teammate, first + number, task.recipes)
+                for number, task in enumerate(own)
+            ]
         track, first = track_of(layout), self.layouts.index(layout) * len(self.presets)
         split = "train" if layout in LAYOUT_NAMES else split_of(get_layout(layout))
         tasks = [
@@ -235,6 +254,11 @@ class Profile:
     def hash(self) -> str:
         """Hash of the profile."""
         return json_hash(asdict(self))
+
+
+def _preference_tasks() -> list[Task]:
+    """Return the training and validation tasks of the track `preference`."""
+    return [task for split in ("train", "validation") for task in read_tasks(manifest_path(PREFERENCE, split))]
 
 
 def _sampled_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:

@@ -12,7 +12,7 @@ class Work(NamedTuple):
 
     Attributes:
         task: the task.
-        source: how its histories are made: "ppo", by an ego that learns, or "noise".
+        source: how its histories are made: "ppo", by an ego that learns, "noise" or "search", by a script.
         learner: number of the learner among the independent ones of the task.
     """
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.format.info import LeftOutTask, read_info
+from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.plotting import check_can_draw
@@ -17,7 +17,7 @@ from icrl4aht_data.utils.files import check_own_folder, process_lock
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.writing.card import facts as release_facts
 from icrl4aht_data.writing.card import teammate_name
-from icrl4aht_data.writing.statistics import print_learning, print_statistics
+from icrl4aht_data.writing.statistics import print_learning
 from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.jobs.job import FAILED, FailedJobsError
 from icrl4aht_generation.jobs.options import QueueOptions
@@ -101,7 +101,6 @@ def build_releases(
                     left_out=left_out,
                 )
         for release in releases:
-            print_statistics(read_info(release), console)
             print_learning(release_facts(release), console)
     return releases
 

@@ -63,7 +63,7 @@ def select_histories(
 ) -> TaskHistories | LeftOutTask:
     """Choose the histories of a task that a release keeps.
 
-    A noise history is always kept; of the streams of learners, the best are kept. On layouts with headroom,
+    A scripted history is always kept; of the streams of learners, the best are kept. On layouts with headroom,
     `profile.least_improvement` also drops the streams that improve by less, and the tasks whose teammate makes no
     difference to the ego; `profile.least_rise` drops the tasks whose kept histories rise by less.
 

@@ -18,7 +18,6 @@ from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
 from icrl4aht_data.overcooked.actions import TEAMMATE
-from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.populations.headroom import learned_headroom
 from icrl4aht_generation.releases.remembered import measured_once
@@ -85,10 +84,10 @@ def teammate_facts(
         settings = software_versions() | {
             "version": version("icrl4aht-data"),
             "layout": layout,
-            "teammates": [task.teammate for task in chosen],
+            "teammates": [[task.teammate, task.recipes] for task in chosen],
             "episodes": REFERENCE_EPISODES,
         }
-        measure = partial(_measure, get_layout(layout), chosen, suite, headroom)
+        measure = partial(_measure, chosen, suite, headroom)
         measured = measured_once(kept, settings, list[TeammateFacts], measure)
         found |= dict(zip(keys, measured, strict=True))
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
@@ -105,9 +104,7 @@ def recorded_provenance(suite: Path) -> dict[str, Provenance]:
     return release_provenance(suite.parent) if suite.name == TEAMMATES else {}
 
 
-def _measure(
-    layout: Layout, tasks: Sequence[Task], suite: Path, headroom: Mapping[str, ReferenceEgos]
-) -> list[TeammateFacts]:
+def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, ReferenceEgos]) -> list[TeammateFacts]:
     """Measure the returns with teammates of one layout, and the distances of learned ones to the test teammates.
 
     For heuristics outside the table, such as presets, the card says that the test has their family. Measuring their
@@ -118,12 +115,12 @@ def _measure(
     missing = [task for task in learned if task.task_id not in headroom]
     returns = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
     returns |= learned_headroom(missing, suite) if missing else {}
-    if heuristics:
-        egos = reference_returns(layout, [build_teammate(None, task.teammate) for task in heuristics])
-        for k, task in enumerate(heuristics):
-            stay, random, oracle = (float(egos[ego][k]) for ego in ("stay", "random", "oracle"))
-            returns[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES)
+    for task in heuristics:  # one at a time: tasks may want dishes of their own, and all of a family share a program
+        egos = reference_returns(task.layout, [build_teammate(None, task.teammate)])
+        stay, random, oracle = (float(egos[ego][0]) for ego in ("stay", "random", "oracle"))
+        returns[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES)
     nearest: dict[str, NearestTest] = {}
+    layout = tasks[0].layout
     if learned and layout.name in TESTED_ON:  # other layouts have no test teammates
         for task, near in zip(learned, nearest_test(layout, [_build(task, suite) for task in learned]), strict=True):
             nearest[task.task_id] = NearestTest(near.teammate, round(near.distance, _DIGITS), near.behaviour)

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES, SCRIPTED_SOURCES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError
@@ -60,7 +60,7 @@ def package_release(
     """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
 
     `select_histories` chooses what is kept. The histories of learners are labelled by the checkpoint of their egos that
-    `choose_labeller` returns, those of the source "noise" by their script.
+    `choose_labeller` returns, others by their script.
 
     Args:
         artefacts: folder of the finished artefacts.
@@ -173,27 +173,34 @@ def _new_task(
         suite=_populations(task, profile, suite, recorded) if task.teammate_family == "rl" else None,
     )
     files = checkpoint_files(suite, task)
-    if found.source == "noise":
-        return _noise_task(found, replace(made, noise=metadata["noise"]), profile, files)
+    if found.source in SCRIPTED_SOURCES:
+        return _scripted_task(found, replace(made, noise=metadata["noise"]), profile, files)
     learned = replace(made, ego=metadata["ego"], ego_hash=metadata["ego_hash"], learners=len(found.folders))
     return _ppo_task(found, learned, profile, suite, files)
 
 
-def _noise_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
-    """Return a task of the source "noise", whose labels are the actions of its script."""
-    earned = made.references
+def _scripted_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
+    """Return a task whose labels are the actions of its script."""
+    if found.source == "noise":
+        earned, action = made.references, "scripted oracle, which sees the full state"
+    else:
+        earned, action = None, "scripted searcher, which sees the full state but not which dish is wanted"
     expert = ExpertLabels(
         policy_sha256=None,
-        action="scripted oracle, which sees the full state",
+        action=action,
         return_greedy=None if earned is None else earned.oracle,
         episodes=None if earned is None else earned.episodes,
     )
 
     def load() -> Iterator[NewHistory]:
         for _, stream, arrays in _recorded_histories(found):
-            labels = np.load(found.folders[0] / "oracle_actions.npy", mmap_mode="r")[stream]
-            wanted = {"oracle_actions": labels} if profile.oracle_actions else {}
-            yield NewHistory(stream, arrays | {"expert_actions": labels} | wanted)
+            labels = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")[stream]
+            wanted = {"expert_actions": labels}
+            if profile.oracle_actions and found.source == "noise":
+                wanted["oracle_actions"] = labels
+            elif profile.oracle_actions:
+                wanted["oracle_actions"] = oracle_labels(found.task.layout, arrays["state"], arrays["actions"])
+            yield NewHistory(stream, arrays | wanted)
 
     return NewTask(found.task, replace(made, expert=expert), len(found.kept), load, files)
 

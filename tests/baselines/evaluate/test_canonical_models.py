@@ -88,7 +88,7 @@ def test_jax_egos_get_canonical_channels_on_every_layout(layout):
     state = RolloutState(EnvState(key, zero, zero, jnp.asarray(record[None])), (), before)
     for channels in ("own", "canonical"):
         rollout = EvaluationRollout(layout, with_view(shown, channels), [], PROTOCOLS["seeded"])
-        seen: Any = rollout.ego_actions((), state, key)[0]
+        seen: Any = jax.jit(rollout.ego_actions)((), state, key)[0]
         np.testing.assert_array_equal(seen.obs[0], observe(layout, record, 0, canonical=channels == "canonical"))
         assert seen._replace(obs=0) == before._replace(obs=0)
 
@@ -187,21 +187,3 @@ def test_an_experiment_with_one_model_of_all_layouts(lite, tmp_path, monkeypatch
     plan = dataclasses.replace(plan, root=str(tmp_path / "two"))
     tested = {task.layout.name for task in experiments._test_tasks(EXPERIMENTS["tracks"], plan, "all")}
     assert tested == {TESTED_ON["asymm_both"], TESTED_ON["cramped_up"]}
-
-
-def test_the_options_of_the_experiments(monkeypatch, tmp_path):
-    plans = []
-
-    def run_plan(name, plan, out, progress):
-        plans.append(plan)
-        return experiments.ExperimentOutcome([], [])
-
-    monkeypatch.setattr(experiments, "run_experiment", run_plan)
-    for given in (["--layout", "all"], ["--layout", "demo_wide", "--channels", "canonical"]):
-        result = CliRunner().invoke(cli, ["research", "tracks", *given, "--out", str(tmp_path)], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-    chosen = [(plan.layouts, plan.histories.get("channels")) for plan in plans]
-    assert chosen == [(("all",), None), (("demo_wide",), "canonical")]
-    wrong = CliRunner().invoke(cli, ["research", "tracks", "--layout", "al"])
-    assert wrong.exit_code == 2
-    assert "unknown layout 'al'; valid: all, coord_simple" in wrong.output

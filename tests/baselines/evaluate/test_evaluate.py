@@ -328,17 +328,6 @@ def test_validation_tasks_are_reported_separately(tmp_path, monkeypatch):
     assert sizes == {("coord_simple", "H4", "test"): 5, ("coord_simple", "H4", "validation"): 2}
 
 
-def test_a_manifest_has_its_own_splits(tmp_path):
-    write_tasks(tmp_path / "tasks.jsonl", SIMPLE)
-    command = ["evaluate", "--agent", "stay", "--out", str(tmp_path / "run"), "--split", "validation"]
-    result = CliRunner().invoke(cli, [*command, "--manifest", str(tmp_path / "tasks.jsonl")])
-    assert result.exit_code == 2
-    assert "--split: not with --manifest" in result.output
-    result = CliRunner().invoke(cli, [*command[:-1], "train"])
-    assert result.exit_code == 2
-    assert "unknown split 'train'; valid: test, validation" in result.output
-
-
 def test_headroom_cards_cover_every_cell():
     for protocol in ("published", "seeded"):
         assert set(read_headroom(protocol)) == {(task.layout.name, task.teammate_family) for task in ALL}

@@ -140,6 +140,7 @@ def test_several_queries_equal_single_queries():
         query_target=np.stack([batch.query_target, other.query_target], axis=1),
     )
 
+    @jax.jit
     def logits(asked):
         return run(method, params, *batch_transitions(asked, plain_view)).logits
 
@@ -152,7 +153,7 @@ def test_several_queries_equal_single_queries():
         for j in range(7)
     ]
     expected = np.mean([losses[j if j % 2 == 0 else 7 + j] for j in range(7)])
-    assert method.loss(params, None, both, None)[1]["action_loss"] == pytest.approx(expected, rel=1e-5)
+    assert jax.jit(method.loss)(params, None, both, None)[1]["action_loss"] == pytest.approx(expected, rel=1e-5)
 
 
 def query_mask(context: int) -> np.ndarray:

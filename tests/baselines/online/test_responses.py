@@ -77,7 +77,7 @@ def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
     write_responses(jobs, path, models)
     (third,) = read_best_responses(path).behaviours
     assert (third.best, third.agent, third.seeds) == (9.5, "better", entry.seeds)
-    assert "| demo_wide | test | H1 t0 | 9.5 | better | 9.0 to 20.0 | 2 | 400 | +0.0 |" in responses_table(path)
+    assert "| demo_wide | test | H1 t0 | 9.5 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |" in responses_table(path)
     pair = ResponseJob(Behaviour((DEMO[0], DEMO[1])), 0, TINY, tmp_path / "pair")
     finished(pair, choice=1.0, earned=1.0)
     write_responses([pair], path)

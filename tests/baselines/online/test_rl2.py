@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,14 @@ def trainer() -> PlayTrainer:
 
 
 @pytest.fixture(scope="module")
-def through(trainer, tmp_path_factory) -> tuple[Path, Any]:
+def episode(trainer) -> Any:
+    """The compiled episode of the trainer's only player, which its steps play as well."""
+    trainer._compiled = trainer._compile(trainer.init(), jax.random.key(0))
+    return trainer._compiled[0]
+
+
+@pytest.fixture(scope="module")
+def through(trainer, episode, tmp_path_factory) -> tuple[Path, Any]:
     folder = tmp_path_factory.mktemp("rl2") / "run"
     return folder, train(METHOD, TrainingData(None, {}), OPTIONS, folder, {}, trainer=trainer)
 
@@ -82,26 +90,27 @@ def test_the_memory_continues_over_steps_and_calls():
     )
     params = METHOD.init(jax.random.key(0))
     start = jnp.zeros((3, 16))
-    found: Any = METHOD.model.apply({"params": params}, steps, start)
+    apply, act = jax.jit(partial(METHOD.model.apply, {"params": params})), jax.jit(METHOD.act)
+    found: Any = apply(steps, start)
     output, end = found
-    half, state = METHOD.model.apply({"params": params}, jax.tree.map(lambda x: x[:3], steps), start)
-    rest, last = METHOD.model.apply({"params": params}, jax.tree.map(lambda x: x[3:], steps), state)
+    half, state = apply(jax.tree.map(lambda x: x[:3], steps), start)
+    rest, last = apply(jax.tree.map(lambda x: x[3:], steps), state)
     np.testing.assert_allclose(output.logits, jnp.concatenate([half.logits, rest.logits]), atol=1e-5)
     np.testing.assert_allclose(np.asarray(end), np.asarray(last), atol=1e-5)
     memory = METHOD.start(0, True)
     for t in range(6):
-        logits, memory = METHOD.act(params, jax.tree.map(lambda x, t=t: x[t, 1], steps), jnp.bool_(False), memory)
+        logits, memory = act(params, jax.tree.map(lambda x, t=t: x[t, 1], steps), jnp.bool_(False), memory)
         np.testing.assert_allclose(logits, output.logits[t, 1], atol=1e-5)
     with pytest.raises(TypeError, match="trained by playing"):
         METHOD.loss(params, None, None, None)
 
 
-def test_episodes_for_learning(trainer):
+def test_episodes_for_learning(trainer, episode):
     """Learning sequences contain the observations, actions and rewards of the played episode."""
     player, state = trainer.players[0], trainer.init()
     tasks, key = state.tasks[0], jax.random.key(3)
     for number in range(3):  # unfinished tasks continue in the next episode
-        after, played, returns = player.compiled(state.params, player.mates, tasks, jax.random.fold_in(key, number))
+        after, played, returns = episode(state.params, player.mates, tasks, jax.random.fold_in(key, number))
         assert played.action.shape == (100, 8)
         np.testing.assert_array_equal(played.seen.prev_action[1:], played.action[:-1])
         np.testing.assert_allclose(played.reward.sum(axis=0) / PLAY_REWARD_SCALE, returns, rtol=1e-5)
@@ -124,10 +133,10 @@ def test_the_log(through):
     assert {"return cramped_up assembly_line", "policy_loss", "value_loss", "entropy", "loss"} <= lines[0].keys()
 
 
-def test_imitation_makes_oracle_actions_likelier(trainer):
+def test_imitation_makes_oracle_actions_likelier(trainer, episode):
     """On a fixed episode, the oracle's actions become likelier only with a positive imitation weight."""
     state = trainer.init()
-    _, played, _ = trainer.players[0].episode(state.params, trainer._mates[0], state.tasks[0], jax.random.key(0))
+    _, played, _ = episode(state.params, trainer._mates[0], state.tasks[0], jax.random.key(0))
     fallen = {}
     for weight in (0.0, 5.0):
         params, optimizer = jax.tree.map(jnp.copy, (state.params, state.optimizer))
@@ -166,8 +175,9 @@ def test_a_first_step_is_not_mirrored(layers):
     model = dataclasses.replace(MODEL, recurrent_layers=layers)
     method = get_method("rl2")(model, overcooked_world([LAYOUT], "mlp", canonical=True))
     params, state = method.init(jax.random.key(0)), jnp.zeros((2, 16 * layers))
-    both: Any = method.model.apply({"params": params}, jax.tree.map(lambda x: x[None], steps), state)
-    _, alone = method.act(params, jax.tree.map(lambda x: x[0], steps), jnp.bool_(False), method.start(0, True))
+    both: Any = jax.jit(method.model.apply)({"params": params}, jax.tree.map(lambda x: x[None], steps), state)
+    step, memory = jax.tree.map(lambda x: x[0], steps), method.start(0, True)
+    _, alone = jax.jit(method.act)(params, step, jnp.bool_(False), memory)
     np.testing.assert_allclose(np.asarray(both[1][0]), np.asarray(alone), atol=1e-6)
 
 
@@ -380,15 +390,3 @@ class TestCommand:
         assert trained.hide_recipe == ("cramped_up",)
         task = published_task("cramped_down", "H1/t0")
         prepare_rollout(agent.make, [task], get_protocol("seeded", 1))  # compiles
-
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            (["rl2", "--size", "tiny"], "--size: not with rl2, which learns by playing"),
-            (["rl2", "--next-obs", "--layers", "2"], "--layers, --next-obs: not with rl2, which learns by playing"),
-            (["ad", "--epochs", "2"], "--epochs: not with ad, only with rl2, which learns by playing"),
-        ],
-    )
-    def test_options_of_other_methods(self, tmp_path, arguments, message):
-        result = CliRunner().invoke(cli, ["train", *arguments, "--layout", "demo_wide", "--out", str(tmp_path / "run")])
-        assert result.exit_code == 2 and message in result.output

@@ -109,28 +109,28 @@ def test_tasks_of_another_collector_come_last(tasks, tmp_path, monkeypatch):
     assert calls == [0, 1, 0]
 
 
-def test_waiting_for_the_other_collector(tasks, pair, tmp_path):
+def test_waiting_for_the_other_collector(tasks, built, tmp_path):
     """A task that the other collector finishes is not repeated."""
     work, profile = tasks[0][0], tasks[1]
     folder = tmp_path / "artefacts" / work.name
     folder.parent.mkdir()
     with run_lock(folder):
         assert run_job(CollectionJob(work, profile, folder.parent), wait=False) == "busy"
-        shutil.copytree(pair / "artefacts" / work.name, folder)
+        shutil.copytree(artefact(built / "a"), folder)
     before = (folder / "metadata.json").stat().st_mtime_ns
     assert run_job(CollectionJob(work, profile, folder.parent), wait=True) == "done"
     assert (folder / "metadata.json").stat().st_mtime_ns == before
 
 
-def test_a_full_disk_ends_one_task(tasks, pair, tmp_path, monkeypatch):
+def test_a_full_disk_ends_one_task(tasks, built, tmp_path, monkeypatch):
     """The first task fails on the full disk, the second finishes, and the failure is logged."""
-    works, _ = tasks
+    works = tasks[0][::-1]
     second = tmp_path / "artefacts" / works[1].name
-    shutil.copytree(pair / "artefacts" / second.name, partial_folder(second))
+    shutil.copytree(artefact(built / "a"), partial_folder(second))
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=10**9, used=10**9, free=5_000))
     output = StringIO()
     with pytest.raises(FailedJobsError, match=f"1 of 2 jobs are unfinished: {works[0].name}; "):
-        collect(tasks, tmp_path, Console(file=output, width=500))
+        collect((works, tasks[1]), tmp_path, Console(file=output, width=500))
     assert second.is_dir()
     (failure,) = failures(tmp_path)
     assert failure["error"].startswith("DiskFullError: ")
@@ -138,12 +138,10 @@ def test_a_full_disk_ends_one_task(tasks, pair, tmp_path, monkeypatch):
     assert "Traceback" not in output.getvalue()
 
 
-def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(built, pair, tmp_path, monkeypatch, capsys):
-    shutil.copytree(pair / "artefacts", tmp_path / "artefacts")
-    second = artefact(tmp_path, 1)
-    partial = partial_folder(second)
-    second.rename(partial)
-    (partial / "metadata.json").unlink()
+def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(tasks, built, tmp_path, monkeypatch, capsys):
+    shutil.copytree(built / "a" / "artefacts", tmp_path / "artefacts")
+    partial = partial_folder(tmp_path / "artefacts" / tasks[0][1].name)
+    partial.mkdir()
     (partial / LEARNER).write_bytes(b"junk")
     monkeypatch.setattr(
         sys, "argv", ["icrl4aht_generation", "generate", "--profile", str(built / "pair.toml"), "--out", str(tmp_path)]
@@ -192,7 +190,7 @@ def test_ray_with_two_workers(built, pair, tmp_path):
     process = start(*command)
     while process.poll() is None:
         addresses |= listening(psutil.Process(process.pid))
-        time.sleep(0.2)
+        time.sleep(0.5)  # reading all connections takes CPU time
     output, errors = process.communicate()
     assert process.returncode == 1, output + errors
     assert "1 of 2 jobs are unfinished" in errors
@@ -212,7 +210,6 @@ def test_ray_with_two_workers(built, pair, tmp_path):
 
 
 def test_workers_of_a_cluster_are_its_own(tasks, tmp_path):
-
     with pytest.raises(OptionError, match="workers = 2: the Ray at there:6379 has its own"):
         collect(tasks, tmp_path, executor="ray", address="there:6379", workers=2)
 

@@ -16,6 +16,7 @@ from icrl4aht_generation.layouts import (
     families,
     find_generated,
     generate_layouts,
+    playable,
     split_of,
 )
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS
@@ -202,15 +203,9 @@ def test_a_sheet_needs_pillow(tmp_path, monkeypatch):
     assert result.exit_code == 1 and install_command("plot") in str(result.exception) and not any(tmp_path.iterdir())
 
 
-def test_the_command_refuses_more_layouts_than_there_are(monkeypatch):
-    monkeypatch.setitem(LAYOUT_FAMILIES, "rooms", lambda seed: iter(()))
-    result = CliRunner().invoke(cli, ["layouts", "--family", "rooms"])
-    assert result.exit_code == 1 and "it has 0 layouts, expected 24" in str(result.exception)
-
-
-@pytest.mark.slow  # compiles a program for each layout
-@EVERY_FAMILY
-def test_the_oracle_earns_something(family, drawn):
-    mate = build_teammate(None, heuristic_teammate("utility_greedy", "default", 0))
-    for layout in drawn[family][:2]:
-        assert reference_returns(layout, [mate])["oracle"] > 0
+@pytest.mark.slow
+def test_oracles_deliver(drawn, monkeypatch):
+    monkeypatch.setattr(playable, "_AT_ONCE", 4)  # two batches
+    idle = Layout("idle", "idle", ("WWWWWW", "WA  WW", "WAW0PB", "WWWWXW"), recipes=((0, 0, 0),))
+    layouts = [one for family in LAYOUT_FAMILIES for one in drawn[family][:2]]
+    assert playable.layouts_delivered([*layouts, idle]).tolist() == [True] * len(layouts) + [False]

@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 def policy():
     layout = get_layout("demo_wide")
     network = ActorCritic(Widths(encoder="mlp", dense=16, gru=8, head=8), view=CompactView("mlp", (layout,)))
-    return network, network.untrained(jax.random.key(0), layout.channels)
+    return network, jax.jit(network.untrained, static_argnums=1)(jax.random.key(0), layout.channels)
 
 
 def equal(ours, theirs) -> bool:

@@ -55,7 +55,7 @@ def test_compact_inputs_give_the_results_of_observations(kind):
         params = jax.tree.map(lambda values: values.astype(jnp.float64), params)
         expected_gradient, expected = with_gradient(plain)(params, obs)
         gradient, features = with_gradient(compact)(params, seen)
-        again: Any = compact.apply(params, obs)  # the same parameters also take plain observations, as when acting
+        again: Any = jax.jit(compact.apply)(params, obs)  # takes plain observations too, as when acting
     assert features.shape == (3, 20, 12) and features.dtype == jnp.float64
     found, wanted = (
         jax.tree.leaves((features, gradient, again)),
@@ -94,8 +94,8 @@ def test_what_the_rules_exclude_is_not_a_number():
     view, broken = CompactView("words", (LAYOUT,)), RECORDS.copy()
     broken[1, 4, columns(LAYOUT).hands] = 255
     module = encoder("words", view)
-    params = module.init(jax.random.key(1), view(jnp.asarray(RECORDS)))
-    wrong = np.isnan(np.asarray(module.apply(params, view(jnp.asarray(broken))))).any(axis=-1)
+    params = jax.jit(module.init)(jax.random.key(1), view(jnp.asarray(RECORDS)))
+    wrong = np.isnan(np.asarray(jax.jit(module.apply)(params, view(jnp.asarray(broken))))).any(axis=-1)
     assert np.argwhere(wrong).tolist() == [[1, 4]]
 
 

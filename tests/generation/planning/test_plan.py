@@ -6,7 +6,7 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from icrl4aht_generation.collection.noise import noise_bytes
+from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.planning import plan
 from icrl4aht_generation.profiles import load_profile
 
@@ -45,13 +45,13 @@ def test_noise_histories(tmp_path):
     found = plan.estimate_cost(profile, devices=2)
     transitions = profile.noise.histories * profile.noise.episodes * 100
     assert (found.learners, found.environment_steps, found.steps_per_second) == (0, 0, None)
-    assert found.noise_transitions == found.kept_transitions == found.tasks * transitions
+    assert found.scripted_transitions == found.kept_transitions == found.tasks * transitions
     assert (
-        found.noise_hours
+        found.scripted_hours
         == found.hours_on_one
         == pytest.approx(found.tasks * (transitions / 180_000 + 30) / 3600, abs=0.01)
     )
-    assert found.artefact_bytes == found.tasks * noise_bytes(get_layout(profile.layouts[0]), profile.noise)
+    assert found.artefact_bytes == found.tasks * scripted_bytes(get_layout(profile.layouts[0]), profile.noise)
     assert "learners" not in dict(found.rows())
 
 

@@ -1,6 +1,7 @@
 """Populations on disk: checkpoints and cards, interrupted and resumed runs, the selection of teammates, manifests.
 
-Each algorithm is trained at most once, by the shipped profile `smoke`: two members, six updates of 2,048 steps each.
+Each algorithm is trained at most once, by the shipped profile `smoke` with one epoch: two members, six updates of 2,048
+steps each.
 Fast tests train LBRDiv alone.
 """
 
@@ -13,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -24,6 +25,7 @@ from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import BusyError, run_lock
 from icrl4aht_generation.policy import stacked
 from icrl4aht_generation.populations import cross_play
+from icrl4aht_generation.populations import train as training
 from icrl4aht_generation.populations.select import (
     make_tasks,
     select_teammates,
@@ -54,7 +56,7 @@ EACH_ALGORITHM = pytest.mark.parametrize(
 )
 FIRST_MEMBER = {"comedi": 1}
 """Number of the first policy that may become a teammate; CoMeDi's first one is trained by self-play alone."""
-CONFIG, WIDTHS = SMOKE.ppo, SMOKE.ppo.widths
+CONFIG, WIDTHS = replace(SMOKE.ppo, epochs=1), SMOKE.ppo.widths
 
 
 TWO_DEVICES = """
@@ -78,6 +80,17 @@ np.savez(sys.argv[1], **flatten_dict(jax.tree.map(np.asarray, state.params), sep
 @cache
 def run_of(algorithm: str) -> PopulationRun:
     return PopulationRun(LAYOUT, algorithm, SMOKE.members, CONFIG, seed=0)
+
+
+short_cross_play = partial(cross_play.cross_play_returns, episodes=2)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_episodes():
+    """Evaluate checkpoints in 2 episodes, since 20 take longer than the training here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "cross_play_returns", short_cross_play)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +163,7 @@ def test_a_cards_return_is_that_checkpoints_own(trained):
     members = stacked([params for _, params, _ in loaded])
     responses = stacked([load_policy(folder / f"responses/m{m}")[1] for m in range(2)])
     for name, greedy in (("return", False), ("teammate_return", True)):
-        returns = cross_play.cross_play_returns(LAYOUT, loaded[0][0], responses, members, greedy=greedy, paired=True)
+        returns = short_cross_play(LAYOUT, loaded[0][0], responses, members, greedy=greedy, paired=True)
         assert [card[name] for _, _, card in loaded] == returns.tolist()
 
 

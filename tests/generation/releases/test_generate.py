@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
@@ -148,6 +149,7 @@ def learned(tmp_path_factory) -> Path:
     profile.write_text(LEARNED)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(select, "THRESHOLD", -np.inf)
+        patch.setattr(suite, "cross_play_returns", partial(suite.cross_play_returns, episodes=2))
         build.build_releases(load_profile(str(profile)), out, ["lite", "full"], Console(file=StringIO()))
     return out
 

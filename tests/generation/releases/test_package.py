@@ -67,7 +67,7 @@ def make_noise(built: Path, work: Work, artefacts: Path) -> None:
     folder.mkdir(parents=True)
     for name in HistoryArrays._fields:
         np.save(folder / f"{name}.npy", np.load(source / f"{name}.npy")[:2])
-    np.save(folder / "oracle_actions.npy", np.arange(1000).reshape(2, 500).astype(np.int8) % 6)
+    np.save(folder / "script_actions.npy", np.arange(1000).reshape(2, 500).astype(np.int8) % 6)
     metadata = json.loads((source / METADATA).read_text())
     for name in ("ego", "ego_hash", "checkpoint_updates"):
         del metadata[name]

@@ -96,7 +96,7 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
     layout = LAYOUTS[name]
     thetas = published_thetas(name, family)
     policy = build_teammate(layout, {"family": family, "theta": thetas[0]}, noise="fixed")
-    records = Environment(layout).init(jax.random.split(jax.random.key(7), episodes)).record
+    records = jax.jit(Environment(layout).init)(jax.random.split(jax.random.key(7), episodes)).record
     pinned = state_record(layout, (1, 1, "up"), (5, 2, "up"))
     recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
     recipes[:, -1] = layout.recipe_items[0]
@@ -240,7 +240,7 @@ def one_step(
     layout: Layout, family: str, slot: int, theta: dict[str, float], mine, partner, memory=None, **fields
 ) -> tuple[str, Any]:
     """Return the action name and memory of a teammate at `mine` (x, y, facing, item in hand), given `partner`."""
-    slots = ALL_SLOTS if layout.name in LAYOUTS else ((family, slot),)
+    slots = SLOTS_ON.get(layout.name, ((family, slot),))
     agents = (mine, partner) if slot == 0 else (partner, mine)
     fields["hands"] = [agent[3] for agent in agents]
     records = np.repeat(state_record(layout, agents[0][:3], agents[1][:3], **fields), ROWS, axis=0)
@@ -315,6 +315,12 @@ DEMO_CASES = [
     (H3, {"stubbornness": 1.0}, {}, "1 13- 51- right, 1 130 51- right, 0 41- 13- left"),
     (H3, {}, {}, "1 13- 51- down"),
 ]
+SLOTS_ON = {
+    "cramped_down": ALL_SLOTS[:-2],
+    "asymm_right": ((H1, 1), (H2, 1)),
+    "demo_wide": ALL_SLOTS,
+}
+"""The families and agents in the scenes of a layout; they are compiled together."""
 SCENES = {"cramped_down": CRAMPED_CASES, "asymm_right": ASYMM_CASES, "demo_wide": DEMO_CASES}
 """Family, parameters, state, and moves: agent; x, y, hand (- nothing, p plate, d dish, 0 or 1) and facing (up if not
 given) of itself; the same of the partner; the action. cramped_down has floor at (1..3, 1..2), plates at (1, 0), the

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import threading
-import urllib.error
-import urllib.request
-from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +16,6 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.browsing.drawings import ShapeRecorder, layout_drawings
 from icrl4aht_data.browsing.embedding import NO_ACTION, embed_history, spread_episodes, spread_histories
 from icrl4aht_data.browsing.page import PAGE_START, make_browser_page
-from icrl4aht_data.browsing.serving import page_server
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError, UnknownNameError
 from icrl4aht_data.overcooked.drawing import state_parts
@@ -168,7 +163,6 @@ class TestCommand:
         facts = json.loads(browse(release, "--out", out, "--histories", 4, "--json"))
         assert facts == {
             "page": str(out),
-            "address": None,
             "histories": 4,
             "episodes": 32,
             "shown_episodes": 32,
@@ -198,28 +192,6 @@ class TestCommand:
             browse(release)
         assert (tmp_path / "browse.html").read_text().endswith("<title>mine</title>")
 
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            (("--port", "0"), "--serve"),
-            (("--overwrite", "--serve"), "--out FILE"),
-            (("--out", "page.txt"), ".html"),
-            (("--out", "missing/page.html"), "missing"),
-            (("--histories", "0"), "--histories"),
-        ],
-    )
-    def test_misuse(self, release, tmp_path, monkeypatch, arguments, message):
-        monkeypatch.chdir(tmp_path)
-        assert message in browse(release, *arguments, code=2)
-        assert not list(tmp_path.iterdir())
-
-    def test_serve(self, release, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
-        assert "http://127.0.0.1:" in browse(release, "--serve")
-        assert json.loads(browse(release, "--serve", "--json"))["address"].startswith("http://127.0.0.1:")
-        assert not list(tmp_path.iterdir())
-
 
 def test_impossible_states_and_actions_are_errors(release, monkeypatch):
     history = load_icrl4aht(release)[0]
@@ -239,22 +211,3 @@ def test_impossible_states_and_actions_are_errors(release, monkeypatch):
             embed_history(history)
         wrong.clear()
     assert len(embed_history(history).records) == 8 * 21
-
-
-def test_the_server_listens_on_loopback_only():
-    with page_server(b"<p>page") as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            assert server.server_address[0] == "127.0.0.1"
-            address = f"http://127.0.0.1:{server.server_port}"
-            with urllib.request.urlopen(f"{address}/?x#history=1") as response:
-                assert response.read() == b"<p>page"
-                assert response.headers["Content-Type"] == "text/html; charset=utf-8"
-            with pytest.raises(urllib.error.HTTPError, match="404"):
-                urllib.request.urlopen(f"{address}/other")
-            with pytest.raises(OptionError, match=f"port {server.server_port}: .*; give another one"):
-                page_server(b"", server.server_port)
-        finally:
-            server.shutdown()
-            thread.join()

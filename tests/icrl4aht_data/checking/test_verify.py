@@ -47,7 +47,7 @@ def flipped(content: bytes, position: int, rng: np.random.Generator) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("release", "flips"), [("tiny", 40), ("observations", 20), pytest.param("tiny", 1000, marks=pytest.mark.slow)]
+    ("release", "flips"), [("tiny", 40), ("observations", 20), pytest.param("tiny", 250, marks=pytest.mark.slow)]
 )
 def test_every_flipped_bit_is_found(converted_release, tmp_path, release, flips):
     root = tmp_path / "release"
@@ -97,10 +97,6 @@ def test_weights_are_in_the_folder_of_their_hash(tmp_path):
     found = verify_release(root, level="quick")
     assert found.files_at_fault == {weights.relative_to(root).as_posix()}
     assert f"expected {weights.parent.name}, the name of its folder" in found.findings[0].problem
-
-
-def test_no_folder(tmp_path):
-    assert "no such folder" in problems(tmp_path / "nowhere")[0]
 
 
 def rewritten(tmp_path, change, kind: Kind = "lite"):
@@ -253,7 +249,7 @@ def test_other_episode_lengths_than_stated(damaged):
     assert any("expected 6 episodes of 40 steps, found 6 in 120 steps" in p for p in problems(damaged))
 
 
-@pytest.mark.parametrize(("flips", "texts"), [(1, 1), pytest.param(25, 7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("flips", "texts"), [(1, 1), pytest.param(6, 7, marks=pytest.mark.slow)])
 def test_no_damage_makes_verify_raise(damaged, flips, texts):
     """With flipped bits or hostile texts in any file, verify reports problems and never raises."""
     rng = np.random.default_rng(7)

@@ -236,5 +236,5 @@ def test_a_left_out_task_has_no_histories(lite_mixed, tmp_path):
 def test_a_task_of_another_source_is_not_combined(tmp_path):
     for name in SOURCES[:2]:
         random_release(tmp_path / name, layouts=("demo_wide",), teammates=1, streams=1, sources=(name,))
-    with pytest.raises(OptionError, match=r"task .* is of source 'ppo', but in .*noise of 'noise': .*another seed"):
+    with pytest.raises(OptionError, match=r"task .* is also in .*noise; .*another seed"):
         combine_releases(tmp_path / "out", [tmp_path / "noise", tmp_path / "ppo"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pathlib
 import re
 import sys
 
@@ -13,7 +14,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.cells import COOKED, INDICATOR, PLATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS
-from icrl4aht_data.overcooked.render import draw_frame, save_episode, save_frame
+from icrl4aht_data.overcooked.render import draw_frame, save_episode
 from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.states import random_records, state_record
@@ -148,12 +149,12 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     path.write_text("old")
 
     def fail(self, target, **options):
-        target.write_text("half")
+        self.write_text("half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(Image.Image, "save", fail)
+    monkeypatch.setattr(pathlib.Path, "write_bytes", fail)
     with pytest.raises(OSError, match="disk full"):
-        save_frame(path, COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up"))[0])
+        save_episode(path, COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up")))
     assert [(entry.name, entry.read_text()) for entry in tmp_path.iterdir()] == [("frame.png", "old")]
 
 

@@ -69,9 +69,7 @@ def test_data_frame(measured):
     assert list(frame.columns) == list(ENTRY_HINTS)
     assert len(frame) == 3
     assert (frame.layout == "demo_wide").tolist() == [True, False, False]
-    assert [str(frame.dtypes[name]) for name in ("layout", "task_id", "source")] == ["category"] * 3
     assert frame.source.tolist() == ["search", "ppo", "ppo"]
-    assert dataset[1:].to_pandas().layout.cat.categories.tolist() == ["coord_simple"]
     assert frame.expert_return.isna().tolist() == [True, False, False]
     assert frame.expert_step.isna().tolist() == [True, False, False]
     assert frame.expert_step.tolist()[1:] == [1000, 1000]
@@ -90,7 +88,7 @@ def test_filters_of_sources_and_algorithms(measured):
         load_icrl4aht(measured, algorithm="utility")
     with pytest.raises(UnknownNameError, match=r"unknown filter 'algoritm'; .* mean 'algorithm'"):
         load_icrl4aht(measured).filter(algoritm="utility")
-    with pytest.raises(EmptySelectionError, match=r"'coord_simple', source='search'\..*; sources: ppo, search$"):
+    with pytest.raises(EmptySelectionError, match=r"'coord_simple', source='search'\..*; source ppo, search$"):
         load_icrl4aht(measured, layout="coord_simple", source="search")
 
 
@@ -100,9 +98,7 @@ def test_filter_by_expert_return(measured):
     assert load_icrl4aht(measured).select([2, 1]).filter(min_expert_return=-1).ids.tolist() == [2, 1]
     with pytest.raises(EmptySelectionError, match=r"expert_return >= 10; the highest is 9\.5"):
         load_icrl4aht(measured, source="ppo", min_expert_return=10)
-    with pytest.raises(
-        NotStoredError, match=r"2 of 8 histories .*converted from published files.*take the histories where it is known"
-    ):
+    with pytest.raises(NotStoredError, match=r"2 of 8 histories earn; leave them out by ds\.select"):
         load_icrl4aht(measured, min_expert_return=0)
     known = load_icrl4aht(measured)
     known = known.select(known.ids[~np.isnan(known.column("expert_return"))])
@@ -130,7 +126,7 @@ class TestWeakLabels:
         entry = dataset.entries[0]
         assert "1 of 2 tasks come from a policy that earns" in str(warning.message)
         end = dataset.column("return_end")[:2].mean()
-        assert f"{entry.task_id} (labels -30.0, sampled 1.0, histories {end:.1f})" in str(warning.message)
+        assert f"{entry.task_id} (labels -30.0, histories {end:.1f})" in str(warning.message)
         assert warning.filename == __file__
 
     @pytest.mark.parametrize(("ends", "weak"), [([20.0, 18.2], True), ([20.0, 17.0], False), ([-4.0, -1.0], False)])

@@ -214,11 +214,6 @@ class TestPredicates:
         whole = two_sourced.filter(source="noise", split="train")
         assert found.ids.tolist() == whole.ids[whole.column("env_idx") > 0].tolist()
 
-    def test_by_content(self, dataset):
-        best = max(history.returns().max() for history in dataset)
-        found = dataset.select([history.returns().max() == best for history in dataset])
-        assert 0 < len(found) <= len(dataset)
-
     def test_nothing_passes_or_no_function(self, two_sourced):
         with pytest.raises(EmptySelectionError, match="no history of this selection passes the function"):
             two_sourced.filter(lambda entry: False)

@@ -197,27 +197,12 @@ class TestMemory:
         dataset = load_icrl4aht(lite[0], layout="demo_wide")
         sampler = _sampler(dataset, kind, batch_size=10**13, steps=100)
         message = (
-            rf"batch_size = {10**13}, (length|context) = 100: a batch takes [\d,]+ GB of memory "
-            rf"\((context_)?obs float32 \({10**13}, 100, 5, 5, 45\) 4,500,000,000 GB\), but [\d.,]+ GB are free: "
-            r'take batch_size = \d+ or less, or obs = "uint8" or "state"'
+            rf"batch_size = {10**13}, (length|context) = 100: .*: takes [\d,]+ GB of memory, more than is free: "
+            rf"read fewer steps, or take a smaller batch"
         )
         for make in (lambda: sampler[0], sampler.empty, lambda: next(sampler.batches(prefetch=0))):
             with pytest.raises(OptionError, match=message):
                 make()
-
-    @pytest.mark.parametrize("kind", ["ad", "dpt"])
-    def test_the_advice_fits(self, lite, kind, monkeypatch):
-        monkeypatch.setattr("icrl4aht_data.utils.system._PLENTY", 0)
-        monkeypatch.setattr("icrl4aht_data.utils.system.free_memory", lambda: 2**20)
-        monkeypatch.setattr("icrl4aht_data.sampling.base.free_memory", lambda: 2**20)
-        dataset = load_icrl4aht(lite[0], layout="demo_wide", obs="uint8", cache="stream")
-        with pytest.raises(OptionError, match=r"take batch_size = \d+ or less$") as caught:
-            _ = _sampler(dataset, kind, batch_size=1000, steps=20)[0]
-        fitting = int(str(caught.value).split(" = ")[-1].split()[0])
-        assert 1 <= fitting < 100
-        assert len(_sampler(dataset, kind, batch_size=fitting, steps=20)[0][0]) == fitting
-        with pytest.raises(OptionError, match=r"take a smaller (length|context)$"):
-            _ = _sampler(dataset, kind, batch_size=1, steps=10**6, order="random")[0]
 
 
 def _sampler(dataset, kind, *, batch_size, steps, order="contiguous"):

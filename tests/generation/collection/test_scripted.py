@@ -1,4 +1,4 @@
-"""Noise histories: actions, keys of episodes, and results that do not depend on the sizes of pieces."""
+"""Histories that scripts play: actions, keys of episodes, memory, and results that do not depend on pieces."""
 
 from __future__ import annotations
 
@@ -7,24 +7,25 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_generation.collection import noise
+from icrl4aht_generation.collection import scripted_rollout
 from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.job import run_task
-from icrl4aht_generation.collection.noise import noise_bytes
-from icrl4aht_generation.collection.noise_rollout import noise_schedules, play_noisy_episodes
-from icrl4aht_generation.collection.task_folder import LEARNER, METADATA, TIMING, last_timing, partial_folder
-from icrl4aht_generation.learners.resume import StateFile
+from icrl4aht_generation.collection.scripted import scripted_bytes
+from icrl4aht_generation.collection.scripted_rollout import noise_schedules, play_scripted_histories
+from icrl4aht_generation.collection.task_folder import METADATA, TIMING, last_timing, partial_folder
 from icrl4aht_generation.profiles import Profile, load_profile
-from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.releases.check import compare_rebuilds
 from icrl4aht_generation.teammates.distances import act_along
 from icrl4aht_generation.teammates.learned import build_learned
+from icrl4aht_generation.teammates.preference import WATCHER
 from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
 from icrl4aht_data.benchmark.tasks import make_task
@@ -47,7 +48,7 @@ pytestmark = pytest.mark.usefixtures("short_pieces")
 def short_pieces():
     """Tasks of 40 episodes in three pieces, the last one half filled."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(noise, "EPISODES_AT_ONCE", PIECE)
+        patch.setattr(scripted_rollout, "EPISODES_AT_ONCE", PIECE)
         yield
 
 
@@ -87,11 +88,11 @@ def test_the_arrays(arrays, made, profile):
         "teammate_actions": ((4, 1000), "int8"),
         "rewards": ((4, 1000), "int8"),
         "episode_end_state": ((4, 10, size), "uint8"),
-        "oracle_actions": ((4, 1000), "int8"),
+        "script_actions": ((4, 1000), "int8"),
         "noise": ((4, 10), "float32"),
     }
     stored = sum(path.stat().st_size for path in made.iterdir() if path.name != METADATA)
-    assert stored == pytest.approx(noise_bytes(LAYOUT, profile.noise), abs=2_000)
+    assert stored == pytest.approx(scripted_bytes(LAYOUT, profile.noise), abs=2_000)
 
 
 def test_every_step_follows_the_rules(arrays):
@@ -106,7 +107,7 @@ def test_every_step_follows_the_rules(arrays):
 
 def test_actions_are_the_oracles_except_for_noise(arrays):
     """One in six random actions equals the oracle's."""
-    clean = (arrays["actions"] == arrays["oracle_actions"]).reshape(40, 100)
+    clean = (arrays["actions"] == arrays["script_actions"]).reshape(40, 100)
     expected = 1 - arrays["noise"].reshape(40, 1) * 5 / 6
     assert clean[expected[:, 0] == 1].all()
     assert abs(clean.mean() - expected.mean()) < 4 * np.sqrt((expected * (1 - expected)).sum() / 40 / 4000)
@@ -116,26 +117,30 @@ def test_actions_are_the_oracles_except_for_noise(arrays):
 
 def test_labels_are_those_of_an_oracle_that_watches_the_episode(arrays):
     found = [oracle_labels(LAYOUT, *one) for one in zip(arrays["state"], arrays["actions"], strict=True)]
-    np.testing.assert_array_equal(found, arrays["oracle_actions"])
+    np.testing.assert_array_equal(found, arrays["script_actions"])
 
 
 def test_an_episode_is_a_function_of_its_numbers(arrays):
     """An episode is the same in a mixed batch as in its task."""
-    mate = build_teammate(LAYOUT, MATE)
+    mate = build_teammate(None, MATE)
     history, episode = np.array([3, 1, *[0] * 14]), np.array([2, 9, *range(14)])
-    chance = arrays["noise"][history, episode % 10]
-    found = play_noisy_episodes(LAYOUT, mate, 7, history, episode, chance)
+    chances = np.concatenate([arrays["noise"], arrays["noise"]], axis=1)  # episodes 10 to 13 have chances, too
+
+    def play(seed):
+        return next(play_scripted_histories(LAYOUT, mate, seed, "noise", [(history, episode)], chances))[1]
+
+    found = play(7)
     for k in range(2):
         steps = slice(100 * episode[k], 100 * episode[k] + 100)
         np.testing.assert_array_equal(np.asarray(found.state)[k], arrays["state"][history[k], steps])
         np.testing.assert_array_equal(np.asarray(found.actions)[k], arrays["actions"][history[k], steps])
-    other = play_noisy_episodes(LAYOUT, mate, 8, history, episode, chance)
+    other = play(8)
     assert not np.array_equal(np.asarray(other.state)[0], np.asarray(found.state)[0])
 
 
 @pytest.mark.slow
 def test_the_bits_do_not_depend_on_the_piece(made, profile, tmp_path, monkeypatch):
-    monkeypatch.setattr(noise, "EPISODES_AT_ONCE", 23)
+    monkeypatch.setattr(scripted_rollout, "EPISODES_AT_ONCE", 23)
     run_task(WORK, profile, tmp_path / "task")
     assert not compare_rebuilds(tmp_path / "task", made).differences
 
@@ -161,46 +166,32 @@ def test_schedules():
     assert np.ptp(drawn[:, 15]) > 0.5
 
 
-@pytest.mark.parametrize("history", [0, 2])
-def test_stopped_and_resumed(made, profile, tmp_path, history):
+def test_a_stopped_task_is_made_again(made, profile, tmp_path):
     folder, seen = tmp_path / WORK.name, []
     with pytest.raises(KeyboardInterrupt):
-        run_task(WORK, profile, folder, stop_after(history), save_seconds=0)
+        run_task(WORK, profile, folder, stop_after(1))
+    assert (partial_folder(folder) / "rewards.npy").exists()
     assert run_task(WORK, profile, folder, lambda number, metrics: seen.append(number))
-    assert seen[-1] == 3
+    assert seen == [0, 1, 2]
     assert not compare_rebuilds(folder, made).differences
     assert not partial_folder(folder).exists()
-
-
-def test_pieces_after_the_last_save_are_repeated(made, profile, tmp_path):
-    folder = tmp_path / WORK.name
-    with pytest.raises(KeyboardInterrupt):
-        run_task(WORK, profile, folder, stop_after(2), save_seconds=0)
-    partial = partial_folder(folder)
-    assert StateFile(partial / LEARNER).progress == 1
-    rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
-    rewards.reshape(-1, 100)[PIECE:] = 77
-    rewards.flush()
-    run_task(WORK, profile, folder)
-    assert not compare_rebuilds(folder, made).differences
 
 
 def test_wall_clock_figures_are_apart_from_what_is_hashed(made):
     assert TIMING not in json.loads((made / METADATA).read_text())["files"]
     timing = last_timing(made)
     assert timing is not None
-    assert timing["update"] == 3
+    assert timing["update"] == 2
     assert 0 < timing["recording"] < timing["seconds"]
 
 
 def test_a_full_disk(profile, tmp_path, monkeypatch):
-    def fill(history, metrics):
-        if history >= 2:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    def fill(piece, metrics):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
-        run_task(WORK, profile, tmp_path / "task", fill, save_seconds=0)
-    assert StateFile(partial_folder(tmp_path / "task") / LEARNER).progress == 1
+        run_task(WORK, profile, tmp_path / "task", fill)
+    assert not partial_folder(tmp_path / "task").exists()
     monkeypatch.setattr(shutil, "disk_usage", lambda path: type("Usage", (), {"free": 5_000}))
     with pytest.raises(
         DiskFullError, match=r"other: the disk is full: this task needs [\d,]{6,} bytes, 5,000 are free"
@@ -209,18 +200,47 @@ def test_a_full_disk(profile, tmp_path, monkeypatch):
     assert not partial_folder(tmp_path / "other").exists()
 
 
+def searched(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict[str, np.ndarray]:
+    """Return the histories of a searcher, beside a teammate that only watches, in a task that wants one dish."""
+    work = Work(make_task("preference", "train", "asymm_both_plain", WATCHER, 5, [dish]), "search")
+    run_task(work, profile, folder / str(dish))
+    return {path.stem: np.load(path) for path in (folder / str(dish)).glob("*.npy")}
+
+
+def test_a_searcher_finds_the_dish_and_remembers_it(profile, tmp_path):
+    config = replace(SEARCH, histories=8, episodes=10, start=(0.0, 0.0))
+    exact = replace(profile, search=config)
+    one, other = (searched(exact, tmp_path, dish) for dish in ((0, 0, 0), (1, 1, 1)))
+    for found in (one, other):
+        np.testing.assert_array_equal(found["actions"], found["script_actions"])
+        returns = found["rewards"].reshape(8, 10, 100).sum(axis=-1)
+        assert (returns[:, 5:] > 0).all(), returns
+        assert returns[:, 5:].mean() > returns[:, 0].mean() + 20
+        assert (returns[:, 0] < 0).any(), "some histories begin with a wrong dish"
+    # Nothing tells the dish before the first delivery.
+    delivered = np.minimum(*((found["rewards"] != 0).argmax(axis=1) for found in (one, other)))
+    assert (delivered > 10).all()
+    for history, step_ in enumerate(delivered):
+        np.testing.assert_array_equal(one["actions"][history, :step_], other["actions"][history, :step_])
+    assert any(not np.array_equal(a, b) for a, b in zip(one["actions"], other["actions"], strict=True))
+
+
+def test_a_search_history_has_one_chance_until_its_end(profile, tmp_path):
+    chances = noise_schedules(replace(SEARCH, histories=50), 0)
+    assert (chances[:, :-1] == chances[:, :1]).all()
+    assert chances.min() >= 0
+    assert chances.max() <= 0.2
+    assert np.ptp(chances[:, 0]) > 0.1
+
+
 @pytest.mark.slow
 def test_histories_with_a_learned_teammate(profile, tmp_path):
-    """A learned teammate acts greedily on its observations, and a resumed task equals an uninterrupted one."""
+    """A learned teammate acts greedily on its observations."""
     save(tmp_path / "suite/member", LAYOUT)
     mate = entry(tmp_path / "suite", "member")
     work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")
     folder, suite = tmp_path / work.name, tmp_path / "suite"
-    with pytest.raises(KeyboardInterrupt):
-        run_task(work, profile, folder, stop_after(1), suite=suite, save_seconds=0)
     assert run_task(work, profile, folder, suite=suite)
-    run_task(work, profile, tmp_path / "again", suite=suite)
-    assert not compare_rebuilds(folder, tmp_path / "again").differences
     states = np.load(folder / "state.npy").reshape(40, 100, -1)[[0, 25]].swapaxes(0, 1)
     policy = build_learned(LAYOUT, suite / "member")
     expected = act_along(LAYOUT, [policy], jnp.asarray(states))[0].T

@@ -1,0 +1,109 @@
+"""One task of the sources `noise` and `search` -> the files of its artefact, without a learner.
+
+A task takes seconds, so a killed one is made again from its start, with the same bits.
+
+The artefact has the arrays of `task_folder`, and
+
+  metrics.jsonl       one line for each history: its mean returns at the start and at the end
+  script_actions.npy  int8 (N, T), the script's action at every step, which the ego took unless it acted at random
+  noise.npy           float32 (N, E), every episode's chance of a random action
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.format.schema import curve_ends
+from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_generation.collection.curate import stream_returns
+from icrl4aht_generation.collection.record import SCRIPT_ARRAYS, array_shapes
+from icrl4aht_generation.collection.scripted_rollout import (
+    Piece,
+    ScriptedEpisodes,
+    noise_schedules,
+    play_scripted_histories,
+    scripted_pieces,
+)
+from icrl4aht_generation.collection.task import TEAMMATE_NOISE, UpdateCallback, readable_disk_errors
+from icrl4aht_generation.collection.task_folder import ArrayWriter, check_room, finish_artefact
+from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.profiles.noise_config import NoiseConfig
+from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.teammates.registry import build_teammate
+
+_LINE_BYTES = 100  # line of a history in metrics, and of a piece in timing
+
+
+def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Return shapes and dtypes of an artefact's arrays: fields of `ScriptedEpisodes` by history, and chances."""
+    actions, chances = SCRIPT_ARRAYS
+    return array_shapes(layout, config.histories, config.episodes) | {
+        actions: ((config.histories, config.episodes * KEPT_STEPS), "int8"),
+        chances: ((config.histories, config.episodes), "float32"),
+    }
+
+
+def scripted_bytes(layout: Layout, config: NoiseConfig) -> int:
+    """Return the size of an artefact."""
+    shapes = _array_shapes(layout, config).values()
+    arrays = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes)
+    return arrays + (config.histories + config.episodes) * _LINE_BYTES
+
+
+def play_histories(
+    work: Work, profile: Profile, partial: Path, on_update: UpdateCallback, suite: Path | None, save_seconds: float
+) -> None:
+    """Play the histories of a task into a partial artefact, see `collection.job.run_task`."""
+    task, config = work.task, profile.scripted[work.source]
+    layout = None if task.teammate["kind"] == "heuristic" else task.layout
+    teammate = build_teammate(layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
+    schedules, pieces = noise_schedules(config, task.seed), scripted_pieces(work.source, config)
+    needed = scripted_bytes(task.layout, config)
+    shutil.rmtree(partial, ignore_errors=True)  # left by a killed run
+    partial.mkdir(parents=True)
+    with readable_disk_errors(partial, needed):
+        check_room(partial, needed)
+        writer = _PieceWriter(partial, task.layout, config, schedules)
+        try:
+            played = play_scripted_histories(task.layout, teammate, task.seed, work.source, pieces, schedules)
+            for number, (piece, episodes) in enumerate(played):
+                on_update(number, writer.write(number, piece, episodes))
+            writer.write_metrics()
+        finally:
+            writer.close()
+        finish_artefact(partial, work, profile)
+
+
+class _PieceWriter(ArrayWriter):
+    """Fills the arrays of an artefact and its log, a piece of episodes at a time."""
+
+    def __init__(self, partial: Path, layout: Layout, config: NoiseConfig, schedules: np.ndarray) -> None:
+        super().__init__(partial, _array_shapes(layout, config), True, 0)
+        self._shape = schedules.shape
+        self._arrays["noise"][:] = schedules
+
+    def write(self, number: int, piece: Piece, episodes: ScriptedEpisodes) -> dict[str, float]:
+        """Record a piece; returns its number and timing."""
+        jax.block_until_ready(episodes)
+        began = time.perf_counter()
+        for name, values in episodes._asdict().items():
+            self._arrays[name].reshape(*self._shape, *values.shape[1:])[piece] = values
+        line = {"update": number} | self._timing(len(piece[0]) * KEPT_STEPS, began)
+        self._log.write(timing=line)
+        return line
+
+    def write_metrics(self) -> None:
+        """Write a line for each history, and force everything to the disk."""
+        ends = zip(*curve_ends(stream_returns(self._arrays["rewards"])), strict=True)
+        for history, (start, end) in enumerate(ends):
+            line = {"return_start": round(float(start), 3), "return_end": round(float(end), 3)}
+            self._log.write({"update": history} | line)
+        self.sync(lambda: None)

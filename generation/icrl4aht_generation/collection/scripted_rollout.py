@@ -1,0 +1,231 @@
+"""Roll-outs of the sources `noise` and `search`, in which a script acts, sometimes at random.
+
+Source `noise`: the scripted oracle plays, and the chance of a random action falls over a history. Noise distillation
+(Zisman et al. 2024, "Emergence of In-Context Reinforcement Learning from Noise Distillation") makes learning histories
+without learning. An episode is a pure function of the task's seed, its history's number, its own number and its chance.
+
+Source `search`: the scripted searcher plays, which finds out the wanted dish and remembers it. An episode also depends
+on those before it in its history. Whatever else is in a batch changes nothing for either source.
+
+Shapes: `N` histories, `E` episodes of each, `M` episodes of one batch, `S` bytes of a state record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Int8, Key, UInt8
+
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.tables import Tables
+from icrl4aht_generation.env import Environment, EnvState
+from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
+from icrl4aht_generation.experts.padded import own_layout, padded_layout
+from icrl4aht_generation.experts.search import SITUATION_SEARCHER, padded_dishes, with_taken
+from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out
+from icrl4aht_generation.policy import Policy, sometimes_random
+from icrl4aht_generation.profiles.noise_config import NoiseConfig
+
+EPISODES_AT_ONCE = 256
+"""Episodes of one batch of the source `noise`. A constant, since a matrix product of another size may round the logits
+of a learned teammate differently."""
+
+_NOISE = 2
+"""Number that an episode's key is folded with for the draws of the noise; see `Environment.episode_key`."""
+
+
+def noise_schedules(config: NoiseConfig, seed: int) -> np.ndarray:
+    """Return the chance of a random action in every episode, float32 (N, E); see `NoiseConfig`.
+
+    Args:
+        config: ranges that each history's schedule is drawn from.
+        seed: the task's seed.
+    """
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(_keys(seed)[0], jnp.arange(config.histories))
+    drawn = np.asarray(jax.vmap(lambda key: jax.random.uniform(key, (5,)))(keys), np.float64)[..., None]
+    ranges = (config.start, config.end, config.begin, config.finish, config.power)
+    start, end, begin, finish, power = (low + (high - low) * drawn[:, k] for k, (low, high) in enumerate(ranges))
+    share = np.linspace(0, 1, config.episodes)
+    length = finish - begin
+    fallen = np.where(length > 0, (share - begin) / np.where(length > 0, length, 1), share >= finish).clip(0, 1)
+    # Rounded, so that the last bits of a platform's `power` do not matter.
+    return np.round(end + (start - end) * (1 - fallen) ** power, 6).astype(np.float32)
+
+
+class ScriptedEpisodes(NamedTuple):
+    """M episodes of 100 steps.
+
+    Attributes:
+        state: uint8 (M, 100, S), state records before each step.
+        actions: int8 (M, 100), the ego's actions, clean or random.
+        teammate_actions: int8 (M, 100).
+        rewards: int8 (M, 100), the team's, unshaped.
+        episode_end_state: uint8 (M, S), state records after the last step.
+        script_actions: int8 (M, 100), the script's actions.
+    """
+
+    state: UInt8[Array, "M 100 S"]
+    actions: Int8[Array, "M 100"]
+    teammate_actions: Int8[Array, "M 100"]
+    rewards: Int8[Array, "M 100"]
+    episode_end_state: UInt8[Array, "M S"]
+    script_actions: Int8[Array, "M 100"]
+
+
+class NoisyChoice(NamedTuple):
+    """Actions of the noisy ego in one step of M environments.
+
+    Attributes:
+        action: int32 (M,), the action taken.
+        clean: int32 (M,), the script's action.
+    """
+
+    action: Int[Array, " M"]
+    clean: Int[Array, " M"]
+
+
+Piece = tuple[np.ndarray, np.ndarray]
+"""Episodes that are played at once: numbers of their histories and of the episodes in these, int (M,) each."""
+
+
+def scripted_pieces(source: str, config: NoiseConfig) -> list[Piece]:
+    """Return the pieces of a task, in the order in which they are played."""
+    if source == "search":  # one episode of all histories, because the script remembers those before
+        histories = np.arange(config.histories)
+        return [(histories, np.full_like(histories, episode)) for episode in range(config.episodes)]
+    episodes = config.histories * config.episodes
+    found = []
+    for first in range(0, episodes, EPISODES_AT_ONCE):
+        # The last piece repeats the last episode: equal sizes share one compilation.
+        numbers = np.minimum(first + np.arange(EPISODES_AT_ONCE), episodes - 1)
+        found.append(np.divmod(numbers, config.episodes))
+    return found
+
+
+def play_scripted_histories(
+    layout: Layout, teammate: Policy, seed: int, source: str, pieces: Sequence[Piece], schedules: np.ndarray
+) -> Iterator[tuple[Piece, ScriptedEpisodes]]:
+    """Play the pieces of a task; compiled once for all heuristics of one family on all layouts of a process.
+
+    A piece is played while its predecessor is used.
+
+    Args:
+        layout: the layout, with the dish of the task.
+        teammate: the teammate: a heuristic that sees a `Situation`, or a learned one of this layout.
+        seed: the task's seed.
+        source: "noise" or "search".
+        pieces: see `scripted_pieces`.
+        schedules: float32 (N, E), the chance of a random action in every episode.
+
+    Yields:
+        The piece, and its episodes.
+    """
+    tables, expert, own = (padded_layout if teammate.sees == "situation" else own_layout)(layout)
+    searches = source == "search"
+    params = {"oracle": expert, "dishes": padded_dishes([layout])} if searches else expert
+    play, last = _program(teammate._replace(params=()), searches), None
+    memory = _blank_memories(params, len(pieces[0][0])) if searches else None
+    for history, episode in pieces:
+        where = history.astype(np.int32), episode.astype(np.int32)
+        chance = schedules[history, episode]
+        played, memory = play(tables, params, teammate.params, _keys(seed)[1], *where, chance, memory)
+        state, end = played.state[..., own], played.episode_end_state[..., own]
+        if last is not None:
+            yield last
+        last = (history, episode), played._replace(state=state, episode_end_state=end)
+    if last is not None:
+        yield last
+
+
+def scripted_episode_keys(seed: int, history: np.ndarray, episode: np.ndarray) -> Key[Array, " M"]:
+    """Return the keys of the environments in which some episodes of a task are played, each its first episode.
+
+    Args:
+        seed: the task's seed.
+        history: int (M,), number of each episode's history.
+        episode: int (M,), its number in the history.
+    """
+    return _episode_keys(_keys(seed)[1], history.astype(np.int32), episode.astype(np.int32))
+
+
+def _keys(seed: int) -> Key[Array, " 2"]:
+    """Return two keys of a task: of its schedules, and of its episodes."""
+    return jax.random.split(jax.random.key(seed))
+
+
+def _episode_keys(key: Key[Array, ""], history: Any, episode: Any) -> Key[Array, " M"]:
+    fold = jax.vmap(jax.random.fold_in)
+    return fold(fold(jnp.broadcast_to(key, len(history)), history), episode)
+
+
+@lru_cache(maxsize=64)
+def _program(teammate: Policy, searches: bool) -> Callable[..., tuple[ScriptedEpisodes, Any]]:
+    """Return a compiled function of tables, parameters of script and teammate, a key, episodes, and memories.
+
+    The memories are the searcher's before the episodes, ignored in the first of a history; the function also returns
+    those after them.
+    """
+    script = SITUATION_SEARCHER if searches else SITUATION_ORACLE
+
+    @jax.jit
+    def play(tables: Tables, expert: Any, params: Any, key: Key[Array, ""], history, episode, chance, memory):
+        env, m = Environment(tables), len(history)
+        keys = _episode_keys(key, history, episode)
+        players = [_noisy_script(env, script, expert, chance), policy_player(env, teammate, params, TEAMMATE, m)]
+        start = init_rollout(env, players, keys)
+        if searches:
+            own = jax.tree.map(partial(_select, episode == 0), start.memories[EGO], memory)
+            start = start._replace(memories=(own, start.memories[TEAMMATE]))
+        # The roll-out's own key is not used: heuristics have keys of their own, and learned teammates act greedily.
+        carry, rollout = roll_out(env, players, start, KEPT_STEPS, key)
+        choice: Any = rollout.choices[EGO]
+
+        def by_episode(values: Array) -> Array:
+            return values.swapaxes(0, 1).astype(jnp.int8)
+
+        episodes = ScriptedEpisodes(
+            state=rollout.record.swapaxes(0, 1),
+            actions=by_episode(choice.action),
+            teammate_actions=by_episode(rollout.actions[..., TEAMMATE]),
+            rewards=by_episode(rollout.reward),
+            episode_end_state=carry.env.record,  # training episodes have more steps, so none has been reset
+            script_actions=by_episode(choice.clean),
+        )
+        return episodes, carry.memories[EGO] if searches else None
+
+    return play
+
+
+def _blank_memories(params: Any, count: int) -> Any:
+    """Return zeros in the shape of `count` memories of the searcher."""
+    shape = jax.eval_shape(SITUATION_SEARCHER.init, params, jax.random.key(0))
+    return jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape), leaf.dtype), shape)
+
+
+def _select(which: Bool[Array, " M"], one: Array, other: Array) -> Array:
+    return jnp.where(which.reshape(-1, *[1] * (one.ndim - 1)), one, other)
+
+
+def _noisy_script(env: Environment, script: Policy, params: Any, chance: Float[Array, " M"]) -> Player:
+    """Return a script as agent 0 of M environments, each with its own chance of a random action.
+
+    It remembers the action that was taken, as an observer of the episode would; so the recorded states and actions
+    determine what it would do at every state.
+    """
+    player = policy_player(env, script, params, EGO, chance.shape[0])
+    fold = jax.vmap(jax.random.fold_in)
+
+    def act(memory: Any, state: EnvState, key: Key[Array, ""]) -> Any:
+        choice, memory = player.act(memory, state, key)
+        own = fold(env.episode_key(state), jnp.full_like(state.clock, _NOISE))
+        action = jax.vmap(sometimes_random)(fold(own, state.clock), chance, choice.action)
+        return NoisyChoice(action, choice.action), with_taken(memory, action)
+
+    return player._replace(act=act)
