@@ -167,11 +167,16 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
     type=Names("split of layouts", lambda: LAYOUT_SPLITS),
     help="Only layouts of this split: train, validation or test.",
 )
+@click.option(
+    "--check",
+    is_flag=True,
+    help="Play each: exit with 1 if the oracle, or a pair of them, delivers no soup in 400 steps.",
+)
 @click.option("--out", type=NewFile(".png"), metavar="FILE", help="Draw a sheet of pictures here.")
 @overwrite_option
 @json_option
 def layouts(
-    family: str, count: int, seed: int, split: str | None, out: Path | None, overwrite: bool, as_json: bool
+    family: str, count: int, seed: int, split: str | None, check: bool, out: Path | None, overwrite: bool, as_json: bool
 ) -> None:
     """List generated layouts, and draw them.
 
@@ -184,6 +189,11 @@ def layouts(
     found = generate_layouts(family, seed, count, split=split)
     if out:
         save_sheet(out, found)
+    delivered = [None] * count
+    if check:
+        from icrl4aht_generation.layouts.playable import layouts_delivered
+
+        delivered = layouts_delivered(found).tolist()
     rows = [
         {
             "name": layout.name,
@@ -192,16 +202,19 @@ def layouts(
             "recipes": layout.recipes,
             "indicates_delivery": layout.indicates_delivery,
         }
-        for layout in found
+        | ({"delivered": one} if check else {})
+        for layout, one in zip(found, delivered, strict=True)
     ]
     if as_json:
         click.echo(json.dumps(rows))
     else:
         for layout, row in zip(found, rows, strict=True):
             size = f"{layout.width}x{layout.height}"
-            click.echo(f"{layout.name:<20} {row['split']:<10} {size:<5} {len(layout.recipes):>2} recipes")
+            fault = "  no soup delivered" if row.get("delivered") is False else ""
+            click.echo(f"{layout.name:<20} {row['split']:<10} {size:<5} {len(layout.recipes):>2} recipes{fault}")
     if out:
         click.echo(f"wrote {out}", err=as_json)
+    sys.exit(int(False in delivered))
 
 
 @click.command()

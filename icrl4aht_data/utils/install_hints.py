@@ -15,6 +15,7 @@ EXTRAS = {
     **dict.fromkeys(("matplotlib", "pillow"), "plot"),
     **dict.fromkeys(("datasets", "pyarrow", "mlcroissant"), "hf"),
     **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari")},
+    "tensorboardx": "tensorboard",
     "s3fs": "s3",
     "ray": "cluster",
     "gymnasium": "gym",

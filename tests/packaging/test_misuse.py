@@ -92,7 +92,7 @@ evaluate --agent stay --out e --split train | unknown split 'train'; valid: test
 evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --split: not with --manifest
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
-research headroom --protocol x | unknown protocol 'x'; valid: published, seeded.
+research headroom --protocol x | unknown protocol 'x'; valid: published, seeded, swap.
 research sweep size --only smal | unknown setting of sweep size 'smal'; valid: small, medium, large.
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """

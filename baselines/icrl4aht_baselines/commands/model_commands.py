@@ -185,6 +185,14 @@ def reference_command(
         click.echo(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}")
 
 
+def _print_schema(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
+    from icrl4aht_baselines.report import submission
+
+    if wanted:
+        click.echo(submission.submission_schema())
+        context.exit()
+
+
 @click.command(
     "submit",
     epilog=examples(
@@ -199,9 +207,14 @@ def reference_command(
 @click.option("--core-hours", type=click.FloatRange(min=0), help="Core-hours of the training and all it needs.")
 @click.option("--link", default="", help="Address of a paper or repository.")
 @click.option("--name", default="", help="Name of the agent in tables.", show_default="that in the results")
+@click.option(
+    "--schema", is_flag=True, is_eager=True, callback=_print_schema, help="Only print the JSON schema of the file."
+)
 @click.option("--out", type=NewFile(".json"), metavar="FILE", required=True, help="Write this file.")
 @overwrite_option
-def submit_command(folders: tuple[Path, ...], name: str, out: Path, overwrite: bool, **facts: Any) -> None:
+def submit_command(
+    folders: tuple[Path, ...], name: str, schema: bool, out: Path, overwrite: bool, **facts: Any
+) -> None:
     """Make a file of results for the page of `results`.
 
     Checks that FOLDERs of `evaluate` have all test tasks of a track, or of both, under protocol seeded with seeds 0, 1

@@ -97,7 +97,8 @@ protocol_option = click.option(
     "--protocol",
     type=PROTOCOL_NAME,
     default="seeded",
-    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers.",
+    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers. swap: seeded, with "
+    "another teammate every 25 episodes.",
 )
 _ACTING = Names("acting", lazy_attribute("icrl4aht_baselines.agents.egos", "ACTING"))
 _ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster."
@@ -144,6 +145,9 @@ seed_option = click.option(
 )
 suite_option = click.option(
     "--suite", type=Folder("`icrl4aht-data teammates`"), metavar="FOLDER", help="Folder of learned teammates."
+)
+tensorboard_option = click.option(
+    "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
 )
 save_minutes_option = click.option(
     "--save-minutes",

@@ -216,6 +216,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     "Run",
     click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD"),
     shared.save_minutes_option,
+    shared.tensorboard_option,
 )
 @shared.process_options
 def train_command(
@@ -231,6 +232,7 @@ def train_command(
     play: dict[str, Any],
     manifests: tuple[Path, ...],
     save_minutes: float,
+    tensorboard: bool,
     **machines: Any,
 ) -> None:
     """Train a model on learning histories.
@@ -253,7 +255,8 @@ def train_command(
     click.echo(description)
     params, steps = None if init is None else start_from(init, job.method, job.about), job.options.steps
     with progress_bars(unit="steps") as show:
-        job.train(folder, done=show_steps(show, method, steps), save_minutes=save_minutes, params=params)
+        watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "params": params}
+        job.train(folder, done=show_steps(show, method, steps), **watched)
     trained = counted_noun(steps, "step")
     click.echo(f"{trained} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it")
     if not can_draw():

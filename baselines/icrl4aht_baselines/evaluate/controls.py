@@ -68,7 +68,8 @@ def evaluate_controls(
         out: folder of the ego's results; those of the controls are in its folders `forgets` and `swapped`.
 
     Raises:
-        OptionError: as `evaluate`; if a task has no partner, or if there are less than 2 episodes.
+        OptionError: as `evaluate`; if a task has no partner, if there are less than 2 episodes, or if the protocol
+            swaps teammates.
     """
     rules = protocol if isinstance(protocol, Protocol) else get_protocol(protocol)
     plan_tasks(tasks, rules, "swapped")  # fails before hours of work

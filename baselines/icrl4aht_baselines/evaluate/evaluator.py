@@ -87,7 +87,7 @@ def evaluate(
 
     Raises:
         OptionError: if `out` has results of other settings or other files, seeds are not different integers from 0,
-            the ego's actions are not integers in 0..5, or a task has no partner for the control.
+            the ego's actions are not integers in 0..5, or a task has no partner for the control or the protocol.
         UnknownNameError: if there is no such protocol or control.
         TaskFormatError: if a teammate's parameters are impossible; names the task.
     """
@@ -310,7 +310,15 @@ def play_tasks(
 
     Yields:
         One `EpisodeBatch` after another with B = tasks x seeds; seeds vary fastest.
+
+    Raises:
+        OptionError: if the protocol changes teammates in these episodes, which `evaluate` alone can play.
     """
+    if len(segment_lengths(protocol)) > 1:
+        raise OptionError(
+            f"protocol {protocol.name}: the teammate changes every {protocol.swap_every} episodes; expected at most as "
+            f"many here, found {protocol.episodes}"
+        )
     yield from play_episodes(prepare_rollout(make_ego, tasks, protocol, seeds, suite), forget=forget)
 
 

@@ -27,6 +27,7 @@ class Protocol:
             not from their own two.
         episodes: number of episodes of each task.
         steps: number of steps of each episode.
+        swap_every: number of episodes after which another teammate plays; None if a task keeps its teammate.
     """
 
     name: str
@@ -34,11 +35,13 @@ class Protocol:
     four_recipes: bool
     episodes: int = 100
     steps: int = KEPT_STEPS
+    swap_every: int | None = None
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings that results store."""
-        return asdict(self)
+        """Settings that results store; they name `swap_every` only if teammates change."""
+        fields = asdict(self)
+        return fields if self.swap_every else {name: fields[name] for name in fields if name != "swap_every"}
 
     @property
     def last_episodes(self) -> int:
@@ -98,8 +101,10 @@ def bundled_tasks(track: str, split: str) -> list[Task]:
 PROTOCOLS = {
     "published": Protocol("published", noise="fixed", four_recipes=True),
     "seeded": Protocol("seeded", noise="seeded", four_recipes=False),
+    "swap": Protocol("swap", noise="seeded", four_recipes=False, swap_every=25),
 }
-"""Protocols by name: `published`, to compare with the paper's numbers; `seeded`, the default, to report."""
+"""Protocols by name: `published`, to compare with the paper's numbers; `seeded`, the default, to report; `swap`, the
+same with another teammate every 25 episodes, without a sign."""
 
 
 def get_protocol(name: str, episodes: int | None = None) -> Protocol:

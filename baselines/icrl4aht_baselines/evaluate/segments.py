@@ -45,39 +45,46 @@ def segment_lengths(protocol: Protocol, control: Control | None = None) -> tuple
     """Return the number of episodes of each segment.
 
     Raises:
-        OptionError: if teammates are to be swapped in a task of one episode.
+        OptionError: if teammates are to be swapped in a task of one episode, or under a protocol that swaps them, too.
     """
-    if control != "swapped":
-        return (protocol.episodes,)
-    if protocol.episodes < 2:
-        raise OptionError(
-            f"the control `swapped` with protocol {protocol.name} and episodes = {protocol.episodes}: expected at "
-            f"least 2 episodes"
-        )
-    return protocol.episodes - protocol.last_episodes, protocol.last_episodes
+    if control == "swapped":
+        if protocol.swap_every or protocol.episodes < 2:
+            raise OptionError(
+                f"the control `swapped` with protocol {protocol.name} and episodes = {protocol.episodes}: expected a "
+                f"protocol that keeps the teammate, such as seeded, and at least 2 episodes"
+            )
+        return protocol.episodes - protocol.last_episodes, protocol.last_episodes
+    every = protocol.swap_every or protocol.episodes
+    return tuple(min(every, protocol.episodes - first) for first in range(0, protocol.episodes, every))
 
 
 def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | None = None) -> list[PlannedTask]:
     """Return what tasks play in each segment.
 
-    Under the control `swapped` the teammate of a task's partner plays first. A task's partner is of the next other
-    family on its layout, in the order of `tasks` and in turn: the first task of a family has the first one of the next
-    family, and so on; if all are of one family, it is the next task with another teammate.
+    A task's partner is of the next other family on its layout, in the order of `tasks` and in turn: the first task of a
+    family has the first one of the next family, and so on; if all are of one family, it is the next task with another
+    teammate. Under the control `swapped` the partner's teammate plays first. Under a protocol that swaps teammates, the
+    task's own is followed by that of its partner, of the partner's partner, and so on.
 
     Raises:
         OptionError: if a task has no partner; names the task. See also `segment_lengths`.
     """
-    if len(segment_lengths(protocol, control)) == 1:
+    segments = len(segment_lengths(protocol, control))
+    if segments == 1:
         return [PlannedTask(task, (task,)) for task in tasks]
     by_layout: dict[str, list[Task]] = defaultdict(list)
     for task in tasks:
         by_layout[task.layout.name].append(task)
+    partner = {task.task_id: _partner(task, by_layout[task.layout.name]) for task in tasks}
     planned = []
     for task in tasks:
-        partner = _partner(task, by_layout[task.layout.name])
+        chain = [task]
+        for _ in range(segments - 1):
+            chain.append(partner[chain[-1].task_id])
+        chain = chain[::-1] if control == "swapped" else chain
         # The id stays, so that keys of episodes do, and the last episodes start as those of the plain evaluation.
-        before = replace(task, teammate=partner.teammate, recipes=partner.recipes)
-        planned.append(PlannedTask(task, (before, task), (partner.task_id, task.task_id)))
+        played = tuple(replace(task, teammate=one.teammate, recipes=one.recipes) for one in chain)
+        planned.append(PlannedTask(task, played, tuple(one.task_id for one in chain)))
     return planned
 
 

@@ -1,10 +1,12 @@
 """Files of results that others add to the page of results: made from folders of `evaluate`, checked, and read.
 
-A file has the return of every episode, so the page can recompute all numbers. `Submission` defines its content.
+A file has the return of every episode, so the page can recompute all numbers. `Submission` defines its content;
+`icrl4aht-data submit --schema` prints the JSON schema.
 """
 
 from __future__ import annotations
 
+import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
@@ -91,6 +93,11 @@ class Submission(msgspec.Struct, forbid_unknown_fields=True):
     best_responses: str
     tracks: list[Literal["teammate", "layout"]]
     evaluations: Annotated[list[Evaluation], Meta(min_length=1)]
+
+
+def submission_schema() -> str:
+    """Return the JSON schema of a file of results."""
+    return json.dumps(msgspec.json.schema(Submission), indent=1)
 
 
 def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "") -> Submission:

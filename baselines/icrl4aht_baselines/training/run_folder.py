@@ -1,4 +1,4 @@
-"""Run folders: config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/.
+"""Run folders: config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/, perhaps tensorboard/.
 
 Checkpoints, logs and resuming are those of `icrl4aht_generation.learners.resume`. This module has a run's settings.
 """
@@ -19,8 +19,8 @@ RUN_FORMAT = 4
 """Version of the layout of run folders: 2 since checkpoints are safetensors files, 3 since config.json has
 `trained_on`, 4 since it has `channels`."""
 
-CONFIG, RUN_CURVES, CHECKPOINTS = "config.json", "curves.png", "checkpoints"
-_FILES = {CONFIG, RUN_CURVES, CHECKPOINTS, METRICS, TIMING}
+CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD = "config.json", "curves.png", "checkpoints", "tensorboard"
+_FILES = {CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD, METRICS, TIMING}
 
 
 def format_versions() -> dict[str, Any]:

@@ -26,8 +26,9 @@ from jaxtyping import Array, Int
 from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.plotting import plot_training_log
 from icrl4aht_baselines.training.options import SAVE_MINUTES, TrainOptions
-from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, format_versions, open_run
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, TENSORBOARD, format_versions, open_run
 from icrl4aht_baselines.training.stopping import StopSignals, TrainingStopped
+from icrl4aht_baselines.training.tensorboard import TensorBoardLog, check_installed
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.sampling.batches import Batches
@@ -231,6 +232,7 @@ def train(
     *,
     trainer: Any = None,
     params: Any = None,
+    tensorboard: bool = False,
     save_minutes: float = SAVE_MINUTES,
     done: StepProgress = lambda step, loss: None,
 ) -> Any:
@@ -247,6 +249,7 @@ def train(
         about: further settings for config.json, such as the model's and the data's.
         trainer: what computes the steps, with the interface of `Trainer`, which is the default.
         params: initial parameters, such as those of another run; drawn by the seed by default.
+        tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
         save_minutes: most minutes between checkpoints, which are also written every `options.save_every` steps.
         done: called after every step, see `StepProgress`.
 
@@ -255,10 +258,12 @@ def train(
 
     Raises:
         OptionError: if the folder has a run with other settings, or with another number of XLA threads, with which the
-            resumed training would give different bits.
+            resumed training would give different bits; if tensorboardX is required and not installed.
         BusyError: if another process trains in the folder.
         TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
     """
+    if tensorboard:
+        check_installed()
     trainer = trainer or Trainer(method, options)
     config = {**format_versions(), "method": method.name, **about, "train": asdict(options)}
     with ExitStack() as stack:
@@ -277,6 +282,9 @@ def train(
         first = int(state.step)
         # Lines after the checkpoint are dropped, since their steps are computed again.
         log = stack.enter_context(closing(RunLog(folder, lambda line: line["step"] <= first)))
+        events = TensorBoardLog(folder / TENSORBOARD, folder / METRICS) if tensorboard and writes else None
+        if events:
+            stack.callback(events.close)
         batches = stack.enter_context(trainer.batches(data.train, first, options.steps))
         stop = stack.enter_context(StopSignals())  # entered last: what came before ends by a signal as usual
         before = first, time.perf_counter(), 0.0
@@ -299,6 +307,8 @@ def train(
                 speed = {"steps_per_second": round(steps / seconds, 4), "loader_wait": round(waited / seconds, 4)}
                 log.write(*lines, timing={"step": step, **speed})
                 before = now
+                if events:
+                    events.add(lines)
             saves, stopped_by = agree_on_stop(save.due(step), stop.received)
             if saves or stopped_by:
                 log.sync()  # a checkpoint whose log was lost could never get these lines again

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -50,10 +51,13 @@ def _padded(layout: Layout, names: tuple[str, ...]) -> PaddedLayout:
 
 @lru_cache(maxsize=8)
 def _largest_of(names: tuple[str, ...]) -> list[Layout]:
+    return largest_layouts([get_layout(name) for name in names]) if names else []
+
+
+def largest_layouts(layouts: Sequence[Layout]) -> list[Layout]:
     """Return layouts that together have the largest size of every axis of the tables and of the oracle's facts."""
-    layouts = [get_layout(name) for name in names]
     sizes = np.array([_sizes(layout) for layout in layouts])
-    return [layouts[number] for number in dict.fromkeys(sizes.argmax(axis=0).tolist())] if names else []
+    return [layouts[number] for number in dict.fromkeys(sizes.argmax(axis=0).tolist())]
 
 
 def _sizes(layout: Layout) -> tuple[int, ...]:

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import NamedEgo, stay
 from icrl4aht_baselines.agents.host import from_host
 from icrl4aht_baselines.evaluate import evaluate_controls
-from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
 from icrl4aht_baselines.evaluate.programs import Programs
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
@@ -108,6 +108,23 @@ def test_controls_of_an_ego_without_memory_earn_the_same(alone, programs):
     assert first != swapped
 
 
+def test_swap_changes_teammates_at_25_50_and_75(programs):
+    swapped = [result.returns[0] for result in evaluate("fixed", ego(STAYS), TASKS, "swap", programs=programs)]
+    assert swapped == [([0.0] * 25 + [40.0] * 25) * 2, ([40.0] * 25 + [0.0] * 25) * 2]
+
+
+def test_swap_keeps_the_memory_and_the_keys(alone, programs):
+    rules = dataclasses.replace(PROTOCOLS["swap"], episodes=4, swap_every=2)
+    first, second = evaluate("mine", ego(PAID), TASKS, rules, programs=programs)
+    stays, wanders = alone
+    assert first.returns[0][:2] == [stays[0, 0], wanders[0, 1]]
+    assert second.returns[0] == [40, 40, 0, 0]  # H4 paid
+    other = dataclasses.replace(H1, teammate=H4.teammate)
+    (expected,) = evaluate("fixed", ego(RANDOM), [other], FOUR)
+    assert first.returns[0][2:] == expected.returns[0][2:]
+    assert (first.partners, second.partners) == ([H1.task_id, H4.task_id], [H4.task_id, H1.task_id])
+
+
 def test_results_are_found_again(programs, tmp_path):
     """A control's folder is resumed with the same partners only; plain results keep the settings of old ones."""
     first = evaluate_controls("mine", ego(PAID), TASKS, FOUR, out=tmp_path, details={"of": 1}, programs=programs)
@@ -175,6 +192,8 @@ class TestPlan:
             assert partner.teammate["theta_id"] == task.teammate["theta_id"]
             assert [one.teammate for one in played] == [partner.teammate, task.teammate]
             assert {one.task_id for one in played} == {task.task_id}
+        families = [by_id[partner].teammate_family for partner in plan_tasks(tasks, PROTOCOLS["swap"])[0].partners]
+        assert families == ["H1", "H2", "H3", "H4"]
 
     def test_of_one_family_another_teammate_plays(self):
         first, second = (published_task("coord_simple", f"H4/t{number}") for number in range(2))
@@ -194,6 +213,8 @@ class TestPlan:
 
     def test_segments(self):
         assert segment_lengths(PROTOCOLS["seeded"]) == (100,)
+        assert segment_lengths(PROTOCOLS["swap"]) == (25, 25, 25, 25)
+        assert segment_lengths(get_protocol("swap", 30)) == (25, 5)
         assert segment_lengths(PROTOCOLS["seeded"], "swapped") == (80, 20)
         assert segment_lengths(get_protocol("seeded", 39), "swapped") == (20, 19)
         assert segment_lengths(get_protocol("seeded", 3), "swapped") == (2, 1)
@@ -202,13 +223,18 @@ class TestPlan:
         message = rf"task {H1.task_id}: needs a task on coord_simple with another teammate to swap with, found none"
         with pytest.raises(OptionError, match=message):
             plan_tasks([H1, published_task("demo_wide", "H2/t0")], FOUR, "swapped")
-        assert plan_tasks([H1], PROTOCOLS["seeded"])[0].partners == ()
+        with pytest.raises(OptionError, match=message):
+            evaluate("stay", stay, [H1], "swap")
+        assert plan_tasks([H1], get_protocol("swap", 25))[0].partners == ()
 
     def test_refusals(self):
-        with pytest.raises(OptionError, match="protocol seeded and episodes = 1: expected at least 2"):
-            evaluate_controls("stay", stay, TASKS, get_protocol("seeded", 1))
+        for rules in (PROTOCOLS["swap"], get_protocol("seeded", 1)):
+            with pytest.raises(OptionError, match=f"protocol {rules.name} and episodes = {rules.episodes}: expected"):
+                evaluate_controls("stay", stay, TASKS, rules)
         with pytest.raises(UnknownNameError, match=r"unknown control 'swaped'.*Did you mean 'swapped'"):
             evaluate("stay", stay, TASKS, FOUR, control="swaped")  # type: ignore[arg-type]
+        with pytest.raises(OptionError, match=r"protocol swap: the teammate changes every 25 episodes.* found 100"):
+            next(play_tasks(stay, [H4], PROTOCOLS["swap"]))
 
 
 def test_the_next_segment_starts_on_its_own_layouts():
@@ -249,6 +275,8 @@ def test_controls_command(programs, tmp_path, monkeypatch):
         assert len(list((tmp_path / folder / "tasks").glob("*.json"))) == 2
     result = run("run", "--controls", "--forget")
     assert result.exit_code == 2 and "--controls: not with --forget" in result.output
+    result = run("swap", "--protocol", "swap", "--episodes", "50")
+    assert result.exit_code == 0 and "(swap), 2 test cells" in result.output, result.output
     result = run("forgets", "--episodes", "4", "--forget")
     assert result.exit_code == 0, result.output
     assert read_run(tmp_path / "forgets").table.equals(read_run(tmp_path / "run/forgets").table)

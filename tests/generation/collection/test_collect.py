@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from icrl4aht_generation.collection import job
+from icrl4aht_generation.collection import job as collection_job
 from icrl4aht_generation.collection import task as collect
 from icrl4aht_generation.collection.record import array_shapes
 from icrl4aht_generation.collection.task_folder import (
@@ -54,7 +54,7 @@ def task(built):
 
 
 def run_task(task: tuple[Work, Profile], *arguments, **options) -> bool:
-    return job.run_task(task[0], task[1], *arguments, **options)
+    return collection_job.run_task(task[0], task[1], *arguments, **options)
 
 
 def stop_after(update: int):

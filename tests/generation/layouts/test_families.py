@@ -25,8 +25,6 @@ from icrl4aht_generation.layouts.grids import agent_rooms, grid_of, symmetric_im
 from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
 from icrl4aht_generation.layouts.solvable import faced_cells
 from icrl4aht_generation.layouts.templates import has_tested_rooms, published_rooms
-from icrl4aht_generation.teammates.references import reference_returns
-from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS
 from icrl4aht_data.commands.cli import cli
