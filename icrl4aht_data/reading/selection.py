@@ -378,7 +378,7 @@ class Selection:
         Raises:
             UnknownNameError: for a field or value that does not exist.
             EmptySelectionError: if no history is left.
-            OptionError: if `predicate` is not a function, or `min_expert_return` not a number.
+            OptionError: if `predicate` is not a function that returns a bool, or `min_expert_return` not a number.
             NotStoredError: for `min_expert_return`, if the expert return of a remaining history is unknown.
         """
         # The index answers for the release; isin keeps the order of this selection, and repeated histories.
@@ -402,8 +402,10 @@ class Selection:
                     f"filter: expected a function of an index entry, such as lambda entry: entry.return_end > 30, "
                     f"found {predicate!r}; values have names: filter(layout={str(predicate)!r})"
                 )
-            kept = np.array([bool(predicate(entry)) for entry in found.entries])
-            found = found._keep(kept, "passes the function")
+            kept = [predicate(entry) for entry in found.entries]
+            if others := {type(one).__name__ for one in kept if not isinstance(one, bool | np.bool_)}:
+                raise OptionError(f"filter: expected the function to return True or False, found {', '.join(others)}")
+            found = found._keep(np.array(kept), "passes the function")
         return found
 
     def _keep(self, kept: np.ndarray, condition: str) -> Self:

@@ -176,6 +176,7 @@ def facts(root: Path) -> dict[str, Any]:
         "layouts": _layouts(info, matters),
         "learning": _learning(tasks, "layout", "source", "split"),
         "teammates": teammates,
+        **_behaviours(teammates),
         "weak": Counter((task.first.layout, task.first.source) for task in tasks if task.has_weak_labels),
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,
@@ -271,6 +272,17 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
         )
     order = {name: number for number, name in enumerate((*layouts, *SPLITS))}
     return sorted(rows, key=lambda row: (order[row["layout"]], order[row["split"]], _learned_last(row["family"])))
+
+
+def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the numbers of teammates with known behaviour and of distinct behaviours, by split."""
+    found = defaultdict[str, list[tuple[Any, ...]]](list)
+    for row in teammates:
+        if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None:
+            found[row["split"]].append((row["layout"], row["family"], row["nearest_test"]["behaviour"]))
+    counts = {split: (len(found[split]), len(set(found[split]))) for split in SPLITS if split in found}
+    shared = set(found.get("train", ())) & set(found.get("validation", ()))
+    return {"behaviours": counts, "shared_behaviours": len(shared)}
 
 
 def _layouts(info: ReleaseInfo, matters: Mapping[str, Sequence[bool]]) -> list[list[str]]:

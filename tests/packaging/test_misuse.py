@@ -42,14 +42,12 @@ def say(capsys, monkeypatch, tmp_path):
 MISUSED = """
 lst | unknown command 'lst'; valid: list, show,
 list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
-list --source nois | unknown source 'nois'; valid: ppo, noise, student. Did you mean 'noise'?
+list --source nois | unknown source 'nois'; valid: ppo, noise, student, search. Did you mean 'noise'?
 verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
 verify --deeep | No such option
 show 158 | 158: no such folder; give a history's id as --history 158
 show --history -1 | -1 is not in the range x>=0
 show --history 9999 | this selection has no history [9999], ids are within 0..
-browse --port 0 | --port is for the server: give --serve with it
-browse --overwrite --serve | --overwrite replaces a file: give --out FILE with it
 browse --out page.txt | page.txt: expected a name that ends in .html
 browse --out none/page.html | no folder none: make it first, or give another path
 browse --histories 0 | 0 is not in the range x>=1
@@ -63,7 +61,7 @@ convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps is for publ
 convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
 release build a b --out c | unexpected extra argument
 upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
-generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, small, smoke.
+generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, search, small, smoke.
 generate --out g --seed -1 | -1 is not in the range 0<=x<=4294967295
 generate --out g --address there:1 | --address needs --executor ray
 teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.

@@ -245,7 +245,7 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
     """Compare models on the benchmark's tasks.
 
     Writes a page with three tables and a figure, results.md and results.png, and every number, results.csv and
-    results.parquet, from the package's stored results and those of FILEs that `submit` made.
+    results.parquet, from the package's stored results and those of FILEs that `submit` made. Names of agents differ.
     """
     from icrl4aht_baselines.report import comparison
     from icrl4aht_baselines.report.submission import read_submission
@@ -253,7 +253,13 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
     check_output(out, overwrite, comparison.RESULTS_FILES)
     stored = comparison.read_stored(comparison.results_file())
     for path in files:
-        stored = comparison.add_submission(stored, read_submission(path))
+        found = read_submission(path)
+        if found.agent in stored.agents and not store:
+            raise OptionError(
+                f"{path}: its agent {found.agent} is on the page already, with other results; give "
+                f"`icrl4aht-data submit` another --name, or replace them with --store"
+            )
+        stored = comparison.add_submission(stored, found)
     if store:
         comparison.write_stored(comparison.results_file(), stored)
     for path in comparison.write_comparison(stored, out):

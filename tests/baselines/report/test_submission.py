@@ -124,3 +124,5 @@ def test_the_commands(submitted, tmp_path, monkeypatch):
     assert "| `my rule` | none | none | – | 1.5 |" in text and "| `rule` † |" in text
     result = runner.invoke(cli, [*page, "--overwrite", "--store"], catch_exceptions=False)
     assert list(comparison.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
+    result = runner.invoke(cli, [*page, "--overwrite"])
+    assert result.exit_code == 1 and "its agent rule is on the page already" in str(result.exception)

@@ -385,7 +385,8 @@ class TestHeldOut:
         [
             ("ad", 121, {}, r"context = 121: the shortest history of .* has 120 steps for a window"),
             ("dpt", 121, {}, r"context = 121: the shortest history has \d+ transitions; take fewer"),
-            ("ad", 41, {"every": 3}, "context = 41: .* has 40 steps .* every = 3;"),
+            ("ad", 41, {"every": 3}, "context = 41: .* has 40 steps .* every = 3 and first = all;"),
+            ("ad", 61, {"first": 3}, "context = 61: .* has 60 steps .* every = 1 and first = 3;"),
             ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts of one part"),
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
             ("amago_offline", 7, {"labels": "expert"}, "amago_offline learns from the histories' own actions"),
@@ -400,7 +401,7 @@ class TestHeldOut:
 
     def test_releases_without_labels(self, tmp_path):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
-        with pytest.raises(LabelsMissingError, match=r"have no expert actions .*: choose histories or a release"):
+        with pytest.raises(LabelsMissingError, match=r"have no expert actions .*: take labels that all have"):
             prepare("dpt", MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(tmp_path / "r")))
 
 

@@ -155,7 +155,7 @@ def test_recovered_environments_take_options():
 
 
 def test_a_release_without_tasks_has_no_environments(converted_release):
-    with pytest.raises(NotStoredError, match="convert again with --tasks"):
+    with pytest.raises(NotStoredError, match=r"convert again with tasks\.jsonl"):
         load_icrl4aht(converted_release).recover_environment(0)
 
 

@@ -173,11 +173,7 @@ def test_index_provenance_and_card_state_the_labeller(built):
     assert (expert.return_greedy, expert.return_sampled) == (greedy[number], sampled[number])
     assert (expert.last_return_greedy, expert.episodes) == (greedy[-1], 200)
     assert expert.policy_sha256 == file_hash(artefact(built / "a") / f"checkpoints/c{number}/policy.safetensors")
-    card = (root / "README.md").read_text()
-    assert "## Labels" in card
-    (row,) = json.loads((root / "card.json").read_text())["labels"]
-    assert (row["layout"], row["teammate"], row["step"]) == ("demo_wide", "H4/t0", step)
-    assert row["greedy"] == pytest.approx(greedy[number])
+    assert "## Labels" in (root / "README.md").read_text()
 
 
 def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
@@ -193,7 +189,6 @@ def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
     expert = read_provenance(root / "meta/provenance.json")[chosen.task_id].expert
     assert expert is not None
     assert (expert.step, expert.last_return_greedy) == (card["steps"], 0)
-    assert "except for 1 of 1 tasks, where an earlier one earns clearly more" in (root / "README.md").read_text()
     assert verify_release(root).ok
 
 
@@ -209,7 +204,6 @@ def test_the_card_marks_labels_that_earn_less_than_half_of_the_end(task, tmp_pat
     card = (root / "README.md").read_text()
     assert ("histories' end in 1 task of ppo on demo_wide" in card) == weak
     assert ("The labels of 1 task earn less than half" in card) == weak
-    assert ("No labels earn less than half" in card) != weak
 
 
 # The policy in the release.

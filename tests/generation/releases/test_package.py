@@ -221,7 +221,7 @@ def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkey
     assert find_draw("demo_wide", other.teammate) is None
     calls = []
 
-    def measure(layout, tasks, *arguments):
+    def measure(tasks, *arguments):
         calls.append([task.task_id for task in tasks])
         return [DOES_NOT for _ in tasks]
 

@@ -221,9 +221,7 @@ class TestPredicates:
             two_sourced.filter("demo_wide")
 
     def test_wrong_functions(self, two_sourced):
-        with pytest.raises(UnknownNameError, match=r"unknown field of an index entry 'layuot'; .* mean 'layout'"):
+        with pytest.raises(AttributeError, match="layuot"):
             two_sourced.filter(lambda entry: entry.layuot == "demo_wide")
-        with pytest.raises(OptionError, match=r"expected the function to return True or False, .* found '\w+' for his"):
+        with pytest.raises(OptionError, match=r"expected the function to return True or False, found str"):
             two_sourced.filter(lambda entry: entry.layout)
-        with pytest.raises(AttributeError, match="nothing"):
-            two_sourced.filter(lambda entry: entry.layout.nothing)

@@ -96,7 +96,7 @@ def test_calls(dataset, message):
 
 def test_buffers_of_other_batches(dataset):
     one, two = (dataset.ad(batch_size=2, length=length) for length in (5, 6))
-    with pytest.raises(OptionError, match=r"out: expected and found .*obs.*\(2, 5, 5, 5, 45\).*\(2, 6, 5, 5, 45\)"):
+    with pytest.raises(OptionError, match=r"out: expected .*obs.*\(2, 5, 5, 5, 45\).*found .*\(2, 6, 5, 5, 45\)"):
         one.batch(0, two.empty())
     sliced = one.empty()._replace(dones=np.empty((5, 2), bool).T)
     with pytest.raises(OptionError, match="C-contiguous"):
