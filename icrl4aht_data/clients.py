@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, RemoteError
 from icrl4aht_data.utils.files import NO_ROOM
@@ -39,6 +40,25 @@ def offline_switches() -> list[str]:
 def without_credentials(text: str) -> str:
     """Remove user names, passwords, queries and fragments from all addresses in a text."""
     return _ADDRESS.sub(r"\g<scheme>\g<rest>", text)
+
+
+def check_credentials(address: str) -> None:
+    """Check that the password in an address has no unencoded "/": the rest would be parsed as the path and shown.
+
+    Raises:
+        OptionError: if it may have one; the message does not contain the address.
+    """
+    try:
+        parts = urlsplit(address)
+        # With a port and a later "@", the part before may be USER:PASSWORD, unless it looks like a host with a dot.
+        is_clear = parts.port is None or "@" in parts.netloc or "@" not in parts.path or "." in parts.netloc
+    except ValueError:  # the port is not a number
+        is_clear = False
+    if not is_clear:
+        raise OptionError(
+            "an address, not shown because it may have a password: expected SCHEME://HOST:PORT/PATH or "
+            "SCHEME://USER:PASSWORD@HOST/PATH: percent-encode the user name and password, such as / as %2F"
+        )
 
 
 class HubClient:

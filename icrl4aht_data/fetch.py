@@ -22,6 +22,7 @@ from icrl4aht_data.clients import (
     Advance,
     FsspecClient,
     HubClient,
+    check_credentials,
     offline_switches,
     with_retries,
     without_credentials,
@@ -281,6 +282,7 @@ def _open_hub(url: str, to: Path | None) -> Remote:
 
 
 def _open_address(address: str, to: Path | None) -> Remote:
+    check_credentials(address)
     client, url = FsspecClient(address), without_credentials(address).rstrip("/")
     base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{short_hash(url.encode(), 8)}"
     latest = base / "latest"  # the version that this address had when it was last opened

@@ -18,7 +18,7 @@ from icrl4aht_data.checking.index import check_index
 from icrl4aht_data.checking.provenance import check_provenance
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
 from icrl4aht_data.checking.structure import check_structure
-from icrl4aht_data.clients import without_credentials
+from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.download import chosen_files
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, check_choice
@@ -64,8 +64,10 @@ def verify_release(
     Raises:
         UnknownNameError: if `level` or a name in `wanted` does not exist.
         EmptySelectionError: if no history matches `wanted`.
+        OptionError: if the user name or password in an address has characters that are not percent-encoded.
     """
     check_choice("level", level, get_args(Level))
+    check_credentials(str(root))
     report = Report(without_credentials(str(MINI if root is None else root)), level)
     try:
         origin = open_root(MINI if root is None else root)

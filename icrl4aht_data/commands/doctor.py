@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 
 from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.clients import offline_switches, without_credentials
+from icrl4aht_data.clients import check_credentials, offline_switches, without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.download import default_remote
 from icrl4aht_data.errors import OptionError, PluginError
@@ -163,6 +163,11 @@ def _network(problems: Problems) -> dict[str, Any]:
     if remote is not None and not is_address(remote):
         step = "set it to one such as hf://datasets/<org>/<repo>, https://... or s3://..., or unset it"
         problems[f"ICRL4AHT_REMOTE={remote!r}: expected an address"] = step
+    try:
+        check_credentials(remote or "")
+    except OptionError as error:
+        problems[f"ICRL4AHT_REMOTE: {error}"] = "set it to such an address, or unset it"
+        remote = "not shown"
     return {"offline": offline_switches(), "remote": remote and without_credentials(remote)}
 
 

@@ -25,7 +25,7 @@ from huggingface_hub import file_download
 from huggingface_hub.utils import _http
 
 from icrl4aht_data import clients, load_icrl4aht, verify_release
-from icrl4aht_data.clients import without_credentials
+from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.errors import (
@@ -460,6 +460,15 @@ def test_the_token_is_sent_to_the_hub_only(lite):
 )
 def test_texts_without_credentials(text, expected):
     assert without_credentials(text) == expected
+
+
+def test_unencoded_credentials_are_refused_and_hidden():
+    for address in ("http://user:hunter2/RET@127.0.0.1:9/x", "http://user:1/hunter2@127.0.0.1:9/x"):
+        with pytest.raises(OptionError, match="percent-encode the user name and password") as caught:
+            load_icrl4aht(address)
+        assert "hunter2" not in str(caught.value)
+    for address in ("https://h.test/a@v1", "http://127.0.0.1:80/a@v1", "https://u:p%2F@h.test:8/x", "s3://bucket/x@1"):
+        check_credentials(address)
 
 
 def test_credentials_in_an_address_are_used_and_never_kept_or_shown(lite, tmp_path):
