@@ -181,6 +181,7 @@ def render_comparison(stored: StoredResults) -> str:
         marks="\n".join(f"* {text}" for text in overlap_legend(overlaps)),
         measured=f"{measured.about.rstrip('.')} (best responses of version {measured.version}).",
         cells=f"{len(scored)} of {len(scales)} cells",
+        scored=", ".join(dict.fromkeys(cell.layout for cell in scored)) or "none",
         least=f"{LEAST_HEADROOM:g}",
         alpha=f"{_SIGNIFICANT:g}",
         rows=f"{len(stored.table):,}",
