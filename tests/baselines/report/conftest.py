@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,10 +20,12 @@ def cards(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(autouse=True)
-def unmeasured(cards, monkeypatch) -> None:
+@pytest.fixture(scope="module", autouse=True)
+def unmeasured(cards) -> Iterator[None]:
     """Replace the package's best responses by none."""
-    monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "none.json")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(best_responses, "best_responses_file", lambda: cards / "none.json")
+        yield
 
 
 @pytest.fixture
