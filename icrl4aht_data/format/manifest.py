@@ -28,6 +28,7 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.utils.files import (
     LARGEST,
     atomic_write,
+    is_inside,
     plain_size,
     read_text,
     resolve_inside,
@@ -69,7 +70,7 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
 
     Raises:
         IndexFormatError: if the manifest is empty or a line is malformed; with the line number.
-        UnsafePathError: if a release may not contain a file with this path.
+        UnsafePathError: if a path leads out of the release, or a release may not contain it.
     """
     if not text:
         raise IndexFormatError(f"{path}: empty: expected a line for each file of the release; fetch it again")
@@ -82,6 +83,10 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         if match is None:
             raise IndexFormatError(f"{path}, line {number}: expected '<sha256>  <path>', found {line[:200]!r}")
         digest, name = match.groups()
+        if not is_inside(name):
+            raise UnsafePathError(
+                f"{path}, line {number}: {name!r} leads out of the release: do not use it, and warn its publisher"
+            )
         if not is_known_file(name):
             raise UnsafePathError(
                 f"{path}, line {number}: {name[:200]!r} is not a file that a release has: do not use it, and warn its "

@@ -130,6 +130,8 @@ def test_the_depth_of_json_is_limited():
 def test_reserved_names_of_windows(tmp_path):
     for name in ("con", "meta/NUL.json", "com1.h5/x", "a./b", "a /b", "data/teammate/aux/train.h5"):
         with pytest.raises(Icrl4ahtError, match="leads out"):
+            parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")
+        with pytest.raises(Icrl4ahtError, match="leads out"):
             resolve_inside(tmp_path, name)
 
 

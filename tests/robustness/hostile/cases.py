@@ -98,7 +98,7 @@ _NAMES = {
     "control": "meta/\x1b[2J",
     "long": "x" * 300,
 }
-add("release", "not a file that a release has", {f"manifest: {name}": listed(path) for name, path in _NAMES.items()})
+add("release", "leads out of the release", {f"manifest: {name}": listed(path) for name, path in _NAMES.items()})
 add("release", "are one file on some systems", {"manifest: upper case": listed(SHARD.replace("teammate", "TEAMMATE"))})
 add("release", "not a file that a release has", {"manifest: code": listed("sitecustomize.py")})
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
@@ -397,7 +397,7 @@ add("published", "an object of objects", {"provenance: a list": replaced("proven
 
 add("served", "expected at most", {f"a terabyte: {name}": replaced(name, sparse) for name in (MANIFEST, TABLE)})
 add("served", "expected at most|sha256", {"a terabyte: shard": replaced(SHARD, sparse)})
-add("served", "not a file that a release has", {"names above": listed("../../new")})
+add("served", "leads out of the release", {"names above": listed("../../new")})
 for _name, _message, _rules in (
     ("endless manifest", "MANIFEST", {"*/MANIFEST.sha256": Long(TERABYTE)}),
     ("endless index", "expected at most|more came|says", {f"*/{HISTORIES}": Long(TERABYTE)}),
