@@ -110,9 +110,9 @@ TEAMMATE_PLUGINS = Plugins("icrl4aht.teammates", (*FAMILIES, *KIND_FAMILIES))
 """Heuristic teammates registered by other packages. Each is a separate family with the same name."""
 
 SOURCES = ("ppo", "noise", "student", "search")
-"""How histories are made: by an ego that learns with PPO; by a script whose random actions become rarer (noise
-distillation, Zisman et al. 2024); by a trained agent, perhaps with random actions in the same way; by a script that
-finds out which dish its teammate wants. Releases may name other sources."""
+"""How histories are made. "ppo": an ego learns with PPO. "noise": a script plays, and its random actions become rarer
+(noise distillation, Zisman et al. 2024). "student": a trained agent plays, perhaps with random actions that become
+rarer. "search": a script finds out which dish its teammate wants. Releases may name other sources."""
 
 SCRIPTED_SOURCES = ("noise", "search")
 """Sources of histories that a script plays; its actions without noise label them."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from icrl4aht_data.benchmark.facts import SCRIPTED_SOURCES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
@@ -51,9 +52,9 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
 def _faults(made: Provenance, entries: Sequence[Entry], seed: int | None) -> Iterator[str]:
     """Yield contradictions within a provenance, and to the index and the task's seed."""
     first, count = entries[0], len(entries)
-    if first.source == "noise" and made.expert and made.expert.policy_sha256:
+    if first.source in SCRIPTED_SOURCES and made.expert and made.expert.policy_sha256:
         labeller = made.expert.policy_sha256
-        yield f"expert.policy_sha256: expected null, as the script labels noise histories, found {labeller}"
+        yield f"expert.policy_sha256: expected null, as the script labels {first.source} histories, found {labeller}"
     names = made.suite and made.suite.algorithms.get(first.layout)
     if names is not None and first.teammate_kind not in names:
         yield f"suite.algorithms: {names}, but the teammate is of {first.teammate_kind}"

@@ -208,13 +208,16 @@ def _print_schema(context: click.Context, parameter: click.Parameter, wanted: bo
 @click.option("--link", default="", help="Address of a paper or repository.")
 @click.option("--name", default="", help="Name of the agent in tables.", show_default="that in the results")
 @click.option(
-    "--schema", is_flag=True, is_eager=True, callback=_print_schema, help="Only print the JSON schema of the file."
+    "--schema",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_schema,
+    help="Only print the JSON schema of the file.",
 )
 @click.option("--out", type=NewFile(".json"), metavar="FILE", required=True, help="Write this file.")
 @overwrite_option
-def submit_command(
-    folders: tuple[Path, ...], name: str, schema: bool, out: Path, overwrite: bool, **facts: Any
-) -> None:
+def submit_command(folders: tuple[Path, ...], name: str, out: Path, overwrite: bool, **facts: Any) -> None:
     """Make a file of results for the page of `results`.
 
     Checks that FOLDERs of `evaluate` have all test tasks of a track, or of both, under protocol seeded with seeds 0, 1
@@ -245,7 +248,8 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
     """Compare models on the benchmark's tasks.
 
     Writes a page with three tables and a figure, results.md and results.png, and every number, results.csv and
-    results.parquet, from the package's stored results and those of FILEs that `submit` made. Names of agents differ.
+    results.parquet, from the package's stored results and those of FILEs that `submit` made. Every
+    agent needs a name of its own.
     """
     from icrl4aht_baselines.report import comparison
     from icrl4aht_baselines.report.submission import read_submission

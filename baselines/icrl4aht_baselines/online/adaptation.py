@@ -66,8 +66,8 @@ class HeadroomJob(TrainingJob):
 
     @property
     def name(self) -> str:
-        """Set of tasks, kind and seed."""
-        return f"{self.title}-{self.kind}-s{self.seed}"
+        """Set of tasks, kind, width and seed."""
+        return f"{self.title}-{self.kind}-{self.ending}"
 
     @property
     def label(self) -> str:

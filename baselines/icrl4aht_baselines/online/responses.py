@@ -153,8 +153,13 @@ class TrainingJob:
         raise NotImplementedError
 
     @property
+    def ending(self) -> str:
+        """End of the name: width and seed, so that trainings of several widths share a folder."""
+        return f"w{self.options.width}-s{self.seed}"
+
+    @property
     def model(self) -> ModelOptions:
-        """Architecture of the ego, that of the bundled rl2 models but for its width."""
+        """Architecture of the ego: that of the bundled rl2 models, with the width of the options."""
         return ModelOptions(**{**RL2_SETTINGS["model"], "width": self.options.width})
 
     @property
@@ -259,10 +264,9 @@ class ResponseJob(TrainingJob):
 
     @property
     def name(self) -> str:
-        """Task and seed, and the model that it starts from."""
+        """Task, the model that it starts from, width and seed."""
         start = f"-{self.options.init}" if self.options.init else ""
-        start += f"-w{self.options.width}" if self.options.width != 128 else ""
-        return f"{self.behaviour.tasks[0].task_id}{start}-s{self.seed}"
+        return f"{self.behaviour.tasks[0].task_id}{start}-{self.ending}"
 
     @property
     def label(self) -> str:

@@ -27,6 +27,7 @@ import numpy as np
 from icrl4aht_generation.collection.curate import follow_oracle
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.ppo import PPO, Sequences, ppo_optimizer
+from icrl4aht_generation.learners.rollout import select_rows
 from icrl4aht_generation.policy import Policy
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -208,9 +209,9 @@ class _Player:
         ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
         sequences = self._sequences(params, state, after, played, ended)
         # Where a task ends, a new one begins with the same teammate: another view, an empty state, no previous step.
-        begun = _select(ended, self._draw_change(change_key), after.ego.change)
+        begun = select_rows(ended, self._draw_change(change_key), after.ego.change)
         memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended, state.ego.partner)
-        before = _select(ended, no_outcome(self.tasks), after.before)
+        before = select_rows(ended, no_outcome(self.tasks), after.before)
         return RolloutState(after.env, memory, before), sequences, played.reward.sum(axis=-1)
 
     def _sequences(
@@ -287,15 +288,6 @@ def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"])
         prev_action=seen(steps.prev_action),
         prev_teammate_action=None if mate is None else seen(mate),
     )
-
-
-def _select(which: Bool[Array, " B"], one: Any, other: Any) -> Any:
-    """Return a pytree with the leaves of `one` where `which`, and of `other` elsewhere."""
-
-    def choose(a: Array, b: Array) -> Array:
-        return jnp.where(which.reshape(which.shape + (1,) * (a.ndim - 1)), a, b)
-
-    return jax.tree.map(choose, one, other)
 
 
 def _model_policy(method: Method, changes: bool) -> Policy:

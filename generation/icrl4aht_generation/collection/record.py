@@ -13,7 +13,7 @@ from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_generation.learners.rollout import Rollout
 
 SCRIPT_ARRAYS = ("script_actions", "noise")
-"""Further arrays of artefacts whose histories a script plays, see `collection.scripted`."""
+"""Arrays that artefacts of scripted sources have besides those of `HistoryArrays`, see `collection.scripted`."""
 
 
 class HistoryArrays(NamedTuple):

@@ -13,13 +13,13 @@ Shapes: `N` histories, `E` episodes of each, `M` episodes of one batch, `S` byte
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Int8, Key, UInt8
+from jaxtyping import Array, Float, Int, Int8, Key, UInt8
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
@@ -29,7 +29,7 @@ from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
 from icrl4aht_generation.experts.padded import own_layout, padded_layout
 from icrl4aht_generation.experts.search import SITUATION_SEARCHER, padded_dishes, with_taken
-from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out
+from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out, select_rows
 from icrl4aht_generation.policy import Policy, sometimes_random
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
@@ -181,7 +181,7 @@ def _program(teammate: Policy, searches: bool) -> Callable[..., tuple[ScriptedEp
         players = [_noisy_script(env, script, expert, chance), policy_player(env, teammate, params, TEAMMATE, m)]
         start = init_rollout(env, players, keys)
         if searches:
-            own = jax.tree.map(partial(_select, episode == 0), start.memories[EGO], memory)
+            own = select_rows(episode == 0, start.memories[EGO], memory)
             start = start._replace(memories=(own, start.memories[TEAMMATE]))
         # The roll-out's own key is not used: heuristics have keys of their own, and learned teammates act greedily.
         carry, rollout = roll_out(env, players, start, KEPT_STEPS, key)
@@ -207,10 +207,6 @@ def _blank_memories(params: Any, count: int) -> Any:
     """Return zeros in the shape of `count` memories of the searcher."""
     shape = jax.eval_shape(SITUATION_SEARCHER.init, params, jax.random.key(0))
     return jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape), leaf.dtype), shape)
-
-
-def _select(which: Bool[Array, " M"], one: Array, other: Array) -> Array:
-    return jnp.where(which.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
 
 def _noisy_script(env: Environment, script: Policy, params: Any, chance: Float[Array, " M"]) -> Player:

@@ -73,7 +73,7 @@ def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
 
 
 def hashed_files(work: Work, profile: Profile) -> list[str]:
-    """Return the files whose hashes an artefact's metadata has, sorted."""
+    """Return the names of the files that an artefact's metadata lists with their hashes, sorted."""
     files = {METRICS, *(f"{name}.npy" for name in HistoryArrays._fields)}
     if work.source in SCRIPTED_SOURCES:
         return sorted(files | {f"{name}.npy" for name in SCRIPT_ARRAYS})

@@ -152,12 +152,16 @@ def roll_out(
 
 def _reset_memory(player: Player, memory: Any, state: EnvState, done: Bool[Array, " N"]) -> Any:
     """Return the player's memory, with that of a new episode in the slots whose environment is `done`."""
-    ended = done[player.agent_slots % done.shape[0]]
+    return select_rows(done[player.agent_slots % done.shape[0]], player.init(state), memory)
 
-    def select(new: Array, old: Array) -> Array:  # the mask is on the leading axis; leaves may be typed keys
-        return jnp.where(ended.reshape(ended.shape + (1,) * (new.ndim - 1)), new, old)
 
-    return jax.tree.map(select, player.init(state), memory)
+def select_rows(which: Bool[Array, " N"], one: Any, other: Any) -> Any:
+    """Return a pytree with the rows of `one` where `which`, and those of `other` elsewhere; rows are on axis 0."""
+
+    def select(a: Array, b: Array) -> Array:  # leaves may be typed keys
+        return jnp.where(which.reshape(which.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(select, one, other)
 
 
 def network_player(

@@ -180,7 +180,7 @@ def _new_task(
 
 
 def _scripted_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
-    """Return a task whose labels are the actions of its script."""
+    """Return a task of a scripted source; its labels are the script's actions before random ones replace them."""
     if found.source == "noise":
         earned, action = made.references, "scripted oracle, which sees the full state"
     else:
