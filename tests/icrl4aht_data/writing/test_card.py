@@ -154,7 +154,8 @@ def test_how_histories_were_made(write):
     suite = TeammateSuite(algorithms={"demo_wide": ["fcp"]}, members=2, train=3, total_steps=10**6, threshold=20.0)
     card = render_card(write(change=lambda of: replace(of, noise=noise | {"power": [0.5, 2.0]}, suite=suite)))
     assert "8 histories of 60 episodes a task. The chance of a random action falls from 0.9-1.0 to 0" in card
-    assert "Learned teammates: populations of 2, 1,000,000 steps per member, by fcp on demo_wide." in card
+    assert "a population has 2 policies, each trained for 1,000,000 steps. Algorithms: fcp on demo_wide." in card
+    assert "if it earns more than 20 with its own partner" in card
     assert "Not recorded" in render_card(write(change=lambda of: Provenance()))
 
 
