@@ -1,9 +1,9 @@
-"""`make demo`: from the bundled release's histories to a model that learns within its context, and a report of it."""
+"""`make demo`: from the bundled histories to a model that learns within its context, and a picture of it."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,46 +13,50 @@ from rich.console import Console
 
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
-from icrl4aht_baselines.methods.options import SIZES, ModelOptions
+from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.page import write_page_with_episodes
-from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, bundled_by_id, evaluate_agent
+from icrl4aht_baselines.report.results import EPISODE_BLOCKS, EvaluationRun, evaluate_agent
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
-from icrl4aht_baselines.training.seen import overlap_legend
 from icrl4aht_baselines.training.trainer import show_steps
-from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.benchmark.reference_returns import REFERENCES
-from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE
+from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import save_episode
-from icrl4aht_data.plotting import check_can_draw, plot_learning_curves
+from icrl4aht_data.plotting import check_can_draw, legend_below, plot_learning_curves, save_figure
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 
-FLOOR = ("stay", "random")
-"""Reference egos that an agent has to exceed before its return says anything."""
+DEMO_LAYOUT = "asymm_both_plain"
+_SOURCE = "search"
+_EPISODES = 10  # of a window: it begins where a history begins, as an evaluation does
 
-DEMO_LAYOUT = "demo_wide"
-_MODEL = ModelOptions(**SIZES["tiny"].model)
-# 4,000 steps at a rate of 3e-3 without dropout fit as many histories better, and held-out ones much worse.
-_TRAINING = TrainOptions(3000, batch_size=16, context=SIZES["tiny"].context, validate_every=500, validation_batches=4)
+_MODEL = ModelOptions(
+    width=128, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05
+)
+_TRAINING = TrainOptions(
+    600, batch_size=32, context=_EPISODES * KEPT_STEPS, learning_rate=2e-3, validate_every=200, validation_batches=1
+)
 _PROTOCOL = get_protocol("seeded", 20)
+
+_AGENTS = {"stay": "never moves", "search": "the script that the model imitates", "oracle": "is told the dish"}
+"""Reference egos that the picture shows, and what they do."""
 
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """What the demo trains and measures; the defaults take at most 10 minutes on two cores.
+    """What the demo trains and measures; the defaults take at most 7 minutes on two cores.
 
     Attributes:
         root: folder of the release.
-        model, training: AD's; by default of size tiny, with fewer steps than its own, chosen on validation tasks.
+        model, training: those of Hybrid-AD, whose steps cost least; chosen on validation tasks.
         tasks: tasks to evaluate on; None for the validation tasks of `DEMO_LAYOUT`.
-        reference: bundled model to compare with; None for none.
         protocol, seeds: of the evaluation.
     """
 
@@ -60,27 +64,12 @@ class DemoSettings:
     model: ModelOptions = _MODEL
     training: TrainOptions = _TRAINING
     tasks: tuple[Task, ...] | None = None
-    reference: str | None = "ad-reference"
     protocol: Protocol = _PROTOCOL
-    seeds: Sequence[int] = range(10)
-
-
-def find_lead(returns: Mapping[str, np.ndarray], agent: str) -> MeanInterval:
-    """Return the difference of an agent's mean return to that of a reference ego, the one with the lower interval.
-
-    Differences are paired, since episodes of a task and a seed start alike for all agents. The interval is over pairs
-    of a task and a seed; the agent earns more than both egos if it is above 0.
-
-    Args:
-        returns: agent -> mean returns (U, S) of U tasks and S seeds.
-        agent: the agent.
-    """
-    differences = (mean_interval((returns[agent] - returns[name]).ravel()) for name in FLOOR)
-    return min(differences, key=lambda found: found.low)
+    seeds: Sequence[int] = range(16)
 
 
 def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) -> Path:
-    """Load, sample, verify, train, evaluate, report, and print what is done.
+    """Load, sample, verify, train, evaluate with and without memory, draw, and print what is done.
 
     Args:
         out: folder; the same call resumes a stopped one.
@@ -97,11 +86,11 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     check_can_draw()
     started = time.perf_counter()
     settings = settings or DemoSettings()
-    paths = [out / name for name in ("learning_curves.png", "episode.gif", "report.html")]
+    paths = [out / name for name in ("learning_curves.png", "episode.gif", "adaptation.png", "report.html")]
     for path in paths:
-        check_output(path, overwrite=(out / "ad").is_dir())  # of a stopped run
+        check_output(path, overwrite=(out / "run").is_dir())  # of a stopped run
     out.mkdir(parents=True, exist_ok=True)
-    curves, episode, page = paths
+    curves, episode, picture, page = paths
 
     def say(number: int, text: str) -> None:
         console.print(f"[bold]{number}/6[/bold] ({time.perf_counter() - started:.0f} s) {text}")
@@ -109,15 +98,14 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     def write(text: str) -> None:
         console.print(text, highlight=False, markup=False)
 
-    say(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}")')
-    dataset = load_icrl4aht(settings.root, split="train", layout=DEMO_LAYOUT)
+    say(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}", source="{_SOURCE}")')
+    dataset = load_icrl4aht(settings.root, split="train", layout=DEMO_LAYOUT, source=_SOURCE)
     plot_learning_curves(load_icrl4aht(settings.root), curves)
     _draw_best_episode(dataset, episode)
     write(f"{dataset!r}\nlearning curves: {curves}\nbest episode: {episode}")
 
-    say(2, "ds.ad(batch_size=8, length=500)[0], then ds.dpt(batch_size=8, context=500)[0]")
-    write(f"{dataset.ad(batch_size=8, length=500)[0].describe()}\n")
-    write(dataset.dpt(batch_size=8, context=500)[0].describe())
+    say(2, 'ds.ad(batch_size=8, length=500, labels="expert")[0]')
+    write(dataset.ad(batch_size=8, length=500, labels="expert")[0].describe())
 
     say(3, "verifying every byte and every step")
     verified = verify_release(settings.root, level="deep")
@@ -127,57 +115,110 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
         f"no problem in {verified.files} files, {verified.chunks} chunks, {verified.transitions:,} transitions replayed"
     )
 
-    model, training = settings.model, settings.training
-    size = f"{model.layers} layers of width {model.width}, K = {training.context}"
-    say(4, f"training AD on oracle labels, {size}: {training.steps} steps")
-    _train_demo(out / "ad", settings)
-    write(f"losses on training and held-out histories: {out / 'ad' / RUN_CURVES}")
+    training = settings.training
+    say(4, f"training Hybrid-AD on windows of {training.context:,} steps: {training.steps} steps")
+    run = out / "run"
+    histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=(_SOURCE,), labels="expert", first=_EPISODES)
+    job = prepare("hybrid_ad", settings.model, training, histories)
+    with progress_bars(unit="steps") as show:
+        job.train(run, done=show_steps(show, "Hybrid-AD", training.steps))
+    write(f"losses on training and held-out histories: {run / RUN_CURVES}")
 
-    tasks = settings.tasks
-    if tasks is None:
-        tasks = tuple(task for task in bundled_by_id("validation").values() if task.layout.name == DEMO_LAYOUT)
-    others = [*REFERENCES, *([settings.reference] if settings.reference else [])]
-    say(5, f"evaluating it and {', '.join(others)} on {len(tasks)} validation tasks of {DEMO_LAYOUT}")
-    agents = [find_agent(name) for name in (*others, out / "ad")]
+    tasks = settings.tasks or validation_tasks()
+    say(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
+    agent = find_agent(run, greedy=False)
     runs = [
-        evaluate_agent(agent, tasks, settings.protocol, out / "results" / agent.name, seeds=settings.seeds)
-        for agent in agents
+        evaluate_agent(one, tasks, settings.protocol, out / "results" / one.name, seeds=settings.seeds)
+        for one in (agent, *map(find_agent, _AGENTS))
     ]
-    own, cells = runs[-1], [*runs[0].cells]
-    leads = {cell: find_lead({run.agent: run.returns[cell].mean for run in runs}, own.agent) for cell in cells}
-    better = f"{own.agent} - better of {' and '.join(FLOOR)}"
-    means = {
-        cell.family: {run.agent: f"{run.returns[cell].mean.mean():.1f}" for run in runs} | {better: lead.text(sign="+")}
-        for cell, lead in leads.items()
-    }
-    write(pd.DataFrame(means).T.to_string())
+    cleared = evaluate_agent(
+        agent, tasks, settings.protocol, out / "results" / "cleared", seeds=settings.seeds, control="forgets"
+    )
+    runs.insert(1, cleared)
+    write(block_table(runs).to_string())
 
-    say(6, "drawing the report")
+    say(6, "drawing")
+    draw_adaptation(runs, picture)
     write_page_with_episodes(runs, page)
-    write(f"report: {page}")
-    write(f"done in {time.perf_counter() - started:.0f} s\n")
-    write("\n".join([*overlap_legend(own.overlaps(cells)), *_conclusion(own, leads)]))
+    write(f"return by episode: {picture}\nreport: {page}")
+    write(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(runs[0], cleared)}")
     return page
 
 
-def _train_demo(folder: Path, settings: DemoSettings) -> None:
-    histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=("noise",), labels="oracle")
-    job = prepare("ad", settings.model, settings.training, histories)
-    with progress_bars(unit="steps") as show:
-        job.train(folder, done=show_steps(show, "AD", job.options.steps))
+def validation_tasks() -> tuple[Task, ...]:
+    """Return the validation tasks of `DEMO_LAYOUT`: new teammates, dishes of training."""
+    tasks = read_tasks(manifest_path(PREFERENCE, "validation"))
+    return tuple(task for task in tasks if task.layout.name == DEMO_LAYOUT)
 
 
-def _conclusion(own: EvaluationRun, leads: Mapping[ResultCell, MeanInterval]) -> list[str]:
-    """Return the limits of what was measured, and the verdict."""
-    floor, better = " and ".join(FLOOR), [cell.family for cell, lead in leads.items() if lead.low > 0]
-    others = ", ".join(cell.family for cell in leads if cell.family not in better)
-    verdict = f"{own.agent} earns more than {floor} with {len(better)} of {len(leads)} families"
-    parts = [", ".join(better)] * bool(better) + [f"no more with {others}"] * bool(others)
-    return [
-        "It is one training run: the intervals leave out how much trainings differ. Validation tasks are for choosing "
-        "models, so this is no test result.",
-        f"{verdict}: {'; '.join(parts)}.",
-    ]
+def block_table(runs: Sequence[EvaluationRun]) -> pd.DataFrame:
+    """Return the mean returns of some agents (rows) in the blocks of episodes that were played (columns)."""
+    means = {
+        run.agent: {block: np.mean([row.mean() for row in rows]) for block, rows in _blocks(run).items()}
+        for run in runs
+    }
+    return pd.DataFrame(means).T.map("{:z.1f}".format).rename(columns="episodes {}".format)
+
+
+def _blocks(run: EvaluationRun) -> dict[str, list[np.ndarray]]:
+    """Return block of episodes -> mean returns of each cell, (U, S)."""
+    found: dict[str, list[np.ndarray]] = {}
+    for of_cell in run.returns.values():
+        for block in EPISODE_BLOCKS:
+            if block in of_cell.blocks:
+                found.setdefault(block, []).append(of_cell.blocks[block][0])
+    return found
+
+
+def find_rise(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
+    """Return how much a run earns more in its last block of episodes than in its first episode.
+
+    Differences are paired by task and seed; cells weigh the same.
+
+    Args:
+        run: the results.
+        other: another agent's, whose last block takes the place of the first episode.
+    """
+    blocks = _blocks(run)
+    last = list(blocks)[-1]
+    return mean_interval(
+        *(a - b for a, b in zip(blocks[last], blocks["1"] if other is None else _blocks(other)[last], strict=True))
+    )
+
+
+def conclusion(own: EvaluationRun, cleared: EvaluationRun) -> str:
+    """Return whether the model learns within its context, and the limits of what was measured."""
+    rise, memory = find_rise(own), find_rise(own, cleared)
+    verdict = "rises by what it remembers" if rise.low > 0 and memory.low > 0 else "does not rise by what it remembers"
+    return (
+        f"Its return {verdict}: {rise.text(sign='+')} from the first episode to the last ones, {memory.text(sign='+')} "
+        f"more there than with its memory cleared before each episode.\n"
+        f"It is one training: the intervals leave out how much trainings differ. Validation tasks are for choosing "
+        f"models, so this is no test result."
+    )
+
+
+def draw_adaptation(runs: Sequence[EvaluationRun], path: Path) -> None:
+    """Draw the mean return of each episode, a line for each run; the model's memory cleared is dashed."""
+    figure, (axes,) = panel_grid(
+        [f"{DEMO_LAYOUT}, validation teammates: one dish is wanted, and nothing shows which"],
+        1,
+        (6.4, 3.6),
+        "episode with the same teammate",
+    )
+    for number, run in enumerate(runs):
+        returns = np.mean([of_cell.mean(axis=0) for of_cell in run.cells.values()], axis=0)
+        label = f"{run.agent}, which {_AGENTS[run.agent]}" if run.agent in _AGENTS else run.agent
+        style = (
+            {"color": "C0", "linewidth": 2.2, "linestyle": "--" if number else "-"}
+            if number < 2
+            else {"color": f"C{number}", "alpha": 0.7}
+        )
+        axes.plot(np.arange(1, len(returns) + 1), returns, marker=".", label=label, **style)
+    axes.set_ylabel("return of an episode", fontsize=8)
+    axes.axhline(0, color="gray", linewidth=0.6)
+    legend_below(figure)
+    save_figure(figure, path)
 
 
 def _draw_best_episode(dataset: Dataset, path: Path) -> None:

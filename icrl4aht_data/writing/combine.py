@@ -19,17 +19,17 @@ from icrl4aht_data.writing.stored import release_tasks, stored_task
 
 def combine_releases(
     target: str | Path,
-    roots: Sequence[str | Path],
+    roots: Sequence[str | Path | Dataset],
     data_version: str | None = None,
     *,
     overwrite: bool = False,
     done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
-    """Combine releases into one, with the histories in order and renumbered.
+    """Combine releases, or selections of their histories, into one release, in order and renumbered.
 
     Args:
         target: the folder to write.
-        roots: releases of the same kind and episode length without common tasks.
+        roots: releases of the same kind and episode length without common tasks; a `Dataset` for a part of one.
         data_version: version of the combination; by default the common version of the releases.
         overwrite: replace a release at `target`.
         done: called when the histories of a task are written.
@@ -42,10 +42,10 @@ def combine_releases(
     if data_version is not None:
         check_version(data_version)
     target = as_path(target)
-    if not roots or isinstance(roots, (str, Path)):
+    if not roots or isinstance(roots, (str, Path, Dataset)):
         raise OptionError(f"expected a list of at least one release to combine, found {roots!r}")
-    check_target(target, overwrite, roots)
-    datasets = [load_icrl4aht(root) for root in roots]
+    check_target(target, overwrite, [root.root if isinstance(root, Dataset) else root for root in roots])
+    datasets = [root if isinstance(root, Dataset) else load_icrl4aht(root) for root in roots]
     _check_compatible(datasets)
     versions = {dataset.info.data_version for dataset in datasets}
     if data_version is None and len(versions) > 1:
@@ -62,7 +62,7 @@ def combine_releases(
         kept_steps=first.environment.kept_steps,
         left_out=[task for task in left_out if task.task_id not in written],
         overwrite=overwrite,
-        sources=roots,
+        sources=[dataset.root for dataset in datasets],
         done=done,
     )
 
@@ -83,8 +83,11 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
     tasks = []
     for dataset in datasets:
         provenance = read_provenance(dataset.origin.file(PROVENANCE))
+        selected = dataset.column("task_id")
         for task in release_tasks(dataset):
-            histories = dataset.select(dataset.index.query(task_id=task.task_id))
+            if not (of_task := selected == task.task_id).any():
+                continue
+            histories = dataset.select(of_task)
             owner = owners.setdefault(task.task_id, dataset)
             if owner is not dataset:
                 raise OptionError(

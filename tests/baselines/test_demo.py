@@ -8,14 +8,13 @@ from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 
-import numpy as np
 import pytest
 from icrl4aht_baselines import demo
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.results import Result, write_result
+from icrl4aht_baselines.evaluate.segments import controlled_name
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.report import gifs, results
-from icrl4aht_baselines.report.statistics import MeanInterval
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_generation.teammates.registry import sample_teammate
 from rich.console import Console
@@ -28,78 +27,71 @@ TASKS = tuple(
     for seed, family in enumerate(("utility_greedy", "territory"))
 )
 SETTINGS = demo.DemoSettings(
-    model=ModelOptions(layers=1, width=16, heads=2),
+    model=ModelOptions(recurrent_layers=1, width=16, heads=2),
     training=TrainOptions(steps=2, batch_size=2, context=10),
     tasks=TASKS,
-    reference=None,
-    protocol=get_protocol("seeded", 2),
+    protocol=get_protocol("seeded", 6),
     seeds=range(4),
 )
-EARNED = {"stay": 0.0, "random": 2.0, "oracle": 50.0}
+EARNED = {"stay": (0.0, 0.0), "search": (-20.0, 40.0), "oracle": (40.0, 40.0)}
+"""Agent -> returns of the first episode and of the others."""
 
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory) -> Path:
     """Return a release of random play with both sources."""
     root = tmp_path_factory.mktemp("demo") / "release"
-    random_release(root, layouts=("demo_wide",), streams=2, length=100, sources=("noise", "ppo"))
+    random_release(root, layouts=("demo_wide",), streams=2, length=100, sources=("search", "ppo"))
     return root
 
 
-def evaluate_without_playing(agent, make, tasks, protocol, *, seeds, out, details, played):
-    """Write results in which the model earns 10 more than `random` with H4 and equally much with H2."""
-    settings = {"agent": agent, "seeds": list(seeds), "protocol": asdict(protocol), "code_version": "0"}
-    settings |= {"details": details} if details else {}
-    found = []
-    for task in tasks:
-        value = EARNED.get(agent, 12.0 if task.teammate_family == "H4" else 2.0)
-        found.append(Result(task.task_id, settings, [[value, value] for _ in seeds]))
-        write_result(out, found[-1])
-    return found
+def evaluation_of(last: float, last_cleared: float):
+    """Return a stand-in of `evaluate` in which a model earns 0, then `last`, less or more by the seed's number."""
+
+    def evaluate(agent, make, tasks, protocol, *, seeds, out, details, played, control=None):
+        name = agent if control is None else controlled_name(agent, control)
+        settings = {"agent": name, "seeds": list(seeds), "protocol": asdict(protocol), "code_version": "0"}
+        settings |= {"details": details} if details else {}
+        first, others = EARNED.get(agent, (0.0, last if control is None else last_cleared))
+        found = []
+        for task in tasks:
+            returns = [[first, *[others + seed] * (protocol.episodes - 1)] for seed in seeds]
+            found.append(Result(task.task_id, settings, returns))
+            write_result(out, found[-1])
+        return found
+
+    return evaluate
 
 
-def test_an_agent_leads_if_its_gain_over_both_is_significant():
-    """Two tasks with two seeds deviate by up to 1 from the agent's mean."""
-
-    def lead(**means: float) -> MeanInterval:
-        spread = np.linspace(-1, 1, 4).reshape(2, 2)
-        return demo.find_lead({agent: mean + spread * (agent == "AD") for agent, mean in means.items()}, "AD")
-
-    found = lead(stay=0.0, random=2.0, AD=12.0)
-    assert found.mean == pytest.approx(10.0) and 8.0 <= found.low < 10.0 < found.high <= 12.0
-    assert lead(stay=0.0, random=12.0, AD=8.0).mean == pytest.approx(-4.0), "the better of both counts"
-    assert lead(stay=0.0, random=2.0, AD=2.5).low < 0 < lead(stay=0.0, random=2.0, AD=2.5).mean
-
-
-def run(out: Path, settings: demo.DemoSettings) -> tuple[str, Path]:
-    """Run a demo; return its output and report."""
-    text = StringIO()
-    page = demo.run_demo(out, Console(file=text, width=300), settings)
-    return text.getvalue(), page
-
-
-def test_the_demo_runs_every_step(release, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("last", "last_cleared", "verdict"),
+    [(20.0, 0.0, "rises by"), (20.0, 20.0, "does not rise by"), (-10.0, -30.0, "does not rise by")],
+)
+def test_the_demo_runs_every_step(last, last_cleared, verdict, release, tmp_path, monkeypatch):
     """The model is trained; its evaluation is replaced by invented results."""
-    monkeypatch.setattr(results, "evaluate", evaluate_without_playing)
+    monkeypatch.setattr(results, "evaluate", evaluation_of(last, last_cleared))
     monkeypatch.setattr(gifs, "save_episodes", lambda *arguments, **named: ())
-    text, page = run(tmp_path, replace(SETTINGS, root=release))
-    for expected in ("1/6", "target_actions", "context_next_obs", "transitions replayed", "6/6", "done in", str(page)):
-        assert expected in text, expected
-    assert text.endswith("AD earns more than stay and random with 1 of 2 families: H4; no more with H2.\n")
-    assert re.search(r"H4 +0\.0 +2\.0 +50\.0 +12\.0 +\+10\.0 \(\+10\.0 to \+10\.0\)", text)
-    assert "† the agent was trained with other teammates of this family" in text
-    assert (tmp_path / "learning_curves.png").read_bytes()[1:4] == b"PNG"
+    monkeypatch.setattr(demo, "DEMO_LAYOUT", "demo_wide")
+    text = StringIO()
+    page = demo.run_demo(tmp_path, Console(file=text, width=300), replace(SETTINGS, root=release))
+    said = text.getvalue()
+    for expected in ("1/6", "target_actions", "transitions replayed", "6/6", "done in", str(page)):
+        assert expected in said, expected
+    assert f"Its return {verdict} what it remembers: {last + 1.5:+.1f}" in said
+    assert re.search(r"search +-20\.0 +41\.5 +41\.5\n", said)
+    for name in ("learning_curves.png", "adaptation.png"):
+        assert (tmp_path / name).read_bytes()[1:4] == b"PNG"
     assert (tmp_path / "episode.gif").read_bytes()[:6] == b"GIF89a"
-    assert "<h3>Return in each cell, validation tasks</h3>" in page.read_text()
-    config = json.loads((tmp_path / "ad" / "config.json").read_text())
-    assert {cell["source"] for cell in config["trained_on"]} == {"noise"}
+    assert "validation tasks</h3>" in page.read_text()
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert {cell["source"] for cell in config["trained_on"]} == {"search"}
 
 
 @pytest.mark.slow
 def test_the_complete_demo(tmp_path):
-    text, page = run(tmp_path, replace(SETTINGS, tasks=None, reference="ad-reference"))
-    assert "transitions replayed" in text
-    rows = {line.split()[0]: line.split() for line in text.splitlines() if re.match(r"H\d .*\(", line)}
-    assert len(rows) >= 2, "families of the validation tasks"
-    assert all(float(row[1]) == 0.0 and float(row[3]) > 20 for row in rows.values()), "stay and oracle"
-    assert "data:image/gif" in page.read_text()
+    text = StringIO()
+    short = TrainOptions(steps=2, batch_size=2, context=100)
+    demo.run_demo(tmp_path, Console(file=text, width=300), replace(SETTINGS, tasks=None, training=short))
+    rows = {line.split()[0]: line.split() for line in text.getvalue().splitlines() if "  " in line}
+    assert float(rows["stay"][1]) < 20 < float(rows["oracle"][1])
+    assert float(rows["search"][1]) < 10 < float(rows["search"][3])

@@ -94,7 +94,8 @@ class CollectionJob:
         """Updates of the ego, or pieces that a script plays."""
         if self.work.source == "ppo":
             return self.profile.ego_on(self.work.task.layout.name).updates
-        return len(scripted_pieces(self.work.source, self.profile.scripted[self.work.source]))
+        layout, source = self.work.task.layout.name, self.work.source
+        return len(scripted_pieces(source, self.profile.scripted_on(layout, source)))
 
     @property
     def xla_threads(self) -> int | None:

@@ -62,7 +62,7 @@ def play_histories(
     work: Work, profile: Profile, partial: Path, on_update: UpdateCallback, suite: Path | None, save_seconds: float
 ) -> None:
     """Play the histories of a task into a partial artefact, see `collection.job.run_task`."""
-    task, config = work.task, profile.scripted[work.source]
+    task, config = work.task, profile.scripted_on(work.task.layout.name, work.source)
     layout = None if task.teammate["kind"] == "heuristic" else task.layout
     teammate = build_teammate(layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
     schedules, pieces = noise_schedules(config, task.seed), scripted_pieces(work.source, config)

@@ -66,7 +66,7 @@ def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
         "code_version": version("icrl4aht-data"),
     }
     if work.source in SCRIPTED_SOURCES:
-        config = profile.scripted[work.source]
+        config = profile.scripted_on(work.task.layout.name, work.source)
         return common | {"noise": json.loads(json.dumps(asdict(config)))}  # lists, as in the file, not tuples
     ego = profile.ego_on(work.task.layout.name)
     return common | {"ego_hash": json_hash(asdict(ego)), "checkpoint_updates": list(checkpoint_updates(ego))}

@@ -132,7 +132,7 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
         for _ in range(count * profile.learners)
     ]
     scripted = [
-        (source, get_layout(name), profile.scripted[source])
+        (source, get_layout(name), profile.scripted_on(name, source))
         for source in SCRIPTED_SOURCES
         for name, count in tasks.get(source, {}).items()
         for _ in range(count)

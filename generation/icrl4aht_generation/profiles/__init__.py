@@ -54,6 +54,7 @@ class _Generated(Struct, forbid_unknown_fields=True):
     count: Count
     seed: Natural = 0
     split: str = "train"
+    teammates: Annotated[int, Meta(ge=0, le=16)] = 0
 
 
 class _Tasks(Struct, forbid_unknown_fields=True):
@@ -122,9 +123,12 @@ def _named_errors(path: Path) -> Iterator[None]:
 def _profile(name: str, content: _ProfileFile) -> Profile:
     release, tasks = content.release, content.tasks
     layouts, sources = _layouts("tasks.layouts", tasks.layouts), _distinct("tasks.sources", tasks.sources)
+    generated: dict[str, int] = {}
     for one in tasks.generated:
-        found = generate_layouts(one.family, one.seed, one.count, split=one.split)
-        layouts += tuple(layout.name for layout in add_layouts(found))
+        found = add_layouts(generate_layouts(one.family, one.seed, one.count, split=one.split))
+        names = _distinct("tasks.generated", [*generated, *(layout.name for layout in found)])
+        generated |= dict.fromkeys(names[len(generated) :], one.teammates)
+    layouts += tuple(generated)
     _known("source", "tasks.sources", sources, REBUILT_SOURCES)
     if not layouts and sources != ("search",):
         raise OptionError("tasks.layouts: none, expected layouts there or in tasks.generated")
@@ -138,6 +142,8 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
     ego = dict(content.ego)
     of_layouts = _by_layout("ego.layouts", ego.pop("layouts", {}), layouts)
     egos = replace_options(PPOConfig(), ego, "ego.")
+    noise, noise_layouts = _scripted("noise", content.noise, NoiseConfig(), layouts)
+    search, search_layouts = _scripted("search", content.search, SEARCH, preference)
     algorithms = _by_layout("tasks.algorithms", tasks.algorithms, layouts)
     for key, names in algorithms.items():
         _known("algorithm", "tasks.algorithms", _distinct(f"tasks.algorithms.{key}", names), ALGORITHMS)
@@ -146,8 +152,10 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         ego=egos,
         ego_layouts={each: replace_options(egos, of, f"ego.layouts.{each}.") for each, of in of_layouts.items()},
         teammates=_teammates(content.teammates),
-        noise=replace_options(NoiseConfig(), content.noise, "noise."),
-        search=replace_options(SEARCH, content.search, "search."),
+        noise=noise,
+        search=search,
+        scripted_layouts={"noise": noise_layouts, "search": search_layouts},
+        generated=generated,
         preference=_distinct("tasks.preference", preference),
         data_version=check_version(release.data_version),
         keep=release.keep if "ppo" in sources else 0,
@@ -163,6 +171,16 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         least_rise=release.least_rise,
         xla_threads=content.xla_threads,
     )
+
+
+def _scripted(
+    source: str, values: dict[str, Any], default: NoiseConfig, layouts: tuple[str, ...]
+) -> tuple[NoiseConfig, dict[str, NoiseConfig]]:
+    """Return the histories of a scripted source, and those of layouts with values of their own."""
+    values = dict(values)
+    own = _by_layout(f"{source}.layouts", values.pop("layouts", {}), layouts)
+    config = replace_options(default, values, f"{source}.")
+    return config, {name: replace_options(config, of, f"{source}.layouts.{name}.") for name, of in own.items()}
 
 
 def _sampled(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
@@ -201,7 +219,7 @@ def _by_layout(key: str, value: Mapping[str, Value] | Value, layouts: tuple[str,
     found = dict(zip(_layouts(key, list(value)), value.values(), strict=True))
     for name in found:
         if name not in layouts:
-            raise OptionError(f"{key}.{name}: expected one of tasks.layouts, {', '.join(layouts)}")
+            raise OptionError(f"{key}.{name}: expected one of the profile's layouts, {', '.join(layouts)}")
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import takewhile
 from typing import Annotated, Any
 
 from icrl4aht_data.benchmark.facts import (
@@ -26,7 +27,7 @@ from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.draws import drawn_teammates
-from icrl4aht_generation.teammates.registry import heuristic_teammate
+from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
 
 LEAST_EPISODES = 5
 """Episodes of a stream: its start and its end are means over five."""
@@ -36,6 +37,10 @@ VALIDATION_DRAWS = 1
 
 _SOURCE_SEEDS, _LAYOUT_SEEDS, _FAMILY_SEEDS, _DRAW_SEEDS = 1_000_000, 10_000, 1_000, 500
 _UNSAMPLED_SEEDS = 500_000  # tasks with presets and learned teammates come behind those with drawn ones
+_GENERATED_SEEDS, _LAYOUT_TEAMMATES = 700_000, 16
+
+_GENERATED_DRAWS = {"train": 4, "validation": 5, "test": 6}
+"""Split of a generated layout -> the base seed of its teammates, of the wide ranges `Heuristic.diverse`."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +117,8 @@ class Profile:
         ego_layouts: layout -> hyper-parameters of its egos, where they differ from `ego`.
         noise: histories of the source "noise".
         search: histories of the source "search".
+        scripted_layouts: source -> layout -> its histories, where they differ from `noise` or `search`.
+        generated: generated layout -> number of its drawn teammates.
         preference: layouts of the source "search": it has their training and validation tasks of the track
             `preference`, and the other sources have none of these.
         policies: whether the release has the policies that label its histories.
@@ -139,6 +146,8 @@ class Profile:
     ego_layouts: dict[str, PPOConfig] = field(default_factory=dict)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     search: NoiseConfig = SEARCH
+    scripted_layouts: dict[str, dict[str, NoiseConfig]] = field(default_factory=dict)
+    generated: dict[str, int] = field(default_factory=dict)
     preference: tuple[str, ...] = ()
     policies: bool = False
     oracle_actions: bool = False
@@ -173,10 +182,10 @@ class Profile:
         """Return the hyper-parameters of the egos on a layout (short name)."""
         return self.ego_layouts.get(layout, self.ego)
 
-    @property
-    def scripted(self) -> dict[str, NoiseConfig]:
-        """Histories of the sources that a script plays."""
-        return {"noise": self.noise, "search": self.search}
+    def scripted_on(self, layout: str, source: str) -> NoiseConfig:
+        """Return the histories that a script plays on a layout (short name), for the source "noise" or "search"."""
+        common = self.search if source == "search" else self.noise
+        return self.scripted_layouts.get(source, {}).get(layout, common)
 
     def layouts_of(self, source: str) -> tuple[str, ...]:
         """Return the names of a source's layouts."""
@@ -243,6 +252,12 @@ class Profile:
             for number, preset in enumerate(self.presets)
         ]
         tasks = [_of_source(task, source) for task in tasks]
+        if layout in self.generated:
+            first = _first_seed(source) + _GENERATED_SEEDS + list(self.generated).index(layout) * _LAYOUT_TEAMMATES
+            return tasks + [
+                make_task(track, split, layout, entry, first + number)
+                for number, entry in enumerate(_drawn_for(layout, split, self.generated))
+            ]
         if self.sampled is None:
             return tasks
         entries = self.sampled.drawn(layout, source)
@@ -259,6 +274,15 @@ class Profile:
 def _preference_tasks() -> list[Task]:
     """Return the training and validation tasks of the track `preference`."""
     return [task for split in ("train", "validation") for task in read_tasks(manifest_path(PREFERENCE, split))]
+
+
+def _drawn_for(layout: str, split: str, generated: Mapping[str, int]) -> list[dict[str, Any]]:
+    """Return the drawn teammates of a generated layout, which take turns with those of the layouts before it."""
+    first, kinds = sum(generated[name] for name in takewhile(layout.__ne__, generated)), list(HEURISTIC_KINDS)
+    return [
+        sample_teammate(kinds[number % len(kinds)], number // len(kinds), "diverse", _GENERATED_DRAWS[split])
+        for number in range(first, first + generated[layout])
+    ]
 
 
 def _sampled_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:

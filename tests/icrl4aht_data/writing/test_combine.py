@@ -53,6 +53,16 @@ def test_one_release_combines_to_the_same_bytes(parts, tmp_path):
         assert (tmp_path / "out" / shard.relative_to(parts[0])).read_bytes() == shard.read_bytes()
 
 
+def test_a_selection_is_combined_without_the_other_histories(parts, tmp_path):
+    chosen = load_icrl4aht(parts[1], layout="demo_wide")[1:]
+    combined = load_icrl4aht(combine_releases(tmp_path / "out", [chosen, parts[0]]))
+    assert combined.counts("layout") == {"demo_wide": 2, "coord_simple": 2}
+    assert verify_release(tmp_path / "out").ok
+    by_stream = {history.entry.env_idx: history for history in combined.filter(layout="demo_wide")}
+    for history in chosen:
+        assert np.array_equal(by_stream[history.entry.env_idx].read("actions"), history.read("actions"))
+
+
 def test_a_task_in_two_releases_is_refused(parts, tmp_path):
     with pytest.raises(OptionError, match=r"b: task teammate_train_demo_cook_wide_.* is also in .*b"):
         combine_releases(tmp_path / "out", [parts[1], parts[0], parts[1]])
