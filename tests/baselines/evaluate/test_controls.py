@@ -111,7 +111,7 @@ def test_intervals_of_controls_resample_behaviours():
             for value, scale in ((values, 1.0), (values, 0.0))
         )
         memory, _ = control_lines(ControlledResults(plain, zero, zero, 2), own)
-        assert memory.startswith("track teammate, memory M: +3.5") and ("(" in memory) == (family == "H3")
+        assert memory.startswith("track teammate, memory M: +2.0") and ("(" in memory) == (family == "H3")
 
 
 def test_controls_of_an_ego_without_memory_earn_the_same(alone, programs):
