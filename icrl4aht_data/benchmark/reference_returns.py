@@ -1,4 +1,4 @@
-"""Mean returns of the reference egos in every test cell, which show where an ego can improve on `stay`."""
+"""Mean returns of the reference egos, which show where an ego can improve on `stay`, and test tasks that are alike."""
 
 from __future__ import annotations
 
@@ -29,6 +29,11 @@ def read_headroom(protocol: str) -> dict[Cell, dict[str, float]]:
 def stay_returns(protocol: str) -> dict[str, float]:
     """Return task id -> mean return of the ego `stay`; empty if the protocol was not measured."""
     return json.loads(card_file("stay.json").read_text(encoding="utf-8")).get(protocol, {})
+
+
+def alike_tasks() -> list[list[str]]:
+    """Return the ids of test tasks whose teammates act alike, a list for each behaviour that several tasks share."""
+    return json.loads(card_file("behaviours.json").read_text(encoding="utf-8"))
 
 
 def has_headroom(references: Mapping[str, float]) -> bool:

@@ -19,12 +19,12 @@ from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.methods.ad import dropped_steps
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
+from icrl4aht_baselines.online.responses import find_behaviours
 from icrl4aht_baselines.training.options import SAVE_MINUTES, HistoryOptions
 from icrl4aht_generation.layouts.families import LAYOUT_SPLITS
 from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
 from icrl4aht_generation.learners.checkpoint import POLICY_CHECKPOINTS
 from icrl4aht_generation.profiles import load_profile
-from icrl4aht_generation.teammates.distances import common_states, group_behaviours
 from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED, Draw, find_draw, read_draws
 from icrl4aht_generation.teammates.heuristics.territory import TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES
@@ -37,7 +37,7 @@ from icrl4aht_data.benchmark.facts import (
     TESTED_ON,
     TRACKS,
 )
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_headroom
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS, alike_tasks, has_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
@@ -314,10 +314,18 @@ def test_behaviours_of_the_test_tasks_are_added_up():
     assert list(counts) == list(HEURISTICS)
 
 
+def test_behaviours_of_the_test_tasks():
+    by_id = {task.task_id: task for task in tasks("test")}
+    found = Counter((task.layout.name, task.teammate_family) for task in by_id.values())
+    for first, *others in alike_tasks():
+        found[by_id[first].layout.name, by_id[first].teammate_family] -= len(others)
+    stated = {(name, family): count for family, row in behaviours_of_tests().items() for name, count in row.items()}
+    assert found == stated
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["test_wide", "demo_wide"])
-def test_behaviours_of_the_test_tasks(name):
-    states = common_states(LAYOUTS[name])
-    for number, family in enumerate(HEURISTICS):
-        own = states.actions[number * INSTANCES : (number + 1) * INSTANCES]
-        assert len(set(group_behaviours(own))) == behaviours_of_tests()[family][name]
+def test_alike_tasks_of_a_layout():
+    own = [task for task in tasks("test") if task.layout.name == "test_wide"]
+    ids = {task.task_id for task in own}
+    found = [[task.task_id for task in one.tasks] for one in find_behaviours(own) if len(one.tasks) > 1]
+    assert found == [group for group in alike_tasks() if group[0] in ids]

@@ -35,6 +35,11 @@ rest is computed again: the window has between 4/5 K and K steps. The context of
 so both compute it once for each episode."""
 
 
+OTHER_WAYS = ("greedy", "sampled")
+"""Ways of choosing actions, see `PlayMode.greedy`. Results of a model that plays in another way than its own have the
+way in their name, such as "ad-reference (sampled)"."""
+
+
 class PlayMode(NamedTuple):
     """Way in which a trained model plays.
 
@@ -132,7 +137,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
         raise UnknownNameError(f"{name}: not a run: {CONFIG} is missing; `icrl4aht-data train` makes runs")
     own_greedy = model is None or not model.sampled
     mode = PlayMode(acting or "cached", own_greedy if greedy is None else greedy)
-    suffix = "" if mode.greedy == own_greedy else " (greedy)" if mode.greedy else " (sampled)"
+    suffix = "" if mode.greedy == own_greedy else f" ({OTHER_WAYS[not mode.greedy]})"
     if model is None:
         run = read_trained(Path(name))
         details = {"run": run.hash, "step": run.step, "context": run.context, "encoder": run.encoder, **mode.details}

@@ -39,11 +39,15 @@ _seeds_option = click.option("--seeds", type=COUNT, default=3, help="Trainings o
 
 def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, float]]:
     """Return model -> task id -> mean return, of the stored results of models on some tasks."""
+    from icrl4aht_baselines.agents.egos import OTHER_WAYS
     from icrl4aht_baselines.report.comparison import read_stored, results_file
     from icrl4aht_baselines.report.results import task_label
 
     table, names = read_stored(results_file()).table, {task_label(task.task_id): task.task_id for task in tasks}
-    chosen = table[(table["protocol"] == protocol) & (table["control"] == "") & (table["block"] == "all")]
+    table = table[table["control"].isin(["", *OTHER_WAYS])]
+    named = table["agent"].where(table["control"] == "", table["agent"] + " (" + table["control"] + ")")
+    table = table.assign(agent=named)
+    chosen = table[(table["protocol"] == protocol) & (table["block"] == "all")]
     means = chosen[chosen["task"].isin(list(names))].groupby(["agent", "task"])["return"].mean()
     found: dict[str, dict[str, float]] = defaultdict(dict)
     for (agent, task), value in means.items():  # type: ignore[misc]

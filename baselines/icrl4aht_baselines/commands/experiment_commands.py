@@ -119,15 +119,22 @@ def control_command(out: Path) -> None:
 def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None:
     """Measure the reference egos on every test task.
 
-    `stay` also plays the validation tasks, since scores are relative to it. Writes their results into OUT, and
-    OUT/headroom.json, OUT/headroom.md and OUT/stay.json from them.
+    `stay` also plays the validation tasks, since scores are relative to it. Under seeded each task is played with the
+    seeds 0, 1 and 2. Writes their results into OUT, and OUT/headroom.json, OUT/headroom.md and OUT/stay.json from them,
+    and OUT/behaviours.json: which test teammates act alike.
     """
-    from icrl4aht_baselines.report.cards import HEADROOM_FILES, measure_headroom, write_headroom_cards
+    from icrl4aht_baselines.report.cards import (
+        HEADROOM_FILES,
+        find_alike_tasks,
+        measure_headroom,
+        write_headroom_cards,
+    )
 
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:
         check_output(folder, overwrite=True, names=HEADROOM_FILES)
     with progress_bars(unit="episodes") as show:
         runs = measure_headroom(out, protocol, show)
-    for path in (path for folder in folders for path in write_headroom_cards(runs, folder)):
+    alike = find_alike_tasks()
+    for path in (path for folder in folders for path in write_headroom_cards(runs, alike, folder)):
         click.echo(f"wrote {path}")

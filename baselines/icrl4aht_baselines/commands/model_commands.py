@@ -207,6 +207,7 @@ def _print_schema(context: click.Context, parameter: click.Parameter, wanted: bo
 @click.option("--core-hours", type=click.FloatRange(min=0), help="Core-hours of the training and all it needs.")
 @click.option("--link", default="", help="Address of a paper or repository.")
 @click.option("--name", default="", help="Name of the agent in tables.", show_default="that in the results")
+@click.option("--update", is_flag=True, help="These are new results of an agent on the page, which they replace.")
 @click.option(
     "--schema",
     is_flag=True,
@@ -217,18 +218,22 @@ def _print_schema(context: click.Context, parameter: click.Parameter, wanted: bo
 )
 @click.option("--out", type=NewFile(".json"), metavar="FILE", required=True, help="Write this file.")
 @overwrite_option
-def submit_command(folders: tuple[Path, ...], name: str, out: Path, overwrite: bool, **facts: Any) -> None:
+def submit_command(
+    folders: tuple[Path, ...], name: str, update: bool, out: Path, overwrite: bool, **facts: Any
+) -> None:
     """Make a file of results for the page of `results`.
 
     Checks that FOLDERs of `evaluate` have all test tasks of a track, or of both, under protocol seeded with seeds 0, 1
     and 2, and say what the agent was trained on. Several folders of one agent are its tracks, or its trainings with
-    different seeds. Results of `evaluate --controls` are included. A pull request that adds the file puts the agent on
-    the page; `icrl4aht-data results FILE` shows it there.
+    different seeds. Results of `evaluate --controls` are included. Results of a model's other way of playing, such as
+    `evaluate --sampled`, in a folder of their own get rows of their own. A pull request that adds the file puts the
+    agent on the page; `icrl4aht-data results FILE` shows it there.
     """
-    from icrl4aht_baselines.report import submission
+    from icrl4aht_baselines.report import comparison, submission
 
     check_output(out, overwrite)
-    found = submission.make_submission(folders, submission.AgentFacts(**facts), name)
+    found = submission.make_submission(folders, submission.AgentFacts(**facts), name, update)
+    comparison.check_agent(comparison.read_stored(comparison.results_file()), found, ", ".join(map(str, folders)))
     submission.write_submission(out, found)
     click.echo(f"wrote {out}: {found.agent}, {' and '.join(found.tracks)}; `icrl4aht-data results {out}` shows it")
 
@@ -258,11 +263,7 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
     stored = comparison.read_stored(comparison.results_file())
     for path in files:
         found = read_submission(path)
-        if found.agent in stored.agents and not store:
-            raise OptionError(
-                f"{path}: its agent {found.agent} is on the page already, with other results; give "
-                f"`icrl4aht-data submit` another --name, or replace them with --store"
-            )
+        comparison.check_agent(stored, found, str(path))
         stored = comparison.add_submission(stored, found)
     if store:
         comparison.write_stored(comparison.results_file(), stored)

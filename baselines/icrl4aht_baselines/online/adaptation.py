@@ -129,7 +129,8 @@ def headroom_jobs(
 def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | None:
     """Return the entry of a set of tasks in cards/adaptation.json; None before both egos of a seed are trained.
 
-    It has the mean return of each kind of ego by seed, and on each layout, mean over these seeds.
+    It has the steps and the network's width of the trainings, and the mean return of each kind of ego by seed, and on
+    each layout, mean over these seeds.
     """
     own = [job for job in jobs if job.title == title and job.is_finished()]
     seeds = sorted(set.intersection(*({job.seed for job in own if job.kind == kind} for kind in EGO_KINDS)))
@@ -146,6 +147,7 @@ def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | 
         "tasks": title,
         "number": len(own[0].tasks),
         "steps": own[0].options.updates * own[0].options.tasks * KEPT_STEPS,
+        "width": own[0].options.width,
         "returns": {kind: {str(seed): mean(kind, [seed]) for seed in seeds} for kind in EGO_KINDS},
         "layouts": {layout: {kind: mean(kind, seeds, layout) for kind in EGO_KINDS} for layout in layouts},
     }
@@ -192,8 +194,9 @@ def adaptation_table(folder: Path, layouts: bool = True) -> str:
             half = stats.t.ppf(0.975, seeds - 1) * differences.std(ddof=1) / np.sqrt(seeds)
             interval = f" ({differences.mean() - half:+.1f} to {differences.mean() + half:+.1f})"
         cells = [f"{informed.mean():.1f}", f"{episodic.mean():.1f}", f"{differences.mean():+.1f}{interval}"]
-        rows.append([entry["tasks"], str(entry["number"]), *cells, str(seeds), f"{entry['steps']:,}"])
+        training = [str(seeds), f"{entry['steps']:,}", str(entry["width"])]
+        rows.append([entry["tasks"], str(entry["number"]), *cells, *training])
         for layout, of in entry["layouts"].items() if layouts and len(entry["layouts"]) > 1 else ():
             one, other = (of[kind] for kind in EGO_KINDS)
-            rows.append([layout, "", f"{one:.1f}", f"{other:.1f}", f"{one - other:+.1f}", "", ""])
-    return markdown_table(["set", "tasks", *EGO_KINDS, "difference", "seeds", "steps of each"], rows, right=6)
+            rows.append([layout, "", f"{one:.1f}", f"{other:.1f}", f"{one - other:+.1f}", "", "", ""])
+    return markdown_table(["set", "tasks", *EGO_KINDS, "difference", "seeds", "steps of each", "width"], rows, right=7)

@@ -13,6 +13,7 @@ import numpy as np
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import UNUSED_OPTIONS
+from icrl4aht_baselines.online.responses import find_behaviours
 from icrl4aht_baselines.report.page import markdown_sections
 from icrl4aht_baselines.report.results import (
     TEST_LAYOUTS,
@@ -20,13 +21,14 @@ from icrl4aht_baselines.report.results import (
     ResultSource,
     evaluate_agent,
 )
+from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, SUBMITTED_SEEDS
 from icrl4aht_baselines.report.tables import PAPER_METHODS, instances_range, published_cells
 from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
 from icrl4aht_data.utils.templates import fill_template, markdown_table
 
-HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json")
+HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json", "behaviours.json")
 
 _NOT_LISTED = ("layouts", "root", "groups", "selections", "sizes", "manifest_sha256", "data_version", "obs_shape")
 
@@ -152,7 +154,8 @@ def _settings(config: Mapping[str, Any]) -> str:
 def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:
     """Evaluate every reference ego under every protocol into out/<protocol>/<agent>; finished tasks are kept.
 
-    `stay` also plays the validation tasks, since scores are relative to it.
+    `stay` also plays the validation tasks, since scores are relative to it. Under the protocol of the scores, the egos
+    play with the seeds of the agents' results, under others with seed 0.
 
     Args:
         out: folder of the results.
@@ -161,20 +164,28 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
     """
     runs = []
     for protocol in protocols:
+        seeds = SUBMITTED_SEEDS if protocol == SUBMITTED_PROTOCOL else (0,)
         for agent in REFERENCES:
             splits = EVALUATION_SPLITS if agent == "stay" else ("test",)
             tasks = [task for split in splits for track in TRACKS for task in bundled_tasks(track, split)]
             ego, folder = NamedEgo(agent, AGENTS[agent]), out / protocol / agent
             what = f"{agent}, {protocol}"
-            runs.append(evaluate_agent(ego, tasks, get_protocol(protocol), folder, show=show, what=what))
+            rules = get_protocol(protocol)
+            runs.append(evaluate_agent(ego, tasks, rules, folder, seeds=seeds, show=show, what=what))
     return runs
 
 
-def write_headroom_cards(runs: Sequence[EvaluationRun], folder: Path) -> list[Path]:
-    """Write headroom.json, headroom.md and stay.json into a folder. Return their paths.
+def find_alike_tasks() -> list[list[str]]:
+    """Return the ids of test tasks whose teammates act alike, a list for each behaviour that several tasks share."""
+    tasks = [task for track in TRACKS for task in bundled_tasks(track, "test")]
+    return [[task.task_id for task in one.tasks] for one in find_behaviours(tasks) if len(one.tasks) > 1]
+
+
+def write_headroom_cards(runs: Sequence[EvaluationRun], alike: Sequence[Sequence[str]], folder: Path) -> list[Path]:
+    """Write `HEADROOM_FILES` into a folder. Return their paths.
 
     headroom.json holds protocol -> layout -> family -> reference ego -> mean return with the test tasks, stay.json
-    protocol -> task id -> mean return of `stay`.
+    protocol -> task id -> mean return of `stay`, behaviours.json `alike`, see `find_alike_tasks`.
     """
     content: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     stays: dict[str, dict[str, float]] = {}
@@ -190,7 +201,8 @@ def write_headroom_cards(runs: Sequence[EvaluationRun], folder: Path) -> list[Pa
     paths = [folder / name for name in HEADROOM_FILES]
     paths[0].write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     paths[1].write_text(headroom_markdown(content), encoding="utf-8")
-    paths[2].write_text(json.dumps(stays, indent=1) + "\n", encoding="utf-8")
+    for path, value in zip(paths[2:], (stays, alike), strict=True):
+        path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
     return paths
 
 
@@ -200,9 +212,10 @@ def headroom_markdown(protocols: Mapping[str, HeadroomCells]) -> str:
         "# Headroom: what an ego can change",
         "",
         "Mean return of the reference egos `stay` / `random` / `oracle` (scripted, full information) over the five",
-        "published test instances of a cell, each played with seed 0 for 100 episodes of 100 steps. **bold**: the",
-        "oracle gets over one point more than staying does; elsewhere no reference ego can raise the return by more,",
-        "so a method's score there says nothing about adaptation.",
+        "published test instances of a cell, each played for 100 episodes of 100 steps with seed 0, under `seeded`",
+        f"with the seeds {', '.join(map(str, SUBMITTED_SEEDS))}. **bold**: the oracle earns over one point more than",
+        "`stay`; elsewhere no reference ego can raise the return by more, so a method's score there says nothing about",
+        "adaptation.",
     ]
     for protocol, layouts in protocols.items():
         names = [layout for layout in TEST_LAYOUTS if layout in layouts]

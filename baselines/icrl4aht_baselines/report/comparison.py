@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from icrl4aht_baselines.agents.egos import OTHER_WAYS
 from icrl4aht_baselines.online.adaptation import adaptation_table
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.results import (
@@ -77,6 +78,14 @@ class StoredResults:
         found = dict(iter(table[chosen].groupby("agent", sort=False)))
         return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
 
+    def with_other_ways(self, results: Mapping[str, AgentReturns]) -> dict[str, AgentReturns]:
+        """Return results with those of the agents' other ways of playing, such as "rl2 (greedy)", after their own."""
+        others, found = {way: self.returns(way) for way in OTHER_WAYS}, {}
+        for agent, own in results.items():
+            found[agent] = own
+            found |= {f"{agent} ({way})": of[agent] for way, of in others.items() if agent in of}
+        return found
+
 
 def results_file() -> Path:
     """Return the path of the stored results' texts; the tables are next to it."""
@@ -117,8 +126,29 @@ def write_stored(path: Path, stored: StoredResults) -> None:
         write_json(partial, msgspec.to_builtins(stored.agents))
 
 
+def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
+    """Check that results of a file are of an agent without stored results, or update those of one with some.
+
+    Raises:
+        OptionError: if not; names the agent.
+    """
+    known = {agent.casefold(): agent for agent in stored.agents}.get(found.agent.casefold())
+    if known and not found.update:
+        raise OptionError(
+            f"{where}: the page has results of an agent {known} already; give `icrl4aht-data submit` another --name, "
+            f"or --update if these are new results of the same agent"
+        )
+    if found.update and found.agent != known:
+        raise OptionError(f"{where}: updates the agent {found.agent}, which the page does not have; leave out --update")
+
+
 def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
-    """Return stored results with those of a file; they replace all of the agent's earlier ones."""
+    """Return stored results with those of a file, see `Submission.update`."""
+    parts = {one.control for one in found.evaluations}
+
+    def replaced(table: pd.DataFrame) -> pd.Series:
+        return (table["agent"] == found.agent) & (table["control"].isin(parts) | ("" in parts))
+
     tables, curves = [], defaultdict(list)
     for one, run in submitted_runs(found):
         tables.append(run.table.assign(agent=found.agent, training=one.training, control=one.control))
@@ -134,10 +164,10 @@ def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
         (stored.curves, pd.DataFrame(rows, columns=CURVE_COLUMNS)),
     )
     merged = (
-        pd.concat([part for part in (old[old["agent"] != found.agent], new) if len(part)], ignore_index=True)
-        for old, new in frames
+        pd.concat([part for part in (old[~replaced(old)], new) if len(part)], ignore_index=True) for old, new in frames
     )
-    return StoredResults(*merged, stored.agents | {found.agent: found.facts})
+    facts = found.facts if "" in parts else stored.agents[found.agent]
+    return StoredResults(*merged, stored.agents | {found.agent: facts})
 
 
 def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
@@ -169,12 +199,15 @@ def render_comparison(stored: StoredResults) -> str:
     results = {agent: cells for agent, cells in every.items() if not stored.agents[agent].commit}
     overlaps = {name for cells in results.values() for returns in cells.values() for name in returns.overlaps}
     measured, scored = read_best_responses(), open_cells(scales)
+    shown = stored.with_other_ways(results)
+    one_way = [f"`{agent}`" for agent in results if not any(f"{agent} ({way})" in shown for way in OTHER_WAYS)]
     return fill_template(
         "results.md",
-        agents=agents_table(stored, results, scales),
+        agents=agents_table(stored, shown, scales),
+        one_way=", ".join(one_way) or "none",
         difference=describe_lead(results, scales),
-        controls=controls_table(stored, results, scales),
-        layouts=layouts_table(results, scales),
+        controls=controls_table(stored, shown, scales),
+        layouts=layouts_table(shown, scales),
         adaptation=adaptation_table(results_file().parent, layouts=False),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
         earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
@@ -200,19 +233,25 @@ def _shown(value: MeanInterval | None, digits: int = 2, sign: str = "") -> str:
 def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 1: a row for each agent, what it was made of, and its scores on each track.
 
-    A track has no score unless the agent played all of its cells with headroom.
+    A track has no score unless the agent played all of its cells with headroom. Rows of another way of playing have
+    the scores alone.
     """
     body = []
     for agent, cells in results.items():
-        facts, marks = stored.agents[agent], {name for of in cells.values() for name in of.overlaps}
-        hours = "–" if facts.core_hours is None else f"{facts.core_hours:g}"
-        row = [f"`{agent}`{overlap_marks(marks)}", facts.data, facts.labels, facts.steps or "–", hours]
+        facts, marks = stored.agents.get(agent), {name for of in cells.values() for name in of.overlaps}
+        row = [f"`{agent}`{overlap_marks(marks)}", *_training_texts(facts)]
         for track in TRACKS:
             score = find_score(cells, track_cells(open_cells(scales), track), scales)
             row += [_shown(score and score.total), _shown(score and score.middle)]
         body.append(row)
     scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")]
     return markdown_table(["model", "data", "labels", "budget", "core-hours", *scored], body)
+
+
+def _training_texts(facts: AgentFacts | None) -> list[str]:
+    if facts is None:
+        return [""] * 4
+    return [facts.data, facts.labels, facts.steps or "–", "–" if facts.core_hours is None else f"{facts.core_hours:g}"]
 
 
 def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
@@ -230,7 +269,7 @@ def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 
 
 def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
-    """Return table 2: M, P and the mean return in blocks of episodes, of each agent.
+    """Return table 2: M, P and the mean return in blocks of episodes, of each row of table 1.
 
     The means are over the cells with headroom, or over all cells that the agent played if best responses were not
     measured. M and P are bold if they are above 0 with a p-value below 0.05, corrected for all M and P of the table.
@@ -243,7 +282,7 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
         for name, control, block in (("M", "forgets", "all"), ("P", "swapped", "last 20")):
             other = controls[control].get(agent, {})
             played = [cell for cell in chosen[agent] if cell in other]
-            if difference := block_difference(cells, other, played, block, scales):
+            if difference := block_difference(cells, other, played, block):
                 found[agent, name] = difference
     corrected = holm({key: difference.p for key, difference in found.items()})
     body = []

@@ -32,7 +32,7 @@ from icrl4aht_baselines.report.results import (
 from icrl4aht_baselines.report.statistics import MeanInterval, Stratum, interquartile_mean, ratio_interval
 from icrl4aht_data.benchmark.best_responses import best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
-from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom, stay_returns
+from icrl4aht_data.benchmark.reference_returns import alike_tasks, has_headroom, read_headroom, stay_returns
 
 
 class TaskScale(NamedTuple):
@@ -87,17 +87,27 @@ def bundled_cells() -> dict[ResultCell, list[str]]:
     return {cell: found[cell] for cell in in_order(found)}
 
 
+def behaviour_names() -> dict[str, str]:
+    """Return key of a task -> id of the first task whose teammate acts alike, of tasks that are known to share one.
+
+    Known are the package's test tasks and those with best responses.
+    """
+    groups = [*alike_tasks(), *(best.tasks for best in best_responses().values())]
+    return {task_label(task): group[0] for group in groups for task in group}
+
+
 def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
     """Return the scales of the package's cells under a protocol, those of which every task has a best response.
 
     A layout's test cells count once all of its cells in which the oracle earns more than `stay` have best responses.
     """
-    measured, stays = best_responses(protocol), stay_returns(protocol)
-    names = {task: f"behaviour of {best.tasks[0]}" for task, best in measured.items()}
+    measured, stays, names = best_responses(protocol), stay_returns(protocol), behaviour_names()
     found: dict[ResultCell, CellScale] = {}
     for cell, tasks in bundled_cells().items() if measured else ():
         if all(task in measured and task in stays for task in tasks):
-            scales = {task_label(task): TaskScale(stays[task], measured[task].best, names[task]) for task in tasks}
+            scales = {
+                task_label(task): TaskScale(stays[task], measured[task].best, names[task_label(task)]) for task in tasks
+            }
             found[cell] = CellScale(scales)
     wanted = (ResultCell(*cell) for cell, egos in read_headroom(protocol).items() if has_headroom(egos))
     unfinished = {cell.layout for cell in wanted if cell not in found}
@@ -194,10 +204,10 @@ def _scaled(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndar
     of_task = [scale.tasks[returns.tasks[number]] for number in known]
     stays, bests = (np.array([getattr(one, name) for one in of_task]) for name in ("stay", "best"))
     gains, names = returns.blocks["all"][:, known] - stays[:, None], [one.behaviour for one in of_task]
-    return gains, bests - stays, names, _stratum(gains, bests - stays, names)
+    return gains, bests - stays, names, behaviour_stratum(gains, bests - stays, names)
 
 
-def _stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
+def behaviour_stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
     """Return the stratum whose units are behaviours, or the seeds of a single one.
 
     Args:
@@ -220,12 +230,12 @@ def score_difference(
     for cell in cells:
         pair = paired(one[cell], other[cell])
         gains, spans, names, _ = _scaled(pair[0], scales[cell])
-        groups[cell.layout].append(_stratum(gains - _scaled(pair[1], scales[cell])[0], spans, names))
+        groups[cell.layout].append(behaviour_stratum(gains - _scaled(pair[1], scales[cell])[0], spans, names))
     return ratio_interval([*groups.values()])
 
 
 def block_difference(
-    one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], block: str, scales: CellScales
+    one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], block: str
 ) -> MeanInterval | None:
     """Return the mean return of one agent minus that of another, mean over cells, paired as in `score_difference`.
 
@@ -233,18 +243,16 @@ def block_difference(
         one, other: the agents.
         cells: the cells; None is returned unless both played all of them.
         block: block of episodes, see `results.BLOCKS`.
-        scales: say which tasks have teammates that behave alike.
     """
-    groups = []
+    groups, alike = [], behaviour_names()
     for cell in cells:
         if cell not in one or cell not in other:
             return None
         first, second = paired(one[cell], other[cell])
         if block not in first.blocks or block not in second.blocks:
             return None
-        known = scales[cell].tasks if cell in scales else {}
-        names = [known[task].behaviour if task in known else task for task in first.tasks]
-        groups.append([_stratum(first.blocks[block] - second.blocks[block], np.ones(len(names)), names)])
+        names = [alike.get(task, task) for task in first.tasks]
+        groups.append([behaviour_stratum(first.blocks[block] - second.blocks[block], np.ones(len(names)), names)])
     return ratio_interval(groups) if groups else None
 
 

@@ -16,7 +16,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from icrl4aht_baselines.agents.egos import AGENTS
+from icrl4aht_baselines.agents.bundled import bundled_models
+from icrl4aht_baselines.agents.egos import AGENTS, OTHER_WAYS
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.results import RESULTS, Result
 from icrl4aht_baselines.evaluate.segments import CONTROLS
@@ -35,6 +36,7 @@ SUBMITTED_SEEDS = (0, 1, 2)
 """Seeds with which every task has to be played."""
 
 _Text = Annotated[str, Meta(min_length=1)]
+_Name = Annotated[str, Meta(pattern=r"^[^\s`|]([^\n`|]*[^\s`|])?$")]  # does not end a cell of a Markdown table
 
 
 class AgentFacts(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -63,7 +65,8 @@ class Evaluation(msgspec.Struct, forbid_unknown_fields=True):
     """Results of a folder that `evaluate` made.
 
     Attributes:
-        control: empty, or the control, see `segments.CONTROLS`.
+        control: empty; or the control, see `segments.CONTROLS`, or the way of playing, see `egos.OTHER_WAYS`, of
+            results that are shown next to the agent's own.
         training: number of the agent's training, for several with different seeds.
         settings: settings of the results, see `evaluate.results.Result`, with `trained_on` among the details.
         returns: task id -> return of each episode, one list per seed.
@@ -85,14 +88,17 @@ class Submission(msgspec.Struct, forbid_unknown_fields=True):
         best_responses: version of the best responses, see `benchmark.best_responses`.
         tracks: the tracks that were played.
         evaluations: the results.
+        update: whether these are new results of an agent on the page. Without results of its own way of playing they
+            are added to the stored ones, otherwise they replace all of them.
     """
 
     format: Literal[1]
-    agent: _Text
+    agent: _Name
     facts: AgentFacts
     best_responses: str
     tracks: list[Literal["teammate", "layout"]]
     evaluations: Annotated[list[Evaluation], Meta(min_length=1)]
+    update: bool = False
 
 
 def submission_schema() -> str:
@@ -100,23 +106,25 @@ def submission_schema() -> str:
     return json.dumps(msgspec.json.schema(Submission), indent=1)
 
 
-def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "") -> Submission:
+def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "", update: bool = False) -> Submission:
     """Return the results in folders that `evaluate` made, and in their folders of controls, checked.
 
     Args:
-        folders: results of one agent. Those of the same tasks are of different trainings, in this order.
+        folders: results of one agent. Those of the same tasks and way of playing are of different trainings, in this
+            order. Controls of the other way of playing are left out.
         facts: what tables say about it.
         agent: name of the agent in tables, by default that in the results.
+        update: see `Submission`.
 
     Raises:
         OptionError: see `check_submission`; also if a folder has no results, or results of another version.
     """
-    counts: Counter[str] = Counter()  # task -> trainings so far
-    evaluations, tasks, training = [], set(), 0
+    counts: Counter[tuple[str, str]] = Counter()  # way of playing, task -> trainings so far
+    evaluations, tasks, training, way = [], set(), 0, ""
     for folder in folders:
         for control in ("", *CONTROLS):
             source = folder / control
-            if control and not (source / RESULTS).is_dir():
+            if control and (way or not (source / RESULTS).is_dir()):
                 continue
             results, trained = read_results(source)
             settings = results[0].settings
@@ -127,14 +135,15 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "")
             if TRAINED_ON not in details and TRAINED_ON in declared:
                 details[TRAINED_ON] = declared[TRAINED_ON]
             if not control:  # controls are of the training of their folder
-                training = max(counts[result.task_id] for result in results)
-                counts.update(result.task_id for result in results)
+                way = next((one for one in OTHER_WAYS if settings["agent"].endswith(f" ({one})")), "")
+                training = max(counts[way, result.task_id] for result in results)
+                counts.update((way, result.task_id) for result in results)
             returns = {result.task_id: result.returns for result in results}
             tasks |= set() if control else returns.keys()
-            evaluations.append(Evaluation(control, training, settings | {"details": details}, returns))
+            evaluations.append(Evaluation(control or way, training, settings | {"details": details}, returns))
     tracks: Any = [track for track in TRACKS if tasks & _track_tasks([track])] or [*TRACKS]
-    name = agent or evaluations[0].settings["agent"]
-    found = Submission(1, name, facts, read_best_responses().version, tracks, evaluations)
+    name = agent or evaluations[0].settings["agent"].removesuffix(f" ({evaluations[0].control})")
+    found = Submission(1, name, facts, read_best_responses().version, tracks, evaluations, update)
     check_submission(found, ", ".join(map(str, folders)))
     return found
 
@@ -147,12 +156,12 @@ def check_submission(found: Submission, where: str) -> None:
     """Check that results are complete, comparable, and declare the training data.
 
     Raises:
-        OptionError: if the agent has the name of a reference ego, the version of the best responses is unknown, the
-            training data is not declared, protocol, seeds or episodes are others than those of the page, or the tasks
-            are not exactly those of the tracks; names them.
+        OptionError: if the agent has the name of a reference ego or of a bundled model that it is not, or one that
+            tables cannot show, the version of the best responses is unknown, the training data is not declared,
+            protocol, seeds or episodes are others than those of the page, or the tasks are not exactly those of the
+            tracks; names them.
     """
-    if found.agent in AGENTS:
-        raise OptionError(f"{where}: the agent {found.agent} has the name of a reference ego; give another --name")
+    _check_name(found, where)
     known = read_best_responses().version
     if found.best_responses != known:
         raise OptionError(
@@ -162,8 +171,8 @@ def check_submission(found: Submission, where: str) -> None:
     played: dict[tuple[str, int], list[str]] = defaultdict(list)
     for one in found.evaluations:
         part = f"{where}: {one.control or found.agent}, training {one.training}"
-        if one.control not in ("", *CONTROLS):
-            raise OptionError(f"{part}: control {one.control!r}, expected {' or '.join(CONTROLS)}")
+        if one.control not in ("", *CONTROLS, *OTHER_WAYS):
+            raise OptionError(f"{part}: control {one.control!r}, expected {' or '.join((*CONTROLS, *OTHER_WAYS))}")
         _check_evaluation(one, part)
         played[one.control, one.training] += one.returns
     expected = _track_tasks(found.tracks)
@@ -178,8 +187,31 @@ def check_submission(found: Submission, where: str) -> None:
             )
         if len(tasks) > len(expected):
             raise OptionError(f"{part}: results of a task twice, expected once; give each folder once")
-    if not any(one.control == "" for one in found.evaluations):
-        raise OptionError(f"{where}: only controls, expected results of the agent itself")
+    if not found.update and not any(one.control == "" for one in found.evaluations):
+        raise OptionError(
+            f"{where}: only controls or another way of playing, expected results of the agent itself; give their "
+            f"folder, too, or --update if the page has these"
+        )
+
+
+def _check_name(found: Submission, where: str) -> None:
+    models = {one.settings.get("details", {}).get("model") for one in found.evaluations}
+    known = "a reference ego" if found.agent in AGENTS else ""
+    if found.agent in bundled_models() and models != {found.agent}:
+        known = "a bundled model"
+    if known:
+        raise OptionError(f"{where}: the agent {found.agent} has the name of {known}; give another --name")
+    try:
+        msgspec.convert(found.agent, _Name)
+    except msgspec.ValidationError as error:
+        raise OptionError(
+            f"{where}: agent {found.agent!r}: expected a name on one line without |, ` and outer spaces; give --name"
+        ) from error
+    if found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
+        raise OptionError(
+            f"{where}: the agent {found.agent} has the name of another way of playing, which its folder shows; give a "
+            f"--name without it"
+        )
 
 
 def _check_evaluation(one: Evaluation, where: str) -> None:
@@ -208,10 +240,11 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
             )
     details = one.settings.get("details", {})
     marks = {control for control, mark in CONTROLS.items() if details.get(mark)}
-    if marks != {one.control} - {""}:
+    expected = {one.control} & {*CONTROLS}
+    if marks != expected:
         raise OptionError(
             f"{where}: results of {' and '.join(sorted(marks)) or 'no control'}, expected "
-            f"{one.control or 'no control'}; give the folder that `evaluate --controls` wrote"
+            f"{''.join(expected) or 'no control'}; give the folder that `evaluate --controls` wrote"
         )
     if None in find_seen(one.settings, None, where).values():
         raise OptionError(

@@ -12,10 +12,11 @@ import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import NamedEgo, stay
 from icrl4aht_baselines.agents.host import from_host
-from icrl4aht_baselines.evaluate import evaluate_controls
+from icrl4aht_baselines.evaluate import ControlledResults, evaluate_controls
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
 from icrl4aht_baselines.evaluate.programs import Programs
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
 from icrl4aht_baselines.evaluate.segments import plan_tasks, segment_lengths
 from icrl4aht_baselines.report.controls import control_lines
@@ -97,6 +98,20 @@ def test_memory_and_partner_are_exact(alone, programs, tmp_path):
     memory, partner = control_lines(found, TASKS)
     assert f"track teammate, memory M: {found.memory.mean():+.1f}, " in memory
     assert f"track teammate, partner P: {found.partner.mean():+.1f}, return in the 2 last episodes" in partner
+
+
+def test_intervals_of_controls_resample_behaviours():
+    """Five tasks of H4 on one layout are one behaviour: with one seed there is nothing to resample."""
+    tasks = [task for task in published_tasks("teammate") if task.layout.name == "coord_simple"]
+    values = np.arange(4.0)
+    for family in ("H4", "H3"):
+        own = [task for task in tasks if task.teammate_family == family]
+        plain, zero = (
+            [Result(task.task_id, {}, [(value + scale * number).tolist()]) for number, task in enumerate(own)]
+            for value, scale in ((values, 1.0), (values, 0.0))
+        )
+        memory, _ = control_lines(ControlledResults(plain, zero, zero, 2), own)
+        assert memory.startswith("track teammate, memory M: +2.0") and ("(" in memory) == (family == "H3")
 
 
 def test_controls_of_an_ego_without_memory_earn_the_same(alone, programs):

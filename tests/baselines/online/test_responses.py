@@ -97,7 +97,7 @@ def test_table_of_the_adaptation_headroom(tmp_path):
         (tmp_path / job.name / "result.json").write_text(json.dumps(result))
         assert job.is_finished()
     write_adaptation(jobs, tmp_path)
-    row = "| demo_wide | 2 | 10.5 | 5.5 | +5.0 (-7.7 to +17.7) | 2 | 400 |"
+    row = "| demo_wide | 2 | 10.5 | 5.5 | +5.0 (-7.7 to +17.7) | 2 | 400 | 128 |"
     assert adaptation_table(tmp_path).splitlines()[-1] == row
     write_adaptation([job for job in jobs if job.seed == 0], tmp_path)
     assert "| 2 | 400 |" in adaptation_table(tmp_path), "a measurement of fewer seeds replaces none"

@@ -189,8 +189,9 @@ def test_headroom_cards_name_cells_without_headroom(tmp_path):
     runs = []
     for agent, (simple, wide) in values.items():
         runs += merge([evaluated_run(agent, ("coord_simple",), simple - 1), evaluated_run(agent, value=wide - 1)])
-    write_headroom_cards(runs, tmp_path)
+    write_headroom_cards(runs, [["a", "b"]], tmp_path)
     content = json.loads((tmp_path / "headroom.json").read_text())
+    assert json.loads((tmp_path / "behaviours.json").read_text()) == [["a", "b"]]
     assert content["seeded"]["demo_wide"]["H1"] == {"stay": 0.0, "random": 0.0, "oracle": 39.9}
     text = (tmp_path / "headroom.md").read_text()
     assert "**0.0 / 0.0 / 39.9**" in text and "No headroom: coord_simple/H1, coord_simple/H2" in text

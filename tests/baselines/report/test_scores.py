@@ -85,10 +85,10 @@ def test_differences_are_paired_by_task_and_seed():
     shuffled = other._replace(tasks=("t3", "t2", "t0", "t1"))  # 10.0 is of t3
     difference = score_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], SCALES)
     assert difference.mean == pytest.approx(((5 - 10) + (15 - 15) + (0 - 0) + (10 - 10)) / 50)
-    returns = block_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], "last 20", SCALES)
+    returns = block_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], "last 20")
     assert returns is not None and returns.mean == pytest.approx(-5 / 4)
-    assert block_difference({WIDE: one}, {}, [WIDE], "all", SCALES) is None
-    assert block_difference({WIDE: one}, {WIDE: other}, [WIDE], "1", SCALES) is None
+    assert block_difference({WIDE: one}, {}, [WIDE], "all") is None
+    assert block_difference({WIDE: one}, {WIDE: other}, [WIDE], "1") is None
 
 
 def test_teammates_that_behave_alike_are_one_unit():

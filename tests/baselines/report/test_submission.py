@@ -63,6 +63,9 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
     ("change", "message"),
     [
         (lambda c, one, task: c.update(agent="search"), "search has the name of a reference ego; give another --name"),
+        (lambda c, one, task: c.update(agent="ad-rising"), "ad-rising has the name of a bundled model; give another"),
+        (lambda c, one, task: c.update(agent="rule (greedy)"), "has the name of another way of playing"),
+        (lambda c, one, task: c.update(agent="a | b"), "not a file of results: .*matching regex"),
         (lambda c, one, task: c.update(best_responses="99"), r"best responses of version '99', expected '0'"),
         (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
         (lambda c, one, task: one["returns"].pop(task), "1 of the 40 test tasks of layout are missing, such as layout"),
@@ -74,7 +77,7 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one["settings"].pop("protocol"), "settings without 'protocol'"),
         (lambda c, one, task: one["settings"]["protocol"].update(four_recipes=True), "'four_recipes': True"),
         (lambda c, one, task: one["settings"].update(code_version="9"), "results of version 9, expected"),
-        (lambda c, one, task: one.update(control="swap"), "control 'swap', expected forgets or swapped"),
+        (lambda c, one, task: one.update(control="swap"), "control 'swap', expected forgets or swapped or"),
         (lambda c, one, task: c["evaluations"].append(one), "results of a task twice"),
         (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "only controls"),
         (lambda c, one, task: one["settings"]["details"].update(forget=True), "of forgets, expected no control"),
@@ -125,4 +128,32 @@ def test_the_commands(submitted, tmp_path, monkeypatch):
     result = runner.invoke(cli, [*page, "--overwrite", "--store"], catch_exceptions=False)
     assert list(comparison.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
     result = runner.invoke(cli, [*page, "--overwrite"])
-    assert result.exit_code == 1 and "its agent rule is on the page already" in str(result.exception)
+    assert result.exit_code == 1 and "the page has results of an agent rule already" in str(result.exception)
+    said = [*said[:-1], "Rule", "--out", str(tmp_path / "again.json")]
+    result = runner.invoke(cli, ["submit", folder, *said])
+    assert result.exit_code == 1 and f"{folder}: the page has results of an agent rule already" in str(result.exception)
+    result = runner.invoke(cli, ["submit", folder, *said, "--update"])
+    assert result.exit_code == 1 and "updates the agent Rule, which the page does not have" in str(result.exception)
+
+
+def test_another_way_of_playing_is_added(tmp_path):
+    """Its folder is told by its name; with --update it is added to stored results, alone."""
+    own, drawn = (
+        write_results(tmp_path / name, name, CURVE, sampled=name != "mine") for name in ("mine", "mine (sampled)")
+    )
+    write_results(drawn / "forgets", "mine (sampled) (forgets)", CURVE, sampled=True, forget=True)
+    both = make_submission([drawn, own], FACTS)
+    assert (both.agent, [one.control for one in both.evaluations]) == ("mine", ["sampled", ""])
+    stored = comparison.add_submission(comparison.StoredResults(), make_submission([own], FACTS))
+    with pytest.raises(OptionError, match="only controls or another way of playing, expected results of the agent"):
+        make_submission([drawn], FACTS)
+    later = comparison.add_submission(stored, make_submission([drawn], AgentFacts("x", "x", "x"), update=True))
+    assert len(later.table) == 2 * len(stored.table) and later.agents == {"mine": FACTS}
+    shown = later.with_other_ways(later.returns())
+    assert list(shown) == ["mine", "mine (sampled)"]
+    table = comparison.agents_table(later, shown, {})
+    assert "| `mine` | none | none | – | – | – |" in table and "| `mine (sampled)` |  |  |  |  | – |" in table
+    page = comparison.render_comparison(later)
+    assert "Not measured for: none." in page and "Not measured for: `mine`." in comparison.render_comparison(stored)
+    replaced = comparison.add_submission(later, make_submission([own], FACTS, update=True))
+    assert set(replaced.table["control"]) == {""}
