@@ -171,7 +171,7 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
         for value in values:
             if value not in found:
                 raise EmptySelectionError(
-                    f"{name} = {value}: none of {dataset!r}; these have {', '.join(found)}: choose among them, or "
+                    f"{name} = {value}: none of {dataset!r}; these have {', '.join(filter(None, found)) or 'none'}: choose among them, or "
                     f"another layout or release"
                 )
     if not passing.any():

@@ -82,7 +82,7 @@ def test_filters_of_sources_and_algorithms(measured):
     assert load_icrl4aht(measured, source="search").ids.tolist() == [4, 5, 6, 7]
     both = load_icrl4aht(measured).filter(source=["ppo", "search"], algorithm="utility_greedy")
     assert both.ids.tolist() == [*range(8)]
-    with pytest.raises(UnknownNameError, match=r"unknown source 'sac'; valid: ppo, noise, student, search"):
+    with pytest.raises(UnknownNameError, match=r"unknown source 'sac'; valid: ppo, noise, agent, search"):
         load_icrl4aht(measured, source="sac")
     with pytest.raises(UnknownNameError, match=r"unknown algorithm 'utility'; .* mean 'utility_greedy'"):
         load_icrl4aht(measured, algorithm="utility")

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, stay
-from icrl4aht_baselines.online import student
-from icrl4aht_baselines.online.student import collect_release, record_histories, release_teammates, with_noise
+from icrl4aht_baselines.online import agent_histories
+from icrl4aht_baselines.online.agent_histories import collect_release, record_histories, release_teammates, with_noise
 from icrl4aht_baselines.reference import RL2_HISTORIES
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
@@ -50,7 +50,7 @@ def dataset() -> Any:
 
 @pytest.fixture(scope="module")
 def release(dataset, tmp_path_factory) -> Path:
-    return collect_release(COOK, release_teammates(dataset), CONFIG, tmp_path_factory.mktemp("student") / "release")
+    return collect_release(COOK, release_teammates(dataset), CONFIG, tmp_path_factory.mktemp("agent") / "release")
 
 
 def test_the_release_is_verified_to_the_last_step(release):
@@ -62,7 +62,7 @@ def test_the_release_is_verified_to_the_last_step(release):
 def test_provenance_of_the_release(release, dataset):
     found = load_icrl4aht(release)
     made, given = release_teammates(found).tasks, release_teammates(dataset).tasks
-    assert found.counts("source") == {"student": 2 * len(given)}
+    assert found.counts("source") == {"agent": 2 * len(given)}
     assert set(found.counts("split")) == {"train", "validation"}
     card = (release / "README.md").read_text(encoding="utf-8")
     assert "a trained agent plays" in card
@@ -134,9 +134,9 @@ def test_a_stopped_collection_resumes(release, dataset, tmp_path, monkeypatch):
         return original(make, tasks, *args)
 
     original, target = record_histories, tmp_path / "release"
-    monkeypatch.setattr(student, "record_histories", record)
+    monkeypatch.setattr(agent_histories, "record_histories", record)
     with monkeypatch.context() as patch:
-        patch.setattr(student, "write_release", killed_in_the_end)
+        patch.setattr(agent_histories, "write_release", killed_in_the_end)
         with pytest.raises(KeyboardInterrupt):
             collect_release(COOK, release_teammates(dataset), CONFIG, target)
     assert not target.exists() and played == ["cramped_up"]
@@ -159,7 +159,7 @@ def test_the_command(tmp_path):
 
 def test_histories_like_those_of_reference_models(monkeypatch, tmp_path):
     made = []
-    monkeypatch.setattr(student, "collect_release", lambda *given, **options: made.append(given[2]))
+    monkeypatch.setattr(agent_histories, "collect_release", lambda *given, **options: made.append(given[2]))
     arguments = ["collect", "--agent", "random", "--layout", "cramped_up", "--like", "rising", "--out", str(tmp_path)]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0 and made == [RL2_HISTORIES["rising"]]
