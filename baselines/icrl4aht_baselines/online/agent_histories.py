@@ -214,7 +214,8 @@ def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, Te
         if len(group) < 2:
             raise OptionError(
                 f"task {task.task_id}: swap = {every} needs another {task.teammate_kind} teammate of split "
-                f"{task.split} on {task.layout.name}, found none: select more histories, give a --manifest, or leave the task out"
+                f"{task.split} on {task.layout.name}, found none: select more histories, give a --manifest, or leave "
+                f"the task out"
             )
         first = list(group).index(teammate_id(task.teammate))
         in_turn = [*group.values()][first:] + [*group.values()][:first]

@@ -167,11 +167,11 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
     for name, values in filters.items():
         column = dataset.column(FILTERS[name])
         passing &= np.isin(column, values)
-        found = sorted(set(column.tolist()))
+        found = sorted(set(column.tolist()) - {""}) or ["none"]
         for value in values:
             if value not in found:
                 raise EmptySelectionError(
-                    f"{name} = {value}: none of {dataset!r}; these have {', '.join(filter(None, found)) or 'none'}: choose among them, or "
+                    f"{name} = {value}: none of {dataset!r}; these have {', '.join(found)}: choose among them, or "
                     f"another layout or release"
                 )
     if not passing.any():
