@@ -255,12 +255,13 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object of the index line, without `label_view` and `teammate_of_episode` if they are None."""
-        content: dict[str, Any] = msgspec.to_builtins(self)
+        content = json.loads(msgspec.json.encode(self))
         return {name: value for name, value in content.items() if value is not None or name not in _LEFT_OUT}
 
     def to_row(self) -> dict[str, Any]:
         """Return the fields as a row of a table, with `teammate_of_episode` as JSON text."""
-        return msgspec.to_builtins(self) | {name: encode(getattr(self, name)) for name in ENCODED}
+        texts = {name: encode(getattr(self, name)) for name in ENCODED}
+        return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)} | texts
 
 
 _LEFT_OUT = ("label_view", "teammate_of_episode")  # so that releases without them keep their bytes

@@ -30,10 +30,10 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
         return labels
     missing = np.flatnonzero(~has[labels])
     counts = ", ".join(f"{int(has[name].sum())} have {name} actions" for name in LABELS)
-    tasks = len(np.unique(dataset.column_codes("task_id")[missing]))
+    tasks = dataset.column("task_id")[missing]
     raise LabelsMissingError(
-        f"labels = {labels}: {len(missing)} of {len(dataset)} histories, of {counted_noun(tasks, 'task')}, have no "
-        f"{labels} actions (first: history {dataset.ids[missing[0]]} of task {dataset.column('task_id')[missing[0]]}); "
+        f"labels = {labels}: {len(missing)} of {len(dataset)} histories have no {labels} actions, those of "
+        f"{counted_noun(len(np.unique(tasks)), 'task')} (first: history {dataset.ids[missing[0]]} of task {tasks[0]}); "
         f"{counts}: take labels that all have, or ds.select(ds.has_labels({labels!r}))"
     )
 

@@ -27,6 +27,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.options import Share
 from icrl4aht_data.utils.progress import progress_bars
+from icrl4aht_data.utils.text import counted_noun
 
 
 @click.command(
@@ -102,7 +103,7 @@ def collect_command(
     """
     from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
-    from icrl4aht_baselines.online.agent_histories import collect_release, release_teammates
+    from icrl4aht_baselines.online.agent_histories import collect_release, plan_swaps, release_teammates
     from icrl4aht_baselines.reference import RL2_HISTORIES
     from icrl4aht_baselines.training.histories import filter_histories
 
@@ -117,6 +118,8 @@ def collect_command(
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
     tasks = [task for manifest in manifests for task in read_tasks(manifest)]
     teammates = release_teammates(dataset, tasks=tasks)
+    if swap is not None and (alone := len(teammates.tasks) - len(plan_swaps(teammates.tasks, config.episodes, swap))):
+        click.echo(f"{counted_noun(alone, 'task')} without another teammate of its kind, split and layout: not swapped")
     with progress_bars(unit="episodes") as show:
         options: Any = {"labeller": other, "swap": swap, "overwrite": overwrite, "progress": show}
         collect_release(ego, teammates, config, out, **options)

@@ -174,7 +174,7 @@ def record_histories(
     parts: list[tuple[np.ndarray, ...]] = []
     for number in range(config.episodes):
         if number % every == 0:  # a new segment, in which no task changes its teammate
-            mates = [swaps[task.task_id].teammate(number) if swaps else task.teammate for task in tasks]
+            mates = [swaps[one.task_id].teammate(number) if one.task_id in swaps else one.teammate for one in tasks]
             playing = [replace(task, teammate=mate) for task, mate in zip(tasks, mates, strict=True)]
             earlier = prepared and prepared._replace(state=state)
             prepared = prepare_rollout(noisy, playing, protocol, seeds, suite, programs=programs, earlier=earlier)
@@ -193,7 +193,8 @@ def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, Te
     """Return task id -> the teammates that play in turn in the task's histories.
 
     They are the teammates of all tasks with its layout, track, split and kind of teammate, in the order of `tasks` from
-    its own on. Splits are kept apart, so that no validation teammate plays in a training history.
+    its own on. Splits are kept apart, so that no validation teammate plays in a training history. Tasks with no other
+    teammate to swap with are left out.
 
     Args:
         tasks: the tasks.
@@ -201,7 +202,7 @@ def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, Te
         every: number of episodes after which the next teammate plays.
 
     Raises:
-        OptionError: if no teammate would change, or a task has no other teammate to swap with; names the task.
+        OptionError: if no teammate would change, because histories are too short or no task has another one.
     """
     if not 0 < every < episodes:
         raise OptionError(f"swap = {every}: expected 1 to {episodes - 1}, since a history has {episodes} episodes")
@@ -211,15 +212,15 @@ def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, Te
     found = {}
     for task in tasks:
         group = groups[_swap_group(task)]
-        if len(group) < 2:
-            raise OptionError(
-                f"task {task.task_id}: swap = {every} needs another {task.teammate_kind} teammate of split "
-                f"{task.split} on {task.layout.name}, found none: select more histories, give a --manifest, or leave "
-                f"the task out"
-            )
-        first = list(group).index(teammate_id(task.teammate))
-        in_turn = [*group.values()][first:] + [*group.values()][:first]
-        found[task.task_id] = TeammateSwaps(every, in_turn[: -(-episodes // every)])
+        if len(group) > 1:
+            first = list(group).index(teammate_id(task.teammate))
+            in_turn = [*group.values()][first:] + [*group.values()][:first]
+            found[task.task_id] = TeammateSwaps(every, in_turn[: -(-episodes // every)])
+    if not found:
+        raise OptionError(
+            f"swap = {every}: none of the {len(tasks)} tasks, such as {tasks[0].task_id}, has another teammate of its "
+            f"kind, split and layout to swap with: select more histories, or give a --manifest"
+        )
     return found
 
 

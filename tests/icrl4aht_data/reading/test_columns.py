@@ -77,7 +77,7 @@ def test_data_frame(measured):
     assert frame.expert_return.isna().tolist() == [True, False, False]
     assert frame.expert_step.isna().tolist() == [True, False, False]
     assert frame.expert_step.tolist()[1:] == [1000, 1000]
-    assert frame.label_view.tolist() == [None, "ego", "ego"]
+    assert frame.label_view.fillna("").tolist() == ["", "ego", "ego"]
     for name in ("history_id", "T", "return_end", "has_expert_actions"):
         assert frame[name].tolist() == [getattr(entry, name) for entry in dataset.entries]
     assert frame.obs_shape.tolist() == [entry.obs_shape for entry in dataset.entries]

@@ -15,8 +15,9 @@ from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import teammate_ids, teammate_names
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.manifest import write_manifest
-from icrl4aht_data.format.provenance import Provenance, ReferenceEgos
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import HISTORIES
+from icrl4aht_data.writing.card import facts, render_card
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
@@ -27,8 +28,15 @@ from tests.helpers.random_releases import random_release
 def swapped(tmp_path_factory) -> Path:
     """Return a release of two tasks on each of two layouts; their teammates take turns of four of six episodes."""
     root = tmp_path_factory.mktemp("swapped") / "release"
-    random_release(root, streams=1, swap=4)
+    random_release(root, streams=1, swap=4, experts=[ExpertLabels(None, "cook", view="ego")] * 4)
     return root
+
+
+def test_the_card_says_so(swapped):
+    content = facts(swapped)
+    assert (content["views"], content["swapped"]) == ({"ego": 4}, 4)
+    card = render_card(content)
+    assert "In 4 histories the teammate changes" in card and "what an ego sees in 4 histories (`ego`)" in card
 
 
 def test_entries_say_who_plays(swapped):
