@@ -36,6 +36,7 @@ from icrl4aht_baselines.agents.egos import NamedEgo
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
 from icrl4aht_baselines.evaluate.programs import Programs
 from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.evaluate.segments import segment_lengths
 from icrl4aht_baselines.online.teammates import check_heuristics
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, teammate_id
@@ -169,23 +170,23 @@ def record_histories(
     def noisy(layout: Layout) -> Policy:
         return with_noise(make_ego(layout), KEPT_STEPS, None if make_labeller is None else make_labeller(layout))
 
-    every = next((one.every for one in swaps.values()), config.episodes)
-    protocol, programs, prepared = get_protocol("seeded", config.episodes), Programs(), None
-    parts: list[tuple[np.ndarray, ...]] = []
-    for number in range(config.episodes):
-        if number % every == 0:  # a new segment, in which no task changes its teammate
-            mates = [swaps[one.task_id].teammate(number) if one.task_id in swaps else one.teammate for one in tasks]
-            playing = [replace(task, teammate=mate) for task, mate in zip(tasks, mates, strict=True)]
-            earlier = prepared and prepared._replace(state=state)
-            prepared = prepare_rollout(noisy, playing, protocol, seeds, suite, programs=programs, earlier=earlier)
+    every = next((one.every for one in swaps.values()), None)
+    protocol = replace(get_protocol("seeded", config.episodes), swap_every=every)
+    programs, prepared, parts = Programs(), None, list[tuple[np.ndarray, ...]]()
+    for length in segment_lengths(protocol):  # segments without a change of teammates
+        mates = [swaps[one.task_id].teammate(len(parts)) if one.task_id in swaps else one.teammate for one in tasks]
+        playing = [replace(task, teammate=mate) for task, mate in zip(tasks, mates, strict=True)]
+        prepared = prepare_rollout(noisy, playing, protocol, seeds, suite, programs=programs, earlier=prepared)
+        for _ in range(length):
             rollout, state, episode = prepared
-        state = state._replace(ego=state.ego._replace(chance=jnp.asarray(chances[:, number])))
-        state, one = episode(rollout.ego.params, rollout.teammate_params, state)
-        actions = np.asarray(one.actions, np.int8)
-        rewards, labels = np.asarray(one.reward, np.int8), np.asarray(state.ego.labels)
-        record, end = np.asarray(one.record), np.asarray(one.end)[:, None]
-        parts.append((record, actions[..., EGO], actions[..., TEAMMATE], rewards, labels, end))
-        played(len(chances))
+            state = state._replace(ego=state.ego._replace(chance=jnp.asarray(chances[:, len(parts)])))
+            state, one = episode(rollout.ego.params, rollout.teammate_params, state)
+            prepared = prepared._replace(state=state)
+            actions = np.asarray(one.actions, np.int8)
+            rewards, labels = np.asarray(one.reward, np.int8), np.asarray(state.ego.labels)
+            record, end = np.asarray(one.record), np.asarray(one.end)[:, None]
+            parts.append((record, actions[..., EGO], actions[..., TEAMMATE], rewards, labels, end))
+            played(len(chances))
     return RecordedHistories(*(np.concatenate(field, axis=1) for field in zip(*parts, strict=True)))
 
 
