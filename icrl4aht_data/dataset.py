@@ -12,13 +12,13 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from icrl4aht_data.benchmark.tasks import Task, read_tasks, task_fields, teammate_id
+from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, task_fields, teammate_id
 from icrl4aht_data.environments import make_environment
 from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError, check_choice, unknown
 from icrl4aht_data.fetch import ReleaseLocation, open_root
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
-from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.provenance import Provenance, TeammateSwaps
 from icrl4aht_data.format.schema import ENTRY_HINTS, INFO, TASKS, TEAMMATES
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -56,6 +56,7 @@ def load_icrl4aht(
     teammate_kind: FilterValues = None,
     algorithm: FilterValues = None,
     source: FilterValues = None,
+    label_view: FilterValues = None,
     task_id: FilterValues = None,
     learner: int | Sequence[int] | None = None,
     min_expert_return: float | None = None,
@@ -79,7 +80,9 @@ def load_icrl4aht(
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
         algorithm: alias of `teammate_kind` for learned teammates, such as "fcp" or "comedi".
         source: how the histories were made: "ppo" (an ego learned by PPO), "noise" (the scripted oracle, with
-            random actions that become rarer) or "student" (a trained agent); see docs/format.md.
+            random actions that become rarer) or "agent" (a trained agent); see docs/format.md.
+        label_view: what the policy behind the expert actions could see: "ego", what an ego sees, or "state", the full
+            state. Older releases do not record it.
         task_id: id of a task; a task is a layout, a teammate and a seed.
         learner: number of the learner within its task, from 0, or several numbers.
         min_expert_return: only histories whose expert actions come from a policy that earned at least this much per
@@ -116,6 +119,7 @@ def load_icrl4aht(
         teammate_kind=teammate_kind,
         algorithm=algorithm,
         source=source,
+        label_view=label_view,
         task_id=task_id,
         learner=learner,
         min_expert_return=min_expert_return,
@@ -246,7 +250,7 @@ class Dataset(Selection):
     def _tasks(self) -> dict[str, Task]:
         return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
 
-    def recover_environment(self, history_id: int, **options: Any) -> gymnasium.Env:
+    def recover_environment(self, history_id: int, episode: int = 0, **options: Any) -> gymnasium.Env:
         """Return the Gymnasium environment of a history: the ego's side of its task, with the teammate inside.
 
         Episodes have the length used to make the history, 400 steps in the benchmark; the release keeps the first 100.
@@ -254,6 +258,7 @@ class Dataset(Selection):
 
         Args:
             history_id: a history of the release, whether selected or not.
+            episode: number of the episode whose teammate plays; it matters only where teammates change.
             options: options of `gymnasium.make`, such as `max_episode_steps` or `render_mode`, and of
                 `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`. The channels of the dataset are the default.
 
@@ -262,8 +267,11 @@ class Dataset(Selection):
             OptionError: if Gymnasium or JAX is not installed, or if the release does not have the checkpoint of a
                 learned teammate.
         """
-        teammate = self.recover_teammate(history_id)
+        teammate = self.recover_teammate(history_id, episode)
         task = self.history_task(history_id)
+        if (swaps := self._swaps(task)) is not None:
+            played = swaps.teammate(episode)
+            task = make_task(task.track, task.split, task.layout_name, played, task.seed, task.recipes)
         known: dict[str, Any] = {
             "task": task_fields(task),
             "noise": teammate.get("noise", "seeded"),
@@ -327,11 +335,12 @@ class Dataset(Selection):
             **msgspec.structs.asdict(self.info.environment),
         }
 
-    def recover_teammate(self, history_id: int) -> dict[str, Any]:
+    def recover_teammate(self, history_id: int, episode: int = 0) -> dict[str, Any]:
         """Return the parameters that rebuild the teammate of a history.
 
         Args:
             history_id: a history of the release, whether selected or not.
+            episode: number of the episode whose teammate is wanted; it matters only where teammates change.
 
         Returns:
             The task's teammate entry (`kind`, `family`, `theta` and others), the teammate's agent number (`slot`) and
@@ -339,10 +348,16 @@ class Dataset(Selection):
 
         Raises:
             NotStoredError: if the release was made without its tasks.
+            OptionError: for an episode that the history does not have.
         """
-        task = self.history_task(history_id)
-        provenance = self.provenance.get(task.task_id, Provenance())
-        return task.teammate | (provenance.teammate or {})
+        task, count = self.history_task(history_id), self.index.entry(history_id).episodes
+        if check_int("episode", episode, 0) >= count:
+            raise OptionError(f"episode = {episode}: history {history_id} has episodes 0..{count - 1}")
+        provenance, swaps = self.provenance.get(task.task_id, Provenance()), self._swaps(task)
+        return (swaps.teammate(episode) if swaps else task.teammate) | (provenance.teammate or {})
+
+    def _swaps(self, task: Task) -> TeammateSwaps | None:
+        return self.provenance.get(task.task_id, Provenance()).swaps
 
     def history_task(self, history_id: int) -> Task:
         """Return the task of a history.
@@ -415,7 +430,11 @@ def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | No
     See `tasks.teammate_id`.
     """
     try:
-        return sorted({teammate_id(dataset.recover_teammate(history_id)) for history_id in history_ids})
+        found: set[str] = set()
+        for history_id in history_ids:
+            spans = dataset.index.entry(history_id).teammate_of_episode
+            found |= {name for _, name in spans or ((0, teammate_id(dataset.recover_teammate(history_id))),)}
+        return sorted(found)
     except (NotStoredError, UnknownNameError):  # a release of observations may not contain its tasks
         return None
 
@@ -424,10 +443,17 @@ def teammate_names(dataset: Dataset) -> np.ndarray:
     """Return a name of each history's teammate, strings (H,), equal for the same policy on the same layout.
 
     The name consists of layout and teammate id; if the release does not describe the teammate, it is the task id.
+    Teammates that play in one history, where they change, have one name.
     """
     codes, first, number = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
-    values, names = dataset.index.values("task_id"), []
+    values, of_task = dataset.index.values("task_id"), list[str]()
+    name_of: dict[str, str] = {}
     for code, history_id in zip(codes.tolist(), dataset.ids[first].tolist(), strict=True):
         ids = teammate_ids(dataset, [history_id])
-        names.append(values[code] if ids is None else f"{dataset.index.entry(history_id).layout} {ids[0]}")
-    return np.array(names)[number]
+        layout = dataset.index.entry(history_id).layout
+        own = [values[code]] if ids is None else [f"{layout} {one}" for one in ids]
+        of_task.append(own[0])
+        merged = {name_of.setdefault(one, one) for one in own}
+        if len(merged) > 1:
+            name_of = {one: min(merged) if name in merged else name for one, name in name_of.items()}
+    return np.array([name_of[one] for one in of_task])[number]

@@ -167,7 +167,7 @@ def hf_index(dataset: Selection) -> datasets.Dataset:
     """
     library = _datasets()
     features = library.Features.from_arrow_schema(index_schema())
-    return library.Dataset.from_list([entry.to_json() for entry in dataset.entries], features=features)
+    return library.Dataset.from_list([entry.to_row() for entry in dataset.entries], features=features)
 
 
 def hf_episodes(dataset: Selection) -> datasets.Dataset:

@@ -2,7 +2,7 @@
 
     OUT/noise/lite              release of noise histories, as `icrl4aht-data generate --profile noise` makes it
     OUT/rl2-TRACK               RL^2, trained by playing with the training teammates of that release
-    OUT/student-TRACK           histories of RL^2 whose noise falls, source `student`
+    OUT/agent-TRACK             histories of RL^2 whose noise falls, source `agent`
     OUT/rising-TRACK            such histories that begin at random, see `RL2_HISTORIES`
     OUT/NAME-TRACK              run folder of a model
     OUT/NAME-TRACK-first        its first training, before it was labelled on histories of its own
@@ -27,8 +27,8 @@ from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
+from icrl4aht_baselines.online.agent_histories import collect_release, release_teammates
 from icrl4aht_baselines.online.prepare import prepare_play
-from icrl4aht_baselines.online.student import collect_release, release_teammates
 from icrl4aht_baselines.report.cards import model_card
 from icrl4aht_baselines.report.results import evaluate_agent, merge, read_run
 from icrl4aht_baselines.training.histories import prepare, start_from
@@ -45,7 +45,7 @@ PROFILE = "noise"
 """Profile of the release that everything starts from."""
 
 RL2_HISTORIES = {
-    "student": NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8)),
+    "agent": NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8)),
     "rising": NoiseConfig(8, 40, start=(0.8, 1.0), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.4, 0.9)),
 }
 """Kind of data -> noise of histories of RL^2 with each teammate. The end of every history is without noise. Those of
@@ -112,8 +112,8 @@ _LONG: dict[str, Any] = {**_STEPS, "steps": 3000, "batch_size": 4, "context": 10
 
 RECIPES = {
     "rl2": Recipe("rl2", "", RL2_SETTINGS["model"], {**RL2_SETTINGS["train"], "steps": 1600}),
-    "ad-student": Recipe("ad", "student", _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True),
-    "dpt-student": Recipe("dpt", "student", _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True),
+    "ad-student": Recipe("ad", "agent", _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True),
+    "dpt-student": Recipe("dpt", "agent", _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True),
     "ad-rising": Recipe("ad", "rising", _TINY, _LONG, forgets=True),
 }
 """Reference models by name: those of the bundled rl2-reference, ad-reference, dpt-reference and ad-rising."""

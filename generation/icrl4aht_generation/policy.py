@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Key, UInt8
 
+from icrl4aht_data.format.provenance import LabelView
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.tables import Tables
@@ -51,6 +52,11 @@ class Policy(NamedTuple):
     init: Callable[[Any, Key[Array, ""]], Any]
     act: Callable[[Any, Any, Any, Key[Array, ""]], tuple[Int[Array, ""], Any]]
     sees: Literal["state", "situation", "observation", "ego_input", "canonical_input"]
+
+    @property
+    def label_view(self) -> LabelView:
+        """What actions of this policy, as labels, are made from: the full state, or what an ego sees."""
+        return "state" if self.sees in ("state", "situation") else "ego"
 
 
 @lru_cache(maxsize=256)

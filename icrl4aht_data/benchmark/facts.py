@@ -109,13 +109,16 @@ KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
 TEAMMATE_PLUGINS = Plugins("icrl4aht.teammates", (*FAMILIES, *KIND_FAMILIES))
 """Heuristic teammates registered by other packages. Each is a separate family with the same name."""
 
-SOURCES = ("ppo", "noise", "student", "search")
+SOURCES = ("ppo", "noise", "agent", "search")
 """How histories are made. "ppo": an ego learns with PPO. "noise": a script plays, and its random actions become rarer
-(noise distillation, Zisman et al. 2024). "student": a trained agent plays, perhaps with random actions that become
+(noise distillation, Zisman et al. 2024). "agent": a trained agent plays, perhaps with random actions that become
 rarer. "search": a script finds out which dish its teammate wants. Releases may name other sources."""
 
 SCRIPTED_SOURCES = ("noise", "search")
 """Sources of histories that a script plays; its actions without noise label them."""
+
+LABEL_VIEWS = ("ego", "state")
+"""What the policy behind `expert_actions` could see: "ego", what an ego sees, or "state", the full state."""
 
 REBUILT_SOURCES = ("ppo", *SCRIPTED_SOURCES)
 """Sources of histories that `generate` can make without a trained agent."""

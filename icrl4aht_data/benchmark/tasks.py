@@ -259,7 +259,7 @@ def parse_task(fields: Any) -> Task:
     task = Task(**msgspec.structs.asdict(_convert(fields, _TaskFields, "")))
     _check_recipes(task)
     check_membership(task.track, task.split, task.layout.name)
-    _check_teammate(task.teammate)
+    check_teammate(task.teammate)
     expected = task_id(task.track, task.split, task.layout_name, task.teammate, task.seed, task.recipes)
     if task.task_id != expected:
         raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")
@@ -282,7 +282,13 @@ def _check_recipes(task: Task) -> None:
         raise TaskFormatError(f"recipes: {error}") from error
 
 
-def _check_teammate(teammate: dict[str, Any]) -> None:
+def check_teammate(teammate: dict[str, Any]) -> None:
+    """Check the fields of a task's teammate entry; not the parameters of a heuristic.
+
+    Raises:
+        TaskFormatError: for missing or unknown fields, or impossible values.
+        UnknownNameError: for a family that does not exist.
+    """
     found = _convert(teammate, _Teammate, "teammate: ")
     family, is_heuristic = kind_family(found.family), found.kind == "heuristic"
     if family is None or (family == "rl") == is_heuristic:

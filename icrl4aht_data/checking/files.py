@@ -101,22 +101,25 @@ def check_references(
     """
     shards = index.values("shard")
     known = {*shards, *map(chunk_table_name, shards)}
-    learned = [task.teammate["theta"]["sha256"] for task in tasks if task.teammate.get("kind") == "rl"]
-    labellers = {made.expert.policy_sha256 for made in (provenance or {}).values() if made.expert}
+    made = provenance or {}
+    played = [one for task in tasks for one in made.get(task.task_id, Provenance()).played(task)]
+    learned = [(task.task_id, task.teammate["theta"]["sha256"]) for task in played if task.teammate["kind"] == "rl"]
+    policies = {sha256 for _, sha256 in learned}
+    labellers = {of_task.expert.policy_sha256 for of_task in made.values() if of_task.expert}
     for name in sorted(listed):
         top, folder, *_ = *name.split("/"), ""
         if (top == "data" or name.startswith("meta/chunks/")) and name not in known:
             report.add(name, "no history of the index is in this shard")
-        elif top == TEAMMATES and folder not in learned:
+        elif top == TEAMMATES and folder not in policies:
             report.add(name, "no task has this teammate")
         elif top == EXPERTS and provenance is not None and folder not in labellers:
             report.add(name, f"{PROVENANCE} names no such policy")
         elif name.endswith(".safetensors") and listed[name] != folder:
             report.add(name, f"sha256 {listed[name]}, expected {folder}, the name of its folder")
     with_weights = {name.split("/")[1] for name in listed if name.startswith(f"{TEAMMATES}/")}
-    without = sum(sha256 not in with_weights for sha256 in learned)
+    without = {task_id for task_id, sha256 in learned if sha256 not in with_weights}
     if without and report.level != "quick":
-        report.notes.append(f"{without} tasks have learned teammates whose checkpoints this release does not have")
+        report.notes.append(f"{len(without)} tasks have learned teammates whose checkpoints this release does not have")
 
 
 def check_shard_sizes(origin: ReleaseLocation, index: Index, shards: list[str], report: Report) -> None:

@@ -21,7 +21,7 @@ from icrl4aht_data.writing.statistics import layout_statistics
 _NAMED = 100  # maximum number of missing shards to report per set
 _OF_A_TASK = (
     *("track", "split", "layout", "teammate_family", "teammate_kind", "seed", "source"),
-    *("expert_return", "expert_return_sampled", "expert_step"),
+    *("expert_return", "expert_return_sampled", "expert_step", "label_view"),
 )
 """Index fields that are equal for all histories of a task."""
 _described = attrgetter("track", "split", "teammate_kind", "teammate_family", "seed")
@@ -37,7 +37,9 @@ def check_index(index: Index, tasks: list[Task], provenance: Mapping[str, Proven
         report: receives the problems.
     """
     _check_tasks(index, tasks, report)
-    _check_disjoint_teammates(tasks, report)
+    made = provenance or {}
+    played = [one for task in tasks for one in made.get(task.task_id, Provenance()).played(task)]
+    _check_disjoint_teammates(played, report)
     if not index.entries:
         report.add(HISTORIES, "no histories")
     for task in index.info.left_out:
@@ -62,6 +64,10 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
         task, other = by_id.get(entry.task_id), first.setdefault(entry.task_id, entry)
         if unlike := [name for name in _OF_A_TASK if getattr(entry, name) != getattr(other, name)]:
             report.add(HISTORIES, f"histories {other.history_id} and {entry.history_id}, of one task: unlike {unlike}")
+        firsts = [episode for episode, _ in entry.teammate_of_episode or ((0, ""),)]
+        if firsts[0] != 0 or firsts != sorted(set(firsts)) or firsts[-1] >= entry.episodes:
+            expected = f"expected ascending episodes from 0 to {entry.episodes - 1} at most"
+            report.add(HISTORIES, f"{where} teammate_of_episode: {expected}, found {firsts}")
         if not has_tasks and entry.seed != -1:
             report.add(HISTORIES, f"{where} seed: expected -1 without tasks, found {entry.seed}")
         if kind_family(entry.teammate_kind) not in (None, entry.teammate_family):

@@ -43,7 +43,7 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
         for fault in _faults(provenance[task_id], entries, seeds.get(task_id)):
             report.add(PROVENANCE, f"task {task_id!r}: {fault}")
         for entry in entries:
-            for name, expected in provenance[task_id].entry_fields().items():
+            for name, expected in provenance[task_id].entry_fields(entry.episodes).items():
                 if (value := getattr(entry, name)) != expected:
                     where = f"history {entry.history_id}: {name}"
                     report.add(HISTORIES, f"{where} {value}, but {PROVENANCE} has {expected} of its task")

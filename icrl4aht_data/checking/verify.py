@@ -36,6 +36,7 @@ from icrl4aht_data.utils.files import resolve_inside
 _NOT_RECOMPUTED = {
     "references": "returns of reference egos, of {} tasks: taken from meta/provenance.json, not measured again",
     "nearest_test": "nearest test teammates, of {} tasks: taken from meta/provenance.json, not measured again",
+    "swaps": "changes of teammates, of {} tasks: taken from meta/provenance.json, not compared with their actions",
     "noise": "noise schedules, of {} tasks: taken from meta/provenance.json, not compared with the actions",
 }
 """Field of a provenance that verification cannot recompute -> note in the report."""

@@ -38,6 +38,7 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
             "return_end": fmean(entry.return_end for entry in some),
             "source": some[0].source,
             "labels": [kind for kind in LABELS if all(entry.has(FIELDS[f"{kind}_actions"]) for entry in some)],
+            "label_view": some[0].label_view,
             "expert_return": some[0].expert_return,
             "expert_return_sampled": some[0].expert_return_sampled,
             "history_ids": [entry.history_id for entry in some],
@@ -63,6 +64,7 @@ def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
     table.add_column("task\nhist. ids", no_wrap=True)
     for task in tasks:
         earned = "" if task["expert_return"] is None else f" {task['expert_return']:.1f}"
+        seen = "" if task["label_view"] is None else f"\n of {task['label_view']}"  # a line of its own is narrower
         ids = id_ranges(task["history_ids"])
         table.add_row(
             f"{task['layout']}\n{task['split']}",
@@ -70,7 +72,7 @@ def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
             task["source"],
             f"{task['histories']:,}\n{task['transitions']:,}",
             f"{task['return_start']:.1f}→{task['return_end']:.1f}",
-            "\n".join(kind + earned * (kind == "expert") for kind in task["labels"]) or "none",
+            "\n".join(kind + (earned + seen) * (kind == "expert") for kind in task["labels"]) or "none",
             f"{task['task_id'][-8:]}\n{ids if len(ids) <= _IDS_SHOWN else '…'}",
         )
     return table
@@ -142,5 +144,6 @@ def summarize_selection(dataset: Dataset) -> dict[str, Any]:
         "sources": dataset.counts("source"),
         "learners": len(np.unique(dataset.column("learner"))),
         "labels": dataset.counts("labels"),
+        "label_views": dataset.counts("label_view"),
         "cache": f"{dataset.cache.cache}: {dataset.cache.reason}",
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Collection, Iterator, Sequence
 from itertools import islice
@@ -16,16 +15,16 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import check_family, check_membership
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.format.cached_arrays import cached_arrays
-from icrl4aht_data.format.schema import ENTRY_HINTS, Entry, check_name
+from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, TEXTS, Entry, check_name, encode
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import LARGEST, plain_size, read_lines, wrap_read_errors
 from icrl4aht_data.utils.hashes import file_hash
 
-QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source")
+QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source", "label_view")
 """Entry fields that histories can be filtered by."""
 
-_VERSION = 4  # of the cached columns
+_VERSION = 5  # of the cached columns
 _UNCACHED = 2**20  # bytes; decoding a smaller index is as fast as opening cached columns
 _BLOCK = 2**12  # entries in memory at a time
 
@@ -34,15 +33,16 @@ _DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int6
 _NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name not in _DERIVED}
 _ABSENT = {name: -1 for name, hint in ENTRY_HINTS.items() if hint == int | None}  # what a column has for None
 _ABSENT |= {name: np.nan for name, hint in ENTRY_HINTS.items() if hint == float | None}
-_STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint is str)
+_STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint in TEXTS or name in ENCODED)
+_ABSENT |= {name: "" for name in _STRINGS if ENTRY_HINTS[name] is not str}
 _names = attrgetter(*_STRINGS)
 
 
 class Columns(Sequence[Entry]):
     """Index of a release as columns with one row per history; a sequence of `Entry`, each made on access.
 
-    A string column has int32 codes of its distinct values. None is stored as -1 in integer columns and as NaN in float
-    columns.
+    A string column has int32 codes of its distinct values. None is stored as -1 in integer columns, as NaN in float
+    columns and as "" in string columns. Fields in `schema.ENCODED` are string columns of JSON text.
 
     Args:
         arrays: every column by name, and the distinct values of each string column as `<name>.values`.
@@ -80,8 +80,10 @@ class Columns(Sequence[Entry]):
         for name in _STRINGS:
             values[name] = self._arrays[f"{name}.values"][self._arrays[name][row]].item().decode()
         for name, absent in _ABSENT.items():
-            if values[name] == absent or math.isnan(values[name]):
+            if values[name] == absent or values[name] != values[name]:  # NaN differs from itself
                 values[name] = None
+            elif name in ENCODED:
+                values[name] = msgspec.json.decode(values[name], type=ENTRY_HINTS[name])
         return Entry(history_id=row, obs_shape=get_layout(values["layout"]).obs_shape, **values)
 
 
@@ -117,6 +119,8 @@ def _parse(path: Path) -> dict[str, np.ndarray]:
     while block := list(islice(entries, _BLOCK)):
         columns = zip(*map(msgspec.structs.astuple, block), strict=True)
         values: dict[str, Sequence[Any]] = dict(zip(ENTRY_HINTS, columns, strict=True))
+        for name in ENCODED:
+            values[name] = [encode(value) for value in values[name]]
         for name, absent in _ABSENT.items():
             values[name] = [absent if value is None else value for value in values[name]]
         for name, dtype in _NUMBERS.items():
@@ -174,7 +178,8 @@ def _check(entry: Entry, number: int, checked: set[tuple[Any, ...]]) -> None:
         return
     checked.add(key)
     for value in _names(entry):
-        check_name(value)
+        for name in [value] if isinstance(value, str) else [name for _, name in value or ()]:
+            check_name(name)
     check_membership(entry.track, entry.split, entry.layout)
     check_family(entry.teammate_family)
     expected = get_layout(entry.layout).obs_shape

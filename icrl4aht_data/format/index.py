@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, SOURCES, SPLITS, all_families
+from icrl4aht_data.benchmark.facts import ALL_TRACKS, LABEL_VIEWS, SOURCES, SPLITS, all_families
 from icrl4aht_data.errors import (
     EmptySelectionError,
     IndexFormatError,
@@ -37,6 +37,7 @@ _KNOWN_VALUES: dict[str, Callable[[], Sequence[str]]] = {
     "track": lambda: ALL_TRACKS,
     "teammate_family": all_families,
     "source": lambda: SOURCES,
+    "label_view": lambda: LABEL_VIEWS,
 }
 
 
@@ -72,7 +73,7 @@ class Index:
         return self.entries[number]
 
     def values(self, name: str) -> list[str]:
-        """Return the values of a string field in this release, in order of first appearance."""
+        """Return the values of a string field in this release, in order of first appearance; "" stands for None."""
         return self.entries.values(name)
 
     def query(self, **wanted: str | Sequence[str] | None) -> np.ndarray:
@@ -100,8 +101,9 @@ class Index:
             matching &= self.entries.matches(name, {self._known_value(name, one, given) for one in names})
         if not matching.any():
             what = ", ".join(f"{name}={value!r}" for name, value in filters.items()) or "any"
-            names = ("split", "layout", "teammate_family", "source")
-            found = "; ".join(f"{name} {listed_names(self.values(name)) or 'none'}" for name in names)
+            names = ("split", "layout", "teammate_family", "source", *("label_view",) * ("label_view" in filters))
+            known = {name: listed_names([one or "not recorded" for one in self.values(name)]) for name in names}
+            found = "; ".join(f"{name} {values or 'none'}" for name, values in known.items())
             raise EmptySelectionError(f"{self.root}: no history has {what}. This release has {found}")
         return np.flatnonzero(matching)
 
@@ -124,7 +126,7 @@ class Index:
         """
         if name == "layout":
             return get_layout(str(value)).name
-        if value in (own := self.values(name)):
+        if value in (own := [one for one in self.values(name) if one]):
             return value  # without reading which other packages are installed
         known = (*_KNOWN_VALUES.get(name, tuple)(), *own)
         check_choice(given, value, known)

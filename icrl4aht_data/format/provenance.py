@@ -10,7 +10,8 @@ import msgspec
 from msgspec import Meta
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
-from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.benchmark.tasks import Task, check_teammate, teammate_id
+from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
 from icrl4aht_data.format.schema import check_name
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.text import counted_noun
@@ -21,6 +22,9 @@ _Positive = Annotated[int, Meta(ge=1, le=2**63 - 1)]
 _Return = Annotated[float, Meta(gt=-1e15, lt=1e15)]
 _Share = Annotated[float, Meta(ge=0, le=1)]
 _Exponent = Annotated[float, Meta(gt=0, lt=1e15)]
+
+LabelView = Literal["ego", "state"]
+"""One of `facts.LABEL_VIEWS`."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,7 @@ class ExpertLabels:
         return_sampled: mean return of its sampled actions.
         episodes: number of episodes of each measurement.
         last_return_greedy: greedy return of the learner's last checkpoint, the paper's source of labels.
+        view: what the policy could see: a name in `facts.LABEL_VIEWS`; None if not recorded.
     """
 
     policy_sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")] | None
@@ -74,6 +79,29 @@ class ExpertLabels:
     return_sampled: _Return | None = None
     episodes: _Count | None = None
     last_return_greedy: _Return | None = None
+    view: LabelView | None = None
+
+
+@dataclass(frozen=True)
+class TeammateSwaps:
+    """Changes of the teammate within each history of a task.
+
+    Args:
+        every: number of episodes after which the next teammate plays.
+        teammates: entries of the teammates, as in `Task.teammate`, in order of play; after the last one the first one,
+            the task's own, plays again.
+    """
+
+    every: _Positive
+    teammates: Annotated[list[dict[str, Any]], Meta(min_length=2)]
+
+    def teammate(self, episode: int) -> dict[str, Any]:
+        """Return the entry of the teammate that plays an episode, counted from 0."""
+        return self.teammates[episode // self.every % len(self.teammates)]
+
+    def spans(self, episodes: int) -> tuple[tuple[int, str], ...]:
+        """Return `Entry.teammate_of_episode` of a history with a number of episodes."""
+        return tuple((first, teammate_id(self.teammate(first))) for first in range(0, episodes, self.every))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +201,7 @@ class Provenance:
         filter: returns of the streams before and after filtering.
         expert: the policy that produced the expert actions.
         suite: the populations that a learned teammate was selected from.
+        swaps: changes of the teammate within each history; None if the task's teammate plays all episodes.
         other: unknown fields, kept unchanged.
     """
 
@@ -196,15 +225,37 @@ class Provenance:
     filter: StreamFilter | None = None
     expert: ExpertLabels | None = None
     suite: TeammateSuite | None = None
+    swaps: TeammateSwaps | None = None
     other: dict[str, Any] = field(default_factory=dict)
 
-    def entry_fields(self) -> dict[str, Any]:
-        """Return the fields of the task's index entries that describe its expert."""
+    def played(self, task: Task) -> list[Task]:
+        """Return the task, and after it a copy with each further teammate that plays in its histories."""
+        return [task, *(replace(task, teammate=one) for one in (self.swaps.teammates[1:] if self.swaps else ()))]
+
+    def wants_oracle(self, return_end: float) -> bool:
+        """Return whether the oracle's actions are worth learning: whether it earns what the histories' end earns.
+
+        Args:
+            return_end: mean return of the last episodes of the task's histories, see `schema.curve_ends`.
+
+        Returns:
+            True as well if the oracle's return is unknown, or if teammates change, since it is with the task's own.
+        """
+        return self.references is None or self.swaps is not None or self.references.oracle >= return_end
+
+    def entry_fields(self, episodes: int) -> dict[str, Any]:
+        """Return the fields of an index entry that describe its expert and its teammates.
+
+        Args:
+            episodes: number of the history's episodes.
+        """
         expert = self.expert or ExpertLabels(None, "")
         return {
             "expert_return": expert.return_greedy,
             "expert_return_sampled": expert.return_sampled,
             "expert_step": expert.step,
+            "label_view": expert.view,
+            "teammate_of_episode": self.swaps.spans(episodes) if self.swaps else None,
         }
 
     def to_json(self) -> dict[str, Any]:
@@ -235,9 +286,11 @@ class Provenance:
             for name, value in msgspec.structs.asdict(noise).items():
                 if isinstance(value, tuple) and value[0] > value[1]:
                     raise IndexFormatError(f"noise.{name}: expected a range [least, most], found {list(value)}")
+            for teammate in found.swaps.teammates if found.swaps else ():
+                check_teammate(teammate)
             for name in filter(None, (found.source, found.nearest_test and found.nearest_test.teammate)):
                 check_name(name)
-        except msgspec.ValidationError as error:
+        except (msgspec.ValidationError, Icrl4ahtError) as error:
             raise IndexFormatError(str(error)) from error
         return replace(found, other={name: value for name, value in content.items() if name not in known})
 

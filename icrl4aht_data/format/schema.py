@@ -18,6 +18,7 @@ shard of `observations` is a `full` one without state records, which files of th
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -152,6 +153,7 @@ _FINITE = 1e15  # sums of numbers below this stay finite
 _Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 _Row = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _Name = Annotated[str, Meta(max_length=_NAME_LENGTH)]
+_Spans = Annotated[tuple[tuple[_Row, _Name], ...], Meta(min_length=1)]
 _Number = Annotated[float, Meta(gt=-_FINITE, lt=_FINITE)]
 
 
@@ -188,6 +190,9 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         expert_step: environment steps that the expert was trained for; None for a script or if unknown.
         learner: number of the independent learner that made the history, from 0.
         has_oracle_actions: whether the release stores `oracle_actions` of the history; see `stored_field`.
+        label_view: what the policy behind `expert_actions` could see: a name in `facts.LABEL_VIEWS`; None if unknown.
+        teammate_of_episode: pairs (episode, id) in ascending order: from this episode on, the teammate with this
+            `tasks.teammate_id` played, until the next pair's. None if the task's teammate played all episodes.
     """
 
     history_id: _Int
@@ -218,6 +223,8 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     expert_step: _Row | None = None
     learner: _Row = 0
     has_oracle_actions: bool = False
+    label_view: _Name | None = None
+    teammate_of_episode: _Spans | None = None
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
         """Return the fields that are stored for this history in a release of a kind."""
@@ -247,12 +254,31 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return -(-self.rows(field) // field.chunk)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the JSON object of the index line."""
-        return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)}
+        """Return the JSON object of the index line, without `label_view` and `teammate_of_episode` if they are None."""
+        content = json.loads(msgspec.json.encode(self))
+        return {name: value for name, value in content.items() if value is not None or name not in _LEFT_OUT}
 
+    def to_row(self) -> dict[str, Any]:
+        """Return the fields as a row of a table, with `teammate_of_episode` as JSON text."""
+        texts = {name: encode(getattr(self, name)) for name in ENCODED}
+        return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)} | texts
+
+
+_LEFT_OUT = ("label_view", "teammate_of_episode")  # so that releases without them keep their bytes
 
 ENTRY_HINTS: dict[str, Any] = get_type_hints(Entry)
 """Field of an index line -> type without bounds."""
+
+TEXTS = (str, str | None)
+"""Types of text fields in `ENTRY_HINTS`."""
+
+ENCODED = tuple(name for name, hint in ENTRY_HINTS.items() if hint == tuple[tuple[int, str], ...] | None)
+"""Fields that columns and tables hold as JSON text."""
+
+
+def encode(value: Any) -> str | None:
+    """Return the value of a field in `ENCODED` as JSON text; None stays None."""
+    return None if value is None else json.dumps(value)
 
 
 def check_name(text: str) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from icrl4aht_data.format.info import ReleaseInfo, read_info
-from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES, PARQUET_INDEX
+from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES, PARQUET_INDEX, TEXTS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, record_width
 from icrl4aht_data.utils.install_hints import import_optional
@@ -37,8 +37,8 @@ _FORMATS = {
     ".safetensors": "application/vnd.safetensors",
 }
 _SHAPE = tuple[int, int, int]
-_TYPES = {str: "TEXT", bool: "BOOL", float: "FLOAT", int: "INTEGER", _SHAPE: "INTEGER"}
-_TYPES |= {int | None: "INTEGER", float | None: "FLOAT"}
+_TYPES = {bool: "BOOL", float: "FLOAT", int: "INTEGER", _SHAPE: "INTEGER", int | None: "INTEGER", float | None: "FLOAT"}
+_TYPES |= dict.fromkeys((*TEXTS, *(ENTRY_HINTS[name] for name in ENCODED)), "TEXT")
 _TERMS_OF_1_1 = {
     "arrayShape": "cr:arrayShape",
     "containedIn": "cr:containedIn",

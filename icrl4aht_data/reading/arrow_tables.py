@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from icrl4aht_data.errors import IndexFormatError
-from icrl4aht_data.format.schema import ACTION_FIELDS, ENTRY_HINTS, FIELDS
+from icrl4aht_data.format.schema import ACTION_FIELDS, ENCODED, ENTRY_HINTS, FIELDS, TEXTS
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.history import History
@@ -58,8 +58,9 @@ def index_schema() -> pa.Schema:
         OptionError: if pyarrow is not installed.
     """
     arrow = import_pyarrow()
-    types = {float: arrow.float64(), int: arrow.int64(), int | None: arrow.int64(), str: arrow.string()}
+    types = {float: arrow.float64(), int: arrow.int64(), int | None: arrow.int64()}
     types |= {bool: arrow.bool_(), float | None: arrow.float64(), tuple[int, int, int]: arrow.list_(arrow.int64(), 3)}
+    types |= dict.fromkeys((*TEXTS, *(ENTRY_HINTS[name] for name in ENCODED)), arrow.string())
     return arrow.schema([(name, types[hint]) for name, hint in ENTRY_HINTS.items()])
 
 

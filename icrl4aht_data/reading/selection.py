@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self, overload
 
-import msgspec
 import numpy as np
 
 from icrl4aht_data.errors import (
@@ -22,7 +21,7 @@ from icrl4aht_data.errors import (
 from icrl4aht_data.fetch import ReleaseLocation
 from icrl4aht_data.format.index import ALIASES, Index
 from icrl4aht_data.format.provenance import ProvenanceByTask, read_provenance
-from icrl4aht_data.format.schema import ENTRY_HINTS, KINDS, PROVENANCE, Entry
+from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, KINDS, PROVENANCE, TEXTS, Entry
 from icrl4aht_data.overcooked.channels import CHANNELS, Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import LABELS, OBS, History, Labels, Obs
@@ -206,7 +205,8 @@ class Selection:
             name: the field; or "labels", which counts histories with expert and with oracle actions.
 
         Returns:
-            Value -> number of histories, above 0; values in order of first appearance in the release.
+            Value -> number of histories, above 0; values in order of first appearance in the release. Histories without
+            a value are not counted.
 
         Raises:
             UnknownNameError: if the index has no such text field.
@@ -215,11 +215,12 @@ class Selection:
             found = {kind: int(self.has_labels(kind).sum()) for kind in LABELS}
             return {kind: number for kind, number in found.items() if number}
         field = ALIASES.get(name, name)
-        if ENTRY_HINTS.get(field) is not str:
-            raise unknown("field of names", name, ("labels", *(one for one, of in ENTRY_HINTS.items() if of is str)))
+        if ENTRY_HINTS.get(field) not in TEXTS:
+            raise unknown("field of names", name, ("labels", *(one for one, of in ENTRY_HINTS.items() if of in TEXTS)))
         # Codes are positions in the values of the whole release, so some of them may be absent from this selection.
         numbers = np.bincount(self.column_codes(field), minlength=1).tolist()
-        return {value: number for value, number in zip(self.index.values(field), numbers, strict=False) if number}
+        found = zip(self.index.values(field), numbers, strict=False)
+        return {value: number for value, number in found if value and number}
 
     def has_labels(self, labels: Labels) -> np.ndarray:
         """Return bool (H,), True for histories with labels of a kind; see `history.LABELS`.
@@ -251,8 +252,8 @@ class Selection:
             name: the field.
 
         Returns:
-            Array (H,) of strings, int64, float64 or bool, with -1 or NaN for None; (H, 3) for `obs_shape`, the shape
-            with the layout's own channels.
+            Array (H,) of strings, int64, float64 or bool, with "", -1 or NaN for None; (H, 3) for `obs_shape`, the
+            shape with the layout's own channels. `teammate_of_episode` is JSON text.
 
         Raises:
             UnknownNameError: if there is no such field; names the nearest one.
@@ -265,7 +266,7 @@ class Selection:
             return self.ids.astype(np.int64)
         if name == "obs_shape":
             return np.array([layout.obs_shape for layout in self.layouts])[self.layout_numbers]
-        if ENTRY_HINTS[name] is str:
+        if ENTRY_HINTS[name] in TEXTS or name in ENCODED:
             # An empty array would be of floats; a release without histories has no values.
             return np.array(self.index.values(name) or [""])[self.column_codes(name)]
         return self.index.entries.column(name)[self.ids]
@@ -283,7 +284,7 @@ class Selection:
             OptionError: if pandas is not installed.
         """
         pandas = import_optional("pandas", "a data frame")
-        frame = pandas.DataFrame([msgspec.structs.asdict(entry) for entry in self.entries])
+        frame = pandas.DataFrame([entry.to_row() | {"obs_shape": entry.obs_shape} for entry in self.entries])
         return frame.astype({name: "Int64" for name, hint in ENTRY_HINTS.items() if hint == int | None})
 
     @cached_property
@@ -372,8 +373,8 @@ class Selection:
             min_expert_return: only histories whose labels come from a policy that earned at least this much, acting
                 greedily: `Entry.expert_return`.
             learner: only histories of these learners, numbered from 0 within each task: `Entry.learner`.
-            wanted: values of split, layout, track, teammate_family, teammate_kind (alias algorithm), source or task_id:
-                one value, several values, or None for any, as in `load_icrl4aht`.
+            wanted: values of split, layout, track, teammate_family, teammate_kind (alias algorithm), source, label_view
+                or task_id: one value, several values, or None for any, as in `load_icrl4aht`.
 
         Raises:
             UnknownNameError: for a field or value that does not exist.

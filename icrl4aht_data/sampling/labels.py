@@ -11,7 +11,7 @@ from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import are_labels_weak
 from icrl4aht_data.reading.history import LABELS, Labels
 from icrl4aht_data.reading.selection import Selection
-from icrl4aht_data.utils.text import listed_names
+from icrl4aht_data.utils.text import counted_noun, listed_names
 
 
 def check_labels(dataset: Selection, labels: Labels) -> Labels:
@@ -30,9 +30,11 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
         return labels
     missing = np.flatnonzero(~has[labels])
     counts = ", ".join(f"{int(has[name].sum())} have {name} actions" for name in LABELS)
+    tasks = dataset.column("task_id")[missing]
     raise LabelsMissingError(
-        f"labels = {labels}: {len(missing)} of {len(dataset)} histories have no {labels} actions (first: history "
-        f"{dataset.ids[missing[0]]}); {counts}: take labels that all have, or ds.select(ds.has_labels({labels!r}))"
+        f"labels = {labels}: {len(missing)} of {len(dataset)} histories have no {labels} actions, those of "
+        f"{counted_noun(len(np.unique(tasks)), 'task')} (first: history {dataset.ids[missing[0]]} of task {tasks[0]}); "
+        f"{counts}: take labels that all have, or ds.select(ds.has_labels({labels!r}))"
     )
 
 

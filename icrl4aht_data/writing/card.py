@@ -172,6 +172,8 @@ def facts(root: Path) -> dict[str, Any]:
         "kinds": dict(sorted({(e.teammate_family, e.teammate_kind) for e in entries if e.teammate_family != "rl"})),
         "algorithms": [name for name in ALGORITHMS if name in {entry.teammate_kind for entry in entries}],
         "labelled": {name: sum(e.has(FIELDS[f"{name}_actions"]) for e in entries) for name in ("expert", "oracle")},
+        "views": Counter(entry.label_view for entry in entries if entry.label_view),
+        "swapped": sum(entry.teammate_of_episode is not None for entry in entries),
         "example": {"split": first.split, "layout": first.layout, "length": length},
         "layouts": _layouts(info, matters),
         "learning": _learning(tasks, "layout", "source", "split"),

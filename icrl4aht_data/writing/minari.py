@@ -109,7 +109,7 @@ def _describe(dataset: Dataset) -> dict[str, Any]:
     """Return the content of the metadata key `icrl4aht`."""
     recorded = read_provenance(dataset.origin.file(PROVENANCE))
     first = {entry.task_id: entry for entry in dataset.entries}
-    names = ("task_id", "source", "env_idx", "learner", "episodes")
+    names = ("task_id", "source", "env_idx", "learner", "episodes")  # who plays follows from `provenance`
     return {
         "data_version": dataset.info.data_version,
         "kept_steps": dataset.info.environment.kept_steps,
@@ -120,8 +120,9 @@ def _describe(dataset: Dataset) -> dict[str, Any]:
 
 
 def _environment(dataset: Dataset, tasks: list[dict[str, Any]], canonical: bool) -> Any:
-    """Return the environment spec if there is a single task with a heuristic teammate, else None."""
-    if len(tasks) > 1 or tasks[0]["teammate"]["kind"] == "rl":
+    """Return the environment spec if there is a single task with one heuristic teammate, else None."""
+    swaps = any(entry.teammate_of_episode for entry in dataset.entries)
+    if len(tasks) > 1 or tasks[0]["teammate"]["kind"] == "rl" or swaps:
         return None
     noise = dataset.recover_teammate(dataset.entries[0].history_id).get("noise", "seeded")
     channels = "canonical" if canonical else "own"

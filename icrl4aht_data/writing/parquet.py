@@ -43,7 +43,7 @@ def to_parquet(dataset: Dataset, path: str | Path, *, overwrite: bool = False) -
     if path.resolve().is_relative_to(dataset.root.resolve()):
         raise OptionError(f"{path}: is inside {dataset.root}, which is read; give another path")
     schema = index_schema().with_metadata({"icrl4aht-data": "index"})
-    rows = arrow.Table.from_pylist([entry.to_json() for entry in dataset.entries], schema)
+    rows = arrow.Table.from_pylist([entry.to_row() for entry in dataset.entries], schema)
     with explain_full_disk(path), atomic_write(path) as partial, partial.open("wb") as stream:
         pq.write_table(rows, stream)  # given a stream, because pyarrow leaves its own file open after an error
     return path

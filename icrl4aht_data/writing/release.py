@@ -285,7 +285,7 @@ class _ShardWriter:
             source=new.provenance.source or "ppo",
             learner=history.learner,
             has_oracle_actions="oracle_actions" in arrays,
-            **new.provenance.entry_fields(),
+            **new.provenance.entry_fields(returns.shape[1]),
         )
 
     def _with_positions(self, entries: list[Entry], shard: str) -> list[Entry]:

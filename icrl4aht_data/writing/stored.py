@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks
 from icrl4aht_data.dataset import Dataset
@@ -40,9 +41,11 @@ def stored_task(
             yield NewHistory.from_history(history, kind)
             done()
 
-    if task.teammate.get("kind") == "rl":
-        dataset.origin.below(f"{TEAMMATES}/{task.teammate['theta']['sha256']}")  # fetches and checks the checkpoint
-    files = checkpoint_files(dataset.root / TEAMMATES, task, dataset.root)
+    files: dict[str, Path] = {}
+    for one in provenance.played(task):
+        if one.teammate.get("kind") == "rl":
+            dataset.origin.below(f"{TEAMMATES}/{one.teammate['theta']['sha256']}")  # fetches and checks the checkpoint
+        files |= checkpoint_files(dataset.root / TEAMMATES, one, dataset.root)
     if provenance.expert is not None and (sha256 := provenance.expert.policy_sha256) is not None:
         files |= expert_files(dataset.origin.below(expert_folder(sha256)), sha256, dataset.root)
     return NewTask(task, provenance, len(dataset), load, files)

@@ -115,11 +115,11 @@ def test_steps_of_building_ad_reference(steps, tmp_path):
     play = ("train", "rl2-layout", rate, "None")
     assert steps == [
         play,
-        ("collect", "rl2-layout", "40", "student-layout", "None"),
+        ("collect", "rl2-layout", "40", "agent-layout", "None"),
         ("train", "ad-student-layout-first", "0.002", "None"),
         play,  # finished: this stub only looks for the checkpoint
         ("collect", "ad-student-layout-first", "20", "ad-student-layout-own", "rl2-layout"),
-        ("combine", "ad-student-layout-mixed", "student-layout", "ad-student-layout-own"),
+        ("combine", "ad-student-layout-mixed", "agent-layout", "ad-student-layout-own"),
         ("train", "ad-student-layout", "0.001", "ad-student-layout-first"),
     ]
 
@@ -180,7 +180,7 @@ def small(monkeypatch, tmp_path) -> Path:
         sizes: dict[str, Any] = TINY if recipe.data else {"steps": 1, "batch_size": 8}
         model = MODEL if recipe.data else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
         monkeypatch.setitem(RECIPES, name, dataclasses.replace(recipe, model=model, train=sizes))
-    monkeypatch.setitem(RL2_HISTORIES, "student", NoiseConfig(2, 10, start=(0.5, 0.5)))
+    monkeypatch.setitem(RL2_HISTORIES, "agent", NoiseConfig(2, 10, start=(0.5, 0.5)))
     monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))
     monkeypatch.setitem(reference.TRACK_PLAY, "layout", {"rearranged": 1})
     diverse = read_tasks(manifest_path("layout", "train", "diverse"))
@@ -197,12 +197,12 @@ def test_a_model_of_rl2_histories_and_its_own(small):
     assert found.run == small / "ad-student-layout" and found.results == {}
     made = {path.name for path in small.iterdir() if path.is_dir() and not path.name.startswith(".")}
     own_round = {f"ad-student-layout{end}" for end in ("", "-first", "-own", "-mixed")}
-    assert made == {"noise", "rl2-layout", "student-layout", *own_round}
+    assert made == {"noise", "rl2-layout", "agent-layout", *own_round}
     trained = read_trained(found.run)
     assert trained.hide_recipe == ("asymm_both",) and trained.step == 2
-    assert {cell["source"] for cell in trained.trained_on} == {"student"}
+    assert {cell["source"] for cell in trained.trained_on} == {"agent"}
     own, mixed = (load_icrl4aht(small / f"ad-student-layout-{name}") for name in ("own", "mixed"))
-    assert len(mixed) == len(own) + len(load_icrl4aht(small / "student-layout"))
+    assert len(mixed) == len(own) + len(load_icrl4aht(small / "agent-layout"))
     times = {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")}
     make_reference("ad-student", "layout", small, lambda *shown: None, evaluates=False)
     assert {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")} == times

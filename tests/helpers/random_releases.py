@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.format.provenance import ExpertLabels, Provenance
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSwaps
 from icrl4aht_data.format.schema import Entry, Kind
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import step
@@ -87,17 +88,20 @@ def random_release(
     experts: Sequence[ExpertLabels | None] = (),
     sources: Sequence[str] = (),
     recipes: Sequence[Dish] | None = None,
+    swap: int | None = None,
     overwrite: bool = False,
 ) -> dict[int, dict[str, np.ndarray]]:
     """Write a release of random actions; returns the written arrays by history id.
 
     `experts` and `sources` say where the labels and the histories of each task come from; `oracle` adds oracle actions,
-    equal to the labels where the source is "noise". Every learner has `streams` histories; a noise task has one.
+    equal to the labels where the source is "noise". Every learner has `streams` histories; a noise task has one. With
+    `swap` the layout's teammates are recorded as playing in turn, each this number of episodes.
     """
     rng = np.random.default_rng(seed)
     written: dict[int, dict[str, np.ndarray]] = {}
     tasks = []
-    for number, task in enumerate(make_tasks(list(layouts), teammates, recipes)):
+    every = make_tasks(list(layouts), teammates, recipes)
+    for number, task in enumerate(every):
         histories = []
         source, expert = sources[number] if sources else None, experts[number] if experts else None
         trained = 1 if source == "noise" else learners
@@ -111,6 +115,9 @@ def random_release(
             written[len(written)] = arrays
             histories.append(NewHistory(stream, arrays, learner))
         made = Provenance(seed=task.seed, source=source, expert=expert, learners=None if trained == 1 else trained)
+        if swap is not None:
+            others = [one.teammate for one in every if one.layout == task.layout and one is not task]
+            made = replace(made, swaps=TeammateSwaps(swap, [task.teammate, *others]))
         tasks.append(NewTask(task, made, len(histories), lambda histories=histories: histories))
     options: dict[str, Any] = {"shard_histories": shard_histories, "overwrite": overwrite}
     write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, **options)

@@ -149,7 +149,7 @@ def test_pytorch_workers(lite, tmp_path, combinations):
 class TestHuggingFace:
     def test_index(self, lite):
         dataset = load_icrl4aht(lite[0], layout="demo_wide")
-        assert hf_index(dataset).to_list() == [entry.to_json() for entry in dataset.entries]
+        assert hf_index(dataset).to_list() == [entry.to_row() for entry in dataset.entries]
 
     def test_episodes(self, lite, tmp_path, monkeypatch):
         monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)

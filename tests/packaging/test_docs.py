@@ -256,6 +256,8 @@ JSON_NAMES = {
     int | None: "int or null",
     float: "number",
     float | None: "number or null",
+    str | None: "string or null",
+    tuple[tuple[int, str], ...] | None: "list of [int, string] or null",
 }
 TYPE_NAMES = {"int32": "i4", "int8": "i1", "float32": "f4", "bool": "bool"}
 

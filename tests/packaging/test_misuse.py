@@ -42,7 +42,7 @@ def say(capsys, monkeypatch, tmp_path):
 MISUSED = """
 lst | unknown command 'lst'; valid: list, show,
 list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
-list --source nois | unknown source 'nois'; valid: ppo, noise, student, search. Did you mean 'noise'?
+list --source nois | unknown source 'nois'; valid: ppo, noise, agent, search. Did you mean 'noise'?
 verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
 verify --deeep | No such option
 show 158 | 158: no such folder; give a history's id as --history 158
@@ -111,7 +111,7 @@ train ad --layout asymm_right | no history has split='train', layout=['asymm_rig
 train amago_offline --layout demo_wide --labels oracle | amago_offline learns from the histories' own
 train rl2 --layout demo_wide --every 2 | every = 2: rl2 learns by playing, not from histories
 train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
-collect --agent stay --source student --out c | source = student: none of Dataset(
+collect --agent stay --source agent --out c | source = agent: none of Dataset(
 collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON
 results none.json --out r | none.json: No such file or directory; check the path
 submit empty --out r.json --about a --data b --labels c | empty: no results in empty/tasks

@@ -27,13 +27,15 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.options import Share
 from icrl4aht_data.utils.progress import progress_bars
+from icrl4aht_data.utils.text import counted_noun
 
 
 @click.command(
     "collect",
     epilog=examples(
-        "icrl4aht-data collect --agent runs/rl2 --root build/noise/lite --out build/student",
-        "icrl4aht-data collect --agent runs/ad --layout demo_wide --histories 2 --out build/student",
+        "icrl4aht-data collect --agent runs/rl2 --root build/noise/lite --out build/agent",
+        "icrl4aht-data collect --agent runs/ad --layout demo_wide --histories 2 --out build/agent",
+        "icrl4aht-data collect --agent rl2-reference --layout demo_wide --swap 5 --out build/swaps",
     ),
 )
 @click.option(
@@ -59,13 +61,20 @@ from icrl4aht_data.utils.progress import progress_bars
 @click.option(
     "--like",
     type=shared.HISTORIES_NAME,
-    help="As many and as long histories as the reference models learn from, with their noise: student, or rising, "
+    help="As many and as long histories as the reference models learn from, with their noise: agent, or rising, "
     "which begin at random. Not with --histories, --episodes and --noise.",
 )
 @click.option(
     "--labeller",
     type=shared.EGO_NAME,
     help="Another agent, such as rl2-reference, whose most probable actions become the expert actions.",
+)
+@click.option(
+    "--swap",
+    type=COUNT,
+    metavar="N",
+    help="Change the teammate after every N episodes, without a sign, among those of its kind, layout and split.",
+    show_default="never",
 )
 @shared.manifests_option
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the release here.")
@@ -81,18 +90,20 @@ def collect_command(
     noise: tuple[float, float],
     like: str | None,
     labeller: str | None,
+    swap: int | None,
     manifests: tuple[Path, ...],
     out: Path,
     overwrite: bool,
 ) -> None:
     """Record histories of an agent with a release's teammates.
 
-    Writes a release of source student: what the agent did, what it would have done without the noise (expert actions),
-    and what the scripted oracle would have done (oracle actions). Validation teammates are played, too.
+    Writes a release of source agent: what the agent did, what it would have done without the noise (expert actions),
+    and what the scripted oracle would have done (oracle actions; not where it earns less than the histories' end, if
+    the release states what it earns). Validation teammates are played, too.
     """
     from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
-    from icrl4aht_baselines.online.student import collect_release, release_teammates
+    from icrl4aht_baselines.online.agent_histories import collect_release, plan_swaps, release_teammates
     from icrl4aht_baselines.reference import RL2_HISTORIES
     from icrl4aht_baselines.training.histories import filter_histories
 
@@ -107,8 +118,10 @@ def collect_command(
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
     tasks = [task for manifest in manifests for task in read_tasks(manifest)]
     teammates = release_teammates(dataset, tasks=tasks)
+    if swap is not None and (alone := len(teammates.tasks) - len(plan_swaps(teammates.tasks, config.episodes, swap))):
+        click.echo(f"{counted_noun(alone, 'task')} without another teammate of its kind, split and layout: not swapped")
     with progress_bars(unit="episodes") as show:
-        options: Any = {"labeller": other, "overwrite": overwrite, "progress": show}
+        options: Any = {"labeller": other, "swap": swap, "overwrite": overwrite, "progress": show}
         collect_release(ego, teammates, config, out, **options)
     click.echo(f"wrote {out}; `icrl4aht-data show {out}` describes it")
 

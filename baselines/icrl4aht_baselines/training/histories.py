@@ -167,7 +167,7 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
     for name, values in filters.items():
         column = dataset.column(FILTERS[name])
         passing &= np.isin(column, values)
-        found = sorted(set(column.tolist()))
+        found = sorted(set(column.tolist()) - {""}) or ["none"]
         for value in values:
             if value not in found:
                 raise EmptySelectionError(

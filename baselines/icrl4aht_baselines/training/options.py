@@ -110,7 +110,7 @@ class ResponseOptions:
 SAVE_MINUTES = 5.0
 """Most minutes between checkpoints of a training run. Results do not depend on it, so it is no setting of a run."""
 
-FILTERS = {"teammate_family": "teammate_family", "algorithm": "teammate_kind", "source": "source"}
+FILTERS = {name: name for name in ("teammate_family", "source", "label_view")} | {"algorithm": "teammate_kind"}
 """Field of `HistoryOptions` -> the field of a release's index that it filters by."""
 
 
@@ -140,7 +140,10 @@ class HistoryOptions:
         Option("Only histories with teammates of this algorithm, such as fcp, or kind of heuristic; repeat."),
     ] = ()
     source: Annotated[
-        tuple[str, ...], Option("Only histories of this source: ppo, noise, student or search; repeat for several.")
+        tuple[str, ...], Option("Only histories of this source: ppo, noise, agent or search; repeat for several.")
+    ] = ()
+    label_view: Annotated[
+        tuple[str, ...], Option("Only histories whose expert actions come from this view: ego or state; repeat.")
     ] = ()
     order: Annotated[ContextOrder, Option("Order of the transitions in DPT's contexts.")] = "contiguous"
     queries: Annotated[Count, Option("Queries that DPT answers with each context, posed in turn.")] = 1

@@ -19,7 +19,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
-from icrl4aht_data.format.schema import Kind, episode_ends
+from icrl4aht_data.format.schema import Kind, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
 from icrl4aht_data.writing.card import CURVES_FIGURE
@@ -190,7 +190,10 @@ def _scripted_task(found: TaskHistories, made: Provenance, profile: Profile, fil
         action=action,
         return_greedy=None if earned is None else earned.oracle,
         episodes=None if earned is None else earned.episodes,
+        view="state",  # scripts see a `Situation`
     )
+
+    with_oracle = profile.oracle_actions and made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
 
     def load() -> Iterator[NewHistory]:
         for _, stream, arrays in _recorded_histories(found):
@@ -198,7 +201,7 @@ def _scripted_task(found: TaskHistories, made: Provenance, profile: Profile, fil
             wanted = {"expert_actions": labels}
             if profile.oracle_actions and found.source == "noise":
                 wanted["oracle_actions"] = labels
-            elif profile.oracle_actions:
+            elif with_oracle:
                 wanted["oracle_actions"] = oracle_labels(found.task.layout, arrays["state"], arrays["actions"])
             yield NewHistory(stream, arrays | wanted)
 
@@ -217,14 +220,16 @@ def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: P
         return_sampled=labeller.return_sampled,
         episodes=LABEL_EPISODES,
         last_return_greedy=labeller.last_return_greedy,
+        view="ego",  # the network of a learner takes observations
     )
+    with_oracle = profile.oracle_actions and made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
     effect = filter_report(found.recorded, found.kept, found.least_improvement)
 
     def load() -> Iterator[NewHistory]:
         network, params, _ = load_policy(labeller.folder)
         for learner, stream, arrays in _recorded_histories(found):
             wanted = {"expert_actions": relabel(task.layout, network, params, arrays["state"])}
-            if profile.oracle_actions:
+            if with_oracle:
                 wanted["oracle_actions"] = oracle_labels(task.layout, arrays["state"], arrays["actions"])
             yield NewHistory(stream, arrays | wanted, learner)
 

@@ -130,13 +130,13 @@ def build_teammate(
     return _family(teammate["family"]).build(layout, teammate["theta"], slot, noise)
 
 
-def recover_teammate(dataset: Dataset, history_id: int) -> Policy:
-    """Return the teammate of a history, as it played.
+def recover_teammate(dataset: Dataset, history_id: int, episode: int = 0) -> Policy:
+    """Return the teammate of a history, as it played an episode; the number matters only where teammates change.
 
     Raises:
         OptionError: if the release does not hold the teammate's checkpoint.
     """
-    entry = dataset.recover_teammate(history_id)
+    entry = dataset.recover_teammate(history_id, episode)
     if entry["kind"] == "rl" and not dataset.origin.below(f"{TEAMMATES}/{entry['theta']['sha256']}").is_dir():
         raise OptionError(
             f"{dataset.root / TEAMMATES}: checkpoint {entry['theta']['sha256']} is missing, the teammate of history "

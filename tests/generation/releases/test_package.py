@@ -125,6 +125,15 @@ def test_streams_of_both_learners_that_rise_are_kept(two_learners, profile, tmp_
     assert verify_release(root).findings == []
 
 
+def test_no_oracle_actions_where_the_oracle_earns_less_than_the_end(two_learners, profile, tmp_path):
+    task_id, references = two_learners[0].task.task_id, MATTERS.references
+    assert references is not None
+    facts = MATTERS._replace(references=replace(references, oracle=-1000.0))
+    dataset = load_icrl4aht(pack(tmp_path, replace(profile, oracle_actions=True), two_learners, {task_id: facts}))
+    assert dataset.counts("label_view") == {"ego": len(dataset)}
+    assert not dataset.has_labels("oracle").any()
+
+
 def test_streams_are_kept_as_before_where_no_teammate_leaves_headroom(two_learners, profile, tmp_path):
     task_id = two_learners[0].task.task_id
     root = pack(tmp_path, replace(profile, least_improvement=50.0), two_learners, {task_id: DOES_NOT})

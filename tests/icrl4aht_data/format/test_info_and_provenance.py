@@ -43,10 +43,11 @@ def test_expert_fields_are_kept():
     note = {"xla_threads": 2, "expert": labels | {"episodes": 200, "last_return_greedy": -1.0}}
     found = Provenance.from_json(note)
     assert found.to_json() == note
-    assert found.entry_fields() == {"expert_return": 0.0, "expert_return_sampled": 16.9, "expert_step": 7}
+    described = {"expert_return": 0.0, "expert_return_sampled": 16.9, "expert_step": 7}
+    assert found.entry_fields(2) == described | {"label_view": None, "teammate_of_episode": None}
     old = {"expert": {"policy_sha256": "ab" * 32, "action": "greedy"}}
     assert Provenance.from_json(old).to_json() == old
-    assert set(Provenance.from_json(old).entry_fields().values()) == {None}
+    assert set(Provenance.from_json(old).entry_fields(2).values()) == {None}
 
 
 @pytest.mark.parametrize(

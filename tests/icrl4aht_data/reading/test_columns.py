@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
 
@@ -16,21 +17,22 @@ from icrl4aht_data.errors import (
     UnknownNameError,
     WeakLabelsWarning,
 )
-from icrl4aht_data.format.provenance import ExpertLabels
+from icrl4aht_data.format.provenance import ExpertLabels, LabelView
 from icrl4aht_data.format.schema import ENTRY_HINTS
 from tests.helpers.random_releases import random_release
 
 
-def expert(greedy: float | None, sampled: float | None = None) -> ExpertLabels:
-    return ExpertLabels("0" * 64, "greedy", step=1000, return_greedy=greedy, return_sampled=sampled, episodes=200)
+def expert(greedy: float | None, sampled: float | None = None, view: LabelView | None = "ego") -> ExpertLabels:
+    sha256, returns = "0" * 64, {"return_greedy": greedy, "return_sampled": sampled}
+    return ExpertLabels(sha256, "greedy", step=1000, episodes=200, view=view, **returns)
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     """Return four tasks with expert returns 9.5, 0.0 (16.9 sampled), -30.0 and unknown."""
     root = tmp_path_factory.mktemp("measured") / "release"
-    experts = [expert(9.5, 10.0), expert(0.0, 16.9), expert(-30.0, 1.0), None]
-    random_release(root, streams=2, experts=experts, sources=["ppo", "ppo", "search", "search"])
+    experts = [expert(9.5, 10.0), expert(0.0, 16.9), expert(-30.0, 1.0, "state"), None]
+    random_release(root, streams=2, experts=experts, sources=["ppo", "ppo", "search", "search"], swap=4)
     return root
 
 
@@ -51,7 +53,9 @@ def test_every_column_agrees_with_the_entries(measured):
         for value, entry in zip(found, dataset.entries, strict=True):
             expected = getattr(entry, name)
             if expected is None:
-                assert value == -1 or math.isnan(value)
+                assert value in (-1, "") or math.isnan(value)
+            elif name == "teammate_of_episode":
+                assert json.loads(value) == [list(pair) for pair in expected]
             else:
                 assert value == (list(expected) if name == "obs_shape" else expected), name
     assert dataset.column("obs_shape").shape == (3, 3)
@@ -73,6 +77,7 @@ def test_data_frame(measured):
     assert frame.expert_return.isna().tolist() == [True, False, False]
     assert frame.expert_step.isna().tolist() == [True, False, False]
     assert frame.expert_step.tolist()[1:] == [1000, 1000]
+    assert frame.label_view.fillna("").tolist() == ["", "ego", "ego"]
     for name in ("history_id", "T", "return_end", "has_expert_actions"):
         assert frame[name].tolist() == [getattr(entry, name) for entry in dataset.entries]
     assert frame.obs_shape.tolist() == [entry.obs_shape for entry in dataset.entries]
@@ -82,7 +87,7 @@ def test_filters_of_sources_and_algorithms(measured):
     assert load_icrl4aht(measured, source="search").ids.tolist() == [4, 5, 6, 7]
     both = load_icrl4aht(measured).filter(source=["ppo", "search"], algorithm="utility_greedy")
     assert both.ids.tolist() == [*range(8)]
-    with pytest.raises(UnknownNameError, match=r"unknown source 'sac'; valid: ppo, noise, student, search"):
+    with pytest.raises(UnknownNameError, match=r"unknown source 'sac'; valid: ppo, noise, agent, search"):
         load_icrl4aht(measured, source="sac")
     with pytest.raises(UnknownNameError, match=r"unknown algorithm 'utility'; .* mean 'utility_greedy'"):
         load_icrl4aht(measured, algorithm="utility")
@@ -90,6 +95,23 @@ def test_filters_of_sources_and_algorithms(measured):
         load_icrl4aht(measured).filter(algoritm="utility")
     with pytest.raises(EmptySelectionError, match=r"'coord_simple', source='search'\..*; source ppo, search$"):
         load_icrl4aht(measured, layout="coord_simple", source="search")
+
+
+def test_filter_by_the_view_of_the_labels(measured, lite):
+    assert load_icrl4aht(measured, label_view="ego").ids.tolist() == [0, 1, 2, 3]
+    assert load_icrl4aht(measured).filter(label_view=["state", "ego"]).ids.tolist() == [*range(6)]
+    assert load_icrl4aht(measured).counts("label_view") == {"ego": 4, "state": 2}
+    with pytest.raises(UnknownNameError, match=r"unknown label_view 'states'; valid: ego, state"):
+        load_icrl4aht(measured, label_view="states")
+    assert load_icrl4aht(lite[0]).counts("label_view") == {}
+    with pytest.raises(EmptySelectionError, match=r"label_view='ego'.*label_view not recorded$"):
+        load_icrl4aht(lite[0], label_view="ego")
+
+
+def test_other_sources_are_read_and_selected(tmp_path):
+    """Releases made before it was renamed have the source `student`."""
+    random_release(tmp_path / "release", streams=1, sources=["student", "noise", "agent", "search"])
+    assert load_icrl4aht(tmp_path / "release", source="student").ids.tolist() == [0]
 
 
 def test_filter_by_expert_return(measured):

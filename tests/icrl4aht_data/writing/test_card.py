@@ -79,7 +79,8 @@ def write(lite, tmp_path) -> Callable[..., dict[str, Any]]:
                 changes |= {"teammate_family": task.teammate_family, "teammate_kind": task.teammate_kind}
                 changes |= {"shard": f"data/teammate/{task.layout.name}/{task.split}-00000-of-00001.h5"}
                 changes |= {"source": of_task.source, "return_start": start, "return_end": end}
-                changes |= {"has_oracle_actions": of_task.source == "noise", **of_task.entry_fields(), **fields}
+                changes |= {"has_oracle_actions": of_task.source == "noise"}
+                changes |= of_task.entry_fields(like.episodes) | fields
                 entries.append(msgspec.structs.replace(like, **changes))
         (tmp_path / "meta").mkdir(exist_ok=True)
         info = replace(describe("lite", "1.0.0", 20, entries), left_out=[LEFT_OUT], shards={"data/x.h5": 1})

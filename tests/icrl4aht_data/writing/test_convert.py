@@ -118,7 +118,7 @@ def test_parquet_index(lite, tmp_path):
 
     dataset = load_icrl4aht(lite[0], layout="demo_wide")
     rows = pq.read_table(to_parquet(dataset, tmp_path / "index.parquet")).to_pylist()
-    assert rows == [entry.to_json() for entry in dataset.entries]
+    assert rows == [entry.to_row() for entry in dataset.entries]
 
 
 def wrong(value: Any) -> Any:

@@ -12,18 +12,26 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, stay
-from icrl4aht_baselines.online import student
-from icrl4aht_baselines.online.student import collect_release, record_histories, release_teammates, with_noise
+from icrl4aht_baselines.online import agent_histories
+from icrl4aht_baselines.online.agent_histories import (
+    Teammates,
+    collect_release,
+    plan_swaps,
+    record_histories,
+    release_teammates,
+    with_noise,
+)
 from icrl4aht_baselines.reference import RL2_HISTORIES
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
+from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.errors import OptionError
+from icrl4aht_data.errors import LabelsMissingError, OptionError
+from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.overcooked.actions import STAY
 from tests.helpers.evaluated import TEST_TASKS
 
@@ -49,8 +57,16 @@ def dataset() -> Any:
 
 
 @pytest.fixture(scope="module")
-def release(dataset, tmp_path_factory) -> Path:
-    return collect_release(COOK, release_teammates(dataset), CONFIG, tmp_path_factory.mktemp("student") / "release")
+def teammates(dataset) -> Teammates:
+    """Return the teammates of these histories. It is known of the second one alone that the oracle is of no use."""
+    found = release_teammates(dataset)
+    useless = ReferenceEgos(stay=0.0, random=0.0, oracle=-1000.0, episodes=100)
+    return found._replace(references={found.tasks[1].task_id: useless})
+
+
+@pytest.fixture(scope="module")
+def release(teammates, tmp_path_factory) -> Path:
+    return collect_release(COOK, teammates, CONFIG, tmp_path_factory.mktemp("agent") / "release")
 
 
 def test_the_release_is_verified_to_the_last_step(release):
@@ -59,15 +75,20 @@ def test_the_release_is_verified_to_the_last_step(release):
     assert not list(release.parent.glob("*.parts"))
 
 
-def test_provenance_of_the_release(release, dataset):
+def test_provenance_of_the_release(release, dataset, teammates):
     found = load_icrl4aht(release)
     made, given = release_teammates(found).tasks, release_teammates(dataset).tasks
-    assert found.counts("source") == {"student": 2 * len(given)}
+    assert found.counts("source") == {"agent": 2 * len(given)}
     assert set(found.counts("split")) == {"train", "validation"}
     card = (release / "README.md").read_text(encoding="utf-8")
     assert "a trained agent plays" in card
     made_by = {made.expert.action for made in found.provenance.values() if made.expert}
     assert made_by == {"cook, before the noise"}
+    assert found.counts("label_view") == {"ego": len(found)}
+    without = found.column("task_id") == teammates.tasks[1].task_id
+    assert (found.has_labels("oracle") == ~without).all() and without.sum() == 2
+    with pytest.raises(LabelsMissingError, match=f"of 1 task .*of task {teammates.tasks[1].task_id}"):
+        found.filter(split="train").ad(batch_size=1, length=10, labels="oracle")
     assert {task.teammate_key for task in made} == {task.teammate_key for task in given}
     assert not set(found.column("task_id")) & set(dataset.column("task_id"))
 
@@ -123,7 +144,7 @@ def test_unusable_tasks_are_refused(dataset):
         release_teammates(dataset, tasks=[learned])
 
 
-def test_a_stopped_collection_resumes(release, dataset, tmp_path, monkeypatch):
+def test_a_stopped_collection_resumes(release, teammates, tmp_path, monkeypatch):
     played: list[str] = []
 
     def killed_in_the_end(*args: Any, **options: Any) -> Any:
@@ -134,17 +155,54 @@ def test_a_stopped_collection_resumes(release, dataset, tmp_path, monkeypatch):
         return original(make, tasks, *args)
 
     original, target = record_histories, tmp_path / "release"
-    monkeypatch.setattr(student, "record_histories", record)
+    monkeypatch.setattr(agent_histories, "record_histories", record)
     with monkeypatch.context() as patch:
-        patch.setattr(student, "write_release", killed_in_the_end)
+        patch.setattr(agent_histories, "write_release", killed_in_the_end)
         with pytest.raises(KeyboardInterrupt):
-            collect_release(COOK, release_teammates(dataset), CONFIG, target)
+            collect_release(COOK, teammates, CONFIG, target)
     assert not target.exists() and played == ["cramped_up"]
     with pytest.raises(OptionError, match=r"release\.parts: parts of other settings \(.*noise.histories.*; remove it"):
-        collect_release(COOK, release_teammates(dataset), NoiseConfig(3, 10), target)
-    collect_release(COOK, release_teammates(dataset), CONFIG, target)
+        collect_release(COOK, teammates, NoiseConfig(3, 10), target)
+    collect_release(COOK, teammates, CONFIG, target)
     assert played == ["cramped_up"]
     assert (target / "MANIFEST.sha256").read_bytes() == (release / "MANIFEST.sha256").read_bytes()
+
+
+def test_swapped_teammates_play_in_turn(release, teammates, tmp_path):
+    tasks = [task for task in teammates.tasks if task.split == "train"][:2]
+    chosen = teammates._replace(tasks=tasks)
+    collect_release(COOK, chosen, CONFIG, tmp_path / "release", swap=4)
+    swapped, plain = load_icrl4aht(tmp_path / "release"), load_icrl4aht(release, task_id=[one.task_id for one in tasks])
+    one, two = (teammate_id(task.teammate) for task in tasks)
+    assert [entry.teammate_of_episode for entry in swapped.entries[::2]] == [
+        ((0, one), (4, two), (8, one)),
+        ((0, two), (4, one), (8, two)),
+    ]
+    for history, before in zip(swapped, plain, strict=True):  # keys depend on the task alone, not on who plays
+        same = [(history.episodes[e].state == before.episodes[e].state).all() for e in range(10)]
+        assert all(same[:4]) and not all(same[4:8])
+    assert verify_release(tmp_path / "release", level="deep").findings == []
+
+
+def test_whom_teammates_take_turns_with(teammates):
+    tasks = teammates.tasks
+    swaps = plan_swaps(tasks, 10, 3)
+    assert swaps.keys() == {task.task_id for task in tasks if task.split == "train"}  # one validation task has no other
+    tasks = tasks[:-1]
+    split = {teammate_id(task.teammate): task.split for task in tasks}
+    for task in tasks:
+        played = [teammate_id(teammate) for teammate in swaps[task.task_id].teammates]
+        assert played[0] == teammate_id(task.teammate) and len(set(played)) == len(played) <= 4
+        assert {split[one] for one in played} == {task.split}
+    with pytest.raises(OptionError, match=r"swap = 10: expected 1 to 9, since a history has 10 episodes"):
+        plan_swaps(tasks, 10, 10)
+    with pytest.raises(OptionError, match=f"swap = 3: none of the 1 tasks, such as {tasks[0].task_id}, has another"):
+        plan_swaps(tasks[:1], 10, 3)
+
+
+def test_what_labels_are_made_from():
+    layout = TEST_TASKS[0].layout
+    assert (AGENTS["oracle"](layout).label_view, cook(layout).label_view) == ("state", "ego")
 
 
 @pytest.mark.slow
@@ -159,7 +217,7 @@ def test_the_command(tmp_path):
 
 def test_histories_like_those_of_reference_models(monkeypatch, tmp_path):
     made = []
-    monkeypatch.setattr(student, "collect_release", lambda *given, **options: made.append(given[2]))
+    monkeypatch.setattr(agent_histories, "collect_release", lambda *given, **options: made.append(given[2]))
     arguments = ["collect", "--agent", "random", "--layout", "cramped_up", "--like", "rising", "--out", str(tmp_path)]
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0 and made == [RL2_HISTORIES["rising"]]

@@ -1,9 +1,10 @@
-"""Histories of the source `student`: a trained agent plays with the teammates of a release, and the oracle labels it.
+"""Histories of the source `agent`: a trained agent plays with the teammates of a release, and the oracle labels it.
 
 The agent's memory lasts for a history, as it does in a test. A chance of a random action may fall over a history's
 episodes, as in noise distillation (Zisman et al. 2024); with a chance of 0 the histories show what the agent itself
 visits. `expert_actions` are the agent's own choices, before the noise, or those of another trained agent, which sees
-the same history. Labels on what a student visits are those of on-policy imitation (DAgger, Ross et al. 2011).
+the same history. Labels on what an agent visits are those of on-policy imitation (DAgger, Ross et al. 2011). The
+teammate may change within a history, as under the protocol `swap`.
 
 Shapes: `B` histories that are played at once, `E` episodes, `T` steps of an episode, `S` bytes of a state record.
 """
@@ -13,10 +14,12 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -31,15 +34,24 @@ from jaxtyping import Array, Float, Int, Int8
 
 from icrl4aht_baselines.agents.egos import NamedEgo
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
+from icrl4aht_baselines.evaluate.programs import Programs
 from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.evaluate.segments import segment_lengths
 from icrl4aht_baselines.online.teammates import check_heuristics
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks
+from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, teammate_id
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files
-from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos, read_provenance
-from icrl4aht_data.format.schema import PROVENANCE, TASKS, TEAMMATES, episode_ends
+from icrl4aht_data.format.provenance import (
+    ExpertLabels,
+    LabelView,
+    Provenance,
+    ReferenceEgos,
+    TeammateSwaps,
+    read_provenance,
+)
+from icrl4aht_data.format.schema import PROVENANCE, TASKS, TEAMMATES, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
@@ -47,13 +59,13 @@ from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import check_target
 
-SOURCE = "student"
+SOURCE = "agent"
 
 FIRST_SEED = 3_000_000
-"""Seed of the first student task; those of other sources are below."""
+"""Seed of the first agent task; those of other sources are below."""
 
 _SEEDS = 100_000
-"""Student tasks of one collection have seeds from a range of this size."""
+"""Agent tasks of one collection have seeds from a range of this size."""
 
 
 class NoisyMemory(NamedTuple):
@@ -135,6 +147,7 @@ def record_histories(
     suite: Path | None = None,
     played: Callable[[int], None] = lambda episodes: None,
     make_labeller: Callable[[Layout], Policy] | None = None,
+    swaps: Mapping[str, TeammateSwaps] = MappingProxyType({}),
 ) -> RecordedHistories:
     """Play histories of tasks that share a layout and a teammate family; `config.histories` of each, in their order.
 
@@ -145,6 +158,7 @@ def record_histories(
         suite: folder of learned teammates, if tasks have any.
         played: called with the number of episodes played since the last call.
         make_labeller: layout -> another agent that labels the histories.
+        swaps: task id -> changes of the teammate, see `plan_swaps`; by default each task keeps its own.
 
     Raises:
         OptionError: if an agent does not fit the layout, or the labeller sees something else than the agent.
@@ -152,27 +166,74 @@ def record_histories(
     chances = np.concatenate([noise_schedules(config, task.seed) for task in tasks])
     seeds = range(config.histories)
 
+    @cache  # segments with other teammates share the compiled program of one agent
     def noisy(layout: Layout) -> Policy:
         return with_noise(make_ego(layout), KEPT_STEPS, None if make_labeller is None else make_labeller(layout))
 
-    rollout, state, episode = prepare_rollout(noisy, tasks, get_protocol("seeded", config.episodes), seeds, suite)
-    parts: list[tuple[np.ndarray, ...]] = []
-    for number in range(config.episodes):
-        state = state._replace(ego=state.ego._replace(chance=jnp.asarray(chances[:, number])))
-        state, one = episode(rollout.ego.params, rollout.teammate_params, state)
-        actions = np.asarray(one.actions, np.int8)
-        rewards, labels = np.asarray(one.reward, np.int8), np.asarray(state.ego.labels)
-        record, end = np.asarray(one.record), np.asarray(one.end)[:, None]
-        parts.append((record, actions[..., EGO], actions[..., TEAMMATE], rewards, labels, end))
-        played(len(chances))
+    every = next((one.every for one in swaps.values()), None)
+    protocol = replace(get_protocol("seeded", config.episodes), swap_every=every)
+    programs, prepared, parts = Programs(), None, list[tuple[np.ndarray, ...]]()
+    for length in segment_lengths(protocol):  # segments without a change of teammates
+        mates = [swaps[one.task_id].teammate(len(parts)) if one.task_id in swaps else one.teammate for one in tasks]
+        playing = [replace(task, teammate=mate) for task, mate in zip(tasks, mates, strict=True)]
+        prepared = prepare_rollout(noisy, playing, protocol, seeds, suite, programs=programs, earlier=prepared)
+        for _ in range(length):
+            rollout, state, episode = prepared
+            state = state._replace(ego=state.ego._replace(chance=jnp.asarray(chances[:, len(parts)])))
+            state, one = episode(rollout.ego.params, rollout.teammate_params, state)
+            prepared = prepared._replace(state=state)
+            actions = np.asarray(one.actions, np.int8)
+            rewards, labels = np.asarray(one.reward, np.int8), np.asarray(state.ego.labels)
+            record, end = np.asarray(one.record), np.asarray(one.end)[:, None]
+            parts.append((record, actions[..., EGO], actions[..., TEAMMATE], rewards, labels, end))
+            played(len(chances))
     return RecordedHistories(*(np.concatenate(field, axis=1) for field in zip(*parts, strict=True)))
+
+
+def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, TeammateSwaps]:
+    """Return task id -> the teammates that play in turn in the task's histories.
+
+    They are the teammates of all tasks with its layout, track, split and kind of teammate, in the order of `tasks` from
+    its own on. Splits are kept apart, so that no validation teammate plays in a training history. Tasks with no other
+    teammate to swap with are left out.
+
+    Args:
+        tasks: the tasks.
+        episodes: number of episodes of each history.
+        every: number of episodes after which the next teammate plays.
+
+    Raises:
+        OptionError: if no teammate would change, because histories are too short or no task has another one.
+    """
+    if not 0 < every < episodes:
+        raise OptionError(f"swap = {every}: expected 1 to {episodes - 1}, since a history has {episodes} episodes")
+    groups: dict[Any, dict[str, dict[str, Any]]] = defaultdict(dict)
+    for task in tasks:
+        groups[_swap_group(task)].setdefault(teammate_id(task.teammate), task.teammate)
+    found = {}
+    for task in tasks:
+        group = groups[_swap_group(task)]
+        if len(group) > 1:
+            first = list(group).index(teammate_id(task.teammate))
+            in_turn = [*group.values()][first:] + [*group.values()][:first]
+            found[task.task_id] = TeammateSwaps(every, in_turn[: -(-episodes // every)])
+    if not found:
+        raise OptionError(
+            f"swap = {every}: none of the {len(tasks)} tasks, such as {tasks[0].task_id}, has another teammate of its "
+            f"kind, split and layout to swap with: select more histories, or give a --manifest"
+        )
+    return found
+
+
+def _swap_group(task: Task) -> tuple[str, ...]:
+    return task.layout.name, task.track, task.split, task.teammate_kind
 
 
 class Teammates(NamedTuple):
     """Teammates of a release, and their recorded reference returns.
 
     Attributes:
-        tasks: one task for each teammate, numbered as a student task.
+        tasks: one task for each teammate, numbered as an agent task.
         references: task id -> returns of egos that do not learn, where the release states them.
         suite: folder of the checkpoints of learned teammates.
         root: folder or address of the release.
@@ -185,7 +246,7 @@ class Teammates(NamedTuple):
 
 
 def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] = ()) -> Teammates:
-    """Return student tasks with the teammates of a selection's histories and of other tasks, each once.
+    """Return agent tasks with the teammates of a selection's histories and of other tasks, each once.
 
     Args:
         dataset: the selection.
@@ -220,11 +281,11 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         if task.teammate_key in found:
             continue
         seed = FIRST_SEED + number * _SEEDS + len(found)
-        student = make_task(task.track, task.split, task.layout.name, task.teammate, seed, task.recipes)
-        found[task.teammate_key] = student
+        played = make_task(task.track, task.split, task.layout.name, task.teammate, seed, task.recipes)
+        found[task.teammate_key] = played
         made = provenance.get(task.task_id)
         if made is not None and made.references is not None:
-            references[student.task_id] = made.references
+            references[played.task_id] = made.references
     suite = dataset.origin.below(TEAMMATES)
     root = str(dataset.origin) if dataset.origin.remote else dataset.root
     return Teammates(list(found.values()), references, suite, root)
@@ -237,11 +298,12 @@ def collect_release(
     out: Path,
     *,
     labeller: NamedEgo | None = None,
+    swap: int | None = None,
     data_version: str = "1.0.0",
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
-    """Play histories with every teammate, and write them as a release of source `student`.
+    """Play histories with every teammate, and write them as a release of source `agent`.
 
     Until the release is complete, finished groups of tasks are kept in the folder `out` with the ending `.parts`, from
     which the same call resumes.
@@ -252,24 +314,30 @@ def collect_release(
         config: number and length of each task's histories, and their noise.
         out: folder of the release.
         labeller: another agent, whose choices become the expert actions; by default the agent's own, without noise.
+        swap: number of episodes after which another teammate plays within a history, see `plan_swaps`; None for never.
         data_version: version of the data.
         overwrite: whether to replace a release at `out`.
         progress: called with (description, episodes played, episodes).
 
     Raises:
         OptionError: if `out` may not be written, if an agent does not fit a layout or the labeller sees something else
-            than the agent, or if the saved parts are of other settings.
+            than the agent, if the saved parts are of other settings, or for an impossible `swap`, see `plan_swaps`.
     """
     out = out.resolve()
     check_target(out, overwrite, [teammates.root])
+    swaps = {} if swap is None else plan_swaps(teammates.tasks, config.episodes, swap)
+    views: dict[Layout, LabelView] = {}
     for layout in dict.fromkeys(task.layout for task in teammates.tasks):
-        with_noise(agent.make(layout), KEPT_STEPS, None if labeller is None else labeller.make(layout))
+        policy, other = agent.make(layout), None if labeller is None else labeller.make(layout)
+        with_noise(policy, KEPT_STEPS, other)
+        views[layout] = (other or policy).label_view
     parts = out.with_name(f"{out.name}.parts")
     settings = {
         "agent": agent.name,
         "details": agent.details,
         "labeller": labeller and [labeller.name, labeller.details],
         "noise": asdict(config),
+        "swap": swap,
         "tasks": [task.task_id for task in teammates.tasks],
         "xla_threads": xla_threads(),
         "code_version": version("icrl4aht-data"),
@@ -285,11 +353,18 @@ def collect_release(
         if folder.is_dir():
             show(len(tasks) * config.histories * config.episodes)
         else:
-            _save_part(folder, record_histories(agent.make, tasks, config, teammates.suite, show, label))
+            _save_part(folder, record_histories(agent.make, tasks, config, teammates.suite, show, label, swaps))
     by = f"{agent.name}, before the noise" if labeller is None else f"{labeller.name}, in histories of {agent.name}"
-    labels = ExpertLabels(policy_sha256=None, action=by)
     new = [
-        _student_task(task, number, parts / f"{layout}-{kind}", labels, config, teammates)
+        _agent_task(
+            task,
+            number,
+            parts / f"{layout}-{kind}",
+            ExpertLabels(policy_sha256=None, action=by, view=views[task.layout]),
+            config,
+            teammates,
+            swaps.get(task.task_id),
+        )
         for (layout, kind), tasks in groups.items()
         for number, task in enumerate(tasks)
     ]
@@ -321,19 +396,28 @@ def _check_settings(path: Path, settings: dict[str, Any]) -> None:
         raise OptionError(f"{path.parent}: parts of other settings ({listed}); remove it, or give another --out")
 
 
-def _student_task(
-    task: Task, number: int, folder: Path, labels: ExpertLabels, config: NoiseConfig, teammates: Teammates
+def _agent_task(
+    task: Task,
+    number: int,
+    folder: Path,
+    labels: ExpertLabels,
+    config: NoiseConfig,
+    teammates: Teammates,
+    swaps: TeammateSwaps | None,
 ) -> NewTask:
     """Return a task with the histories of one group that belong to it, which are read when they are written."""
-    first = number * config.histories
+    rows = slice(number * config.histories, (number + 1) * config.histories)
+    rewards = np.load(folder / "rewards.npy", mmap_mode="r")[rows]
+    returns = rewards.reshape(config.histories, config.episodes, -1).sum(axis=-1, dtype=np.float64)
 
     def load() -> Iterator[NewHistory]:
-        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in RecordedHistories._fields}
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r")[rows] for name in RecordedHistories._fields}
         for stream in range(config.histories):
-            of_history = {name: array[first + stream] for name, array in arrays.items()}
-            labels = oracle_labels(task.layout, of_history["state"], of_history["actions"])
-            dones = episode_ends(len(labels), KEPT_STEPS)
-            yield NewHistory(stream, of_history | {"dones": dones, "oracle_actions": labels})
+            of_history = {name: array[stream] for name, array in arrays.items()}
+            of_history["dones"] = episode_ends(rewards.shape[1], KEPT_STEPS)
+            if made.wants_oracle(curve_ends(returns)[1].mean()):
+                of_history["oracle_actions"] = oracle_labels(task.layout, of_history["state"], of_history["actions"])
+            yield NewHistory(stream, of_history)
 
     made = Provenance(
         code_version=version("icrl4aht-data"),
@@ -348,5 +432,9 @@ def _student_task(
         streams_recorded=config.histories,
         streams_kept=config.histories,
         expert=labels,
+        swaps=swaps,
     )
-    return NewTask(task, made, config.histories, load, checkpoint_files(teammates.suite, task))
+    files: dict[str, Path] = {}
+    for one in made.played(task):
+        files |= checkpoint_files(teammates.suite, one)
+    return NewTask(task, made, config.histories, load, files)

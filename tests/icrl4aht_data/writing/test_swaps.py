@@ -1,0 +1,119 @@
+"""Histories within which the teammate changes: index, provenance, conversions, verification."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from icrl4aht_data import load_icrl4aht, verify_release
+from icrl4aht_data.benchmark.tasks import teammate_id
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.dataset import teammate_ids, teammate_names
+from icrl4aht_data.errors import IndexFormatError, OptionError
+from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos
+from icrl4aht_data.format.schema import HISTORIES
+from icrl4aht_data.writing.card import facts, render_card
+from icrl4aht_data.writing.combine import combine_releases
+from icrl4aht_data.writing.convert import to_release
+from icrl4aht_data.writing.published import from_published, to_published
+from tests.helpers.random_releases import random_release
+
+
+@pytest.fixture(scope="module")
+def swapped(tmp_path_factory) -> Path:
+    """Return a release of two tasks on each of two layouts; their teammates take turns of four of six episodes."""
+    root = tmp_path_factory.mktemp("swapped") / "release"
+    random_release(root, streams=1, swap=4, experts=[ExpertLabels(None, "cook", view="ego")] * 4)
+    return root
+
+
+def test_the_card_says_so(swapped):
+    content = facts(swapped)
+    assert (content["views"], content["swapped"]) == ({"ego": 4}, 4)
+    card = render_card(content)
+    assert "In 4 histories the teammate changes" in card and "what an ego sees in 4 histories (`ego`)" in card
+
+
+def test_entries_say_who_plays(swapped):
+    dataset = load_icrl4aht(swapped)
+    first, second = (teammate_id(dataset.history_task(number).teammate) for number in (0, 1))
+    assert dataset[0].entry.teammate_of_episode == ((0, first), (4, second))
+    assert dataset[1].entry.teammate_of_episode == ((0, second), (4, first))
+    played = [teammate_id(dataset.recover_teammate(0, episode)) for episode in range(6)]
+    assert played == [first] * 4 + [second] * 2
+    with pytest.raises(OptionError, match=r"episode = 6: history 0 has episodes 0\.\.5"):
+        dataset.recover_teammate(0, 6)
+
+
+def test_teammates_that_share_a_history_are_held_out_together(swapped, lite):
+    dataset = load_icrl4aht(swapped)
+    assert len(set(teammate_names(dataset))) == 2  # one for each layout
+    assert np.array_equal(teammate_names(dataset.select([0, 2])), teammate_names(dataset.select([1, 3])))
+    assert teammate_ids(dataset, [0]) == teammate_ids(dataset, [1])
+    assert len(set(teammate_names(load_icrl4aht(lite[0])))) == 4
+
+
+@pytest.mark.parametrize("kind", ["lite", "full", "published"])
+def test_copies_keep_the_changes(swapped, tmp_path, kind):
+    """Only one of the tasks is copied, so that the other's teammate is known from the provenance alone."""
+    part, copy = load_icrl4aht(swapped).select([1]), tmp_path / "copy"
+    if kind == "published":
+        to_published(part, tmp_path / "published")
+        from_published(tmp_path / "published", copy, kept_steps=20)
+    else:
+        to_release(part, copy, kind)
+    found = load_icrl4aht(copy)
+    assert found[0].entry.teammate_of_episode == part[0].entry.teammate_of_episode
+    assert found.recover_teammate(0, 5) == part.recover_teammate(1, 5)
+    report = verify_release(copy, level="deep")
+    assert report.findings == [] and any(note.startswith("changes of teammates") for note in report.notes)
+
+
+def test_combinations_keep_the_changes(swapped, lite, tmp_path):
+    random_release(tmp_path / "other", layouts=("cramped_up",), streams=1)
+    combine_releases(tmp_path / "both", [swapped, tmp_path / "other"])
+    entries, before = load_icrl4aht(tmp_path / "both").entries, load_icrl4aht(swapped).entries
+    spans = [entry.teammate_of_episode for entry in entries]
+    assert spans == [*(entry.teammate_of_episode for entry in before), None, None]
+    lines = (tmp_path / "both" / HISTORIES).read_text().splitlines()
+    assert ["teammate_of_episode" in json.loads(line) for line in lines] == [True] * 4 + [False] * 2
+
+
+@pytest.mark.parametrize(
+    "spans", [[[1, "a"]], [[0, "a"], [0, "b"]], [[0, "a"], [4, "b"], [2, "a"]], [[0, "a"], [6, "b"]]]
+)
+def test_verification_of_the_episodes(swapped, tmp_path, spans):
+    copy = tmp_path / "copy"
+    to_release(load_icrl4aht(swapped).select([0]), copy, "lite")
+    line = json.loads((copy / HISTORIES).read_text())
+    (copy / HISTORIES).write_text(json.dumps(line | {"teammate_of_episode": spans}) + "\n")
+    write_manifest(copy)
+    problems = [one.problem for one in verify_release(copy).findings]
+    assert any("expected ascending episodes from 0 to 5 at most" in problem for problem in problems)
+    assert any("teammate_of_episode" in problem and "provenance" in problem for problem in problems)
+
+
+def test_a_malformed_teammate_is_refused():
+    teammate = {"kind": "heuristic", "family": "cook", "theta_id": 0, "base_seed": 0, "theta": {}}
+    with pytest.raises(IndexFormatError, match="unknown heuristic family 'cook'"):
+        Provenance.from_json({"swaps": {"every": 2, "teammates": [teammate, teammate]}})
+    with pytest.raises(IndexFormatError, match="length >= 2"):
+        Provenance.from_json({"swaps": {"every": 2, "teammates": [teammate]}})
+
+
+def test_show(swapped):
+    output = CliRunner().invoke(cli, ["show", str(swapped), "--history", "1", "--json"], catch_exceptions=False).output
+    entry = load_icrl4aht(swapped)[1].entry
+    assert json.loads(output)["teammate_of_episode"] == [list(pair) for pair in entry.teammate_of_episode or ()]
+
+
+def test_the_oracle_is_wanted_where_it_earns_what_the_end_earns():
+    references = ReferenceEgos(stay=0.0, random=0.0, oracle=20.0, episodes=100)
+    assert Provenance(references=references).wants_oracle(20.0)
+    assert not Provenance(references=references).wants_oracle(20.5)
+    assert Provenance().wants_oracle(1000.0)
