@@ -28,7 +28,7 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@
 
-demo: install ## load, sample, verify, train, evaluate on validation tasks and draw it (at most 10 minutes)
+demo: install ## load, sample, verify, train, show what a model earns by its memory (at most 7 minutes)
 	$(BIN)/icrl4aht-data demo
 
 generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|noise|search|small|mini|cpu|paper, OUT=folder, OPTIONS=...

@@ -35,15 +35,15 @@ from icrl4aht_data.utils.progress import progress_bars
 
 DEMO_LAYOUT = "asymm_both_plain"
 _SOURCE = "search"
-_EPISODES = 10  # of a window: it begins where a history begins, as an evaluation does
+_EPISODES = 5  # of a window, which begins where a history begins, as an evaluation does; later ones show nothing new
 
 _MODEL = ModelOptions(
     width=128, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05
 )
 _TRAINING = TrainOptions(
-    600, batch_size=32, context=_EPISODES * KEPT_STEPS, learning_rate=2e-3, validate_every=200, validation_batches=1
+    1500, batch_size=32, context=_EPISODES * KEPT_STEPS, learning_rate=2e-3, validate_every=500, validation_batches=1
 )
-_PROTOCOL = get_protocol("seeded", 20)
+_PROTOCOL = get_protocol("seeded", 10)
 
 _AGENTS = {"stay": "never moves", "search": "the script that the model imitates", "oracle": "is told the dish"}
 """Reference egos that the picture shows, and what they do."""
