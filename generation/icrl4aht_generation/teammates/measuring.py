@@ -21,6 +21,7 @@ from icrl4aht_generation.teammates.draws import (
     read_draws_table,
     write_draws_table,
 )
+from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES
 from icrl4aht_generation.teammates.references import reference_returns
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
@@ -143,7 +144,9 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: i
         candidates: entries of heuristic teammates.
         most: most teammates to choose.
     """
-    policies = [build_teammate(None, entry) for entry in candidates]
+    # All as mixtures, most with chance 0: a family's candidates share one compilation.
+    mixed = [entry | {"theta": {RANDOM_ACTIONS: 0.0} | entry["theta"]} for entry in candidates]
+    policies = [build_teammate(None, entry) for entry in mixed]
     common = common_states(layout, _SPREAD_EPISODES)
     actions = act_along(layout, policies, common.records)
     tests = distances_to_tests(common, actions)
