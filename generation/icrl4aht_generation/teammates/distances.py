@@ -9,7 +9,7 @@ are those of the layout that their models are tested on, acting on the training 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -79,35 +79,58 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
 
 
 @lru_cache(maxsize=2)
-def common_states(layout: Layout, episodes: int = _EPISODES) -> CommonStates:
+def common_states(layout: Layout) -> CommonStates:
     """Return the states of a layout on which teammates are compared.
+
+    Raises:
+        UnknownNameError: if the layout is not one of the benchmark.
+    """
+    records = common_records(layout)
+    return tested_states(records, act_along(layout, tested_policies(layout), records))
+
+
+def tested_states(records: Array, actions: np.ndarray) -> CommonStates:
+    """Return common states of records, and the actions on all of them of `tested_policies`, int8 (instances, T, N)."""
+    each = records.shape[1] // len(TESTED_FAMILIES)
+    # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
+    parts = [
+        actions[k * INSTANCES : (k + 1) * INSTANCES, :, k * each : (k + 1) * each] for k in range(len(TESTED_FAMILIES))
+    ]
+    names = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
+    return CommonStates(records, names, np.concatenate(parts))
+
+
+def tested_policies(layout: Layout, extra: Mapping[str, float] | None = None) -> list[Policy]:
+    """Return the test instances of the layout that models of a layout are tested on, by family and number.
 
     Args:
         layout: the layout.
-        episodes: episodes of each test instance with each of the two egos.
+        extra: further parameters of all of them.
+    """
+    tested = TESTED_ON.get(layout.name, layout.name)
+    return [
+        build_teammate(None, {"family": family, "theta": theta | (extra or {})})
+        for family in TESTED_FAMILIES
+        for theta in published_thetas(tested, family)
+    ]
+
+
+def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T N S"]:
+    """Return state records of episodes of the test instances, by family and instance.
+
+    Args:
+        layout: the layout.
+        episodes: episodes of each instance with each of the two egos.
 
     Raises:
         UnknownNameError: if the layout is not one of the benchmark.
     """
     if layout.name not in LAYOUT_NAMES:
         raise unknown("layout", layout.name, LAYOUT_NAMES)
-    tested = TESTED_ON.get(layout.name, layout.name)
-    tests = [
-        [build_teammate(None, {"family": family, "theta": theta}) for theta in published_thetas(tested, family)]
-        for family in TESTED_FAMILIES
-    ]
-    each = INSTANCES * 2 * episodes
-    families = [next(stacked_families(policies))[1] for policies in tests]
+    families = [family for _, family in stacked_families(tested_policies(layout))]
     tables, expert, positions = padded_layout(layout)
     play = _play_tests(tuple(family._replace(params=()) for family in families), episodes)
-    params = [family.params for family in families]
-    records = play(tables, expert, params, jax.random.key(_SEED))[..., positions]
-    # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
-    actions = np.concatenate(
-        [act_along(layout, own, records)[:, :, k * each : (k + 1) * each] for k, own in enumerate(tests)]
-    )
-    names = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
-    return CommonStates(records, names, actions)
+    return play(tables, expert, [family.params for family in families], jax.random.key(_SEED))[..., positions]
 
 
 @lru_cache(maxsize=2)

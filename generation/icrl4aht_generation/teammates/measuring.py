@@ -12,7 +12,15 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_generation.teammates.distances import act_along, common_states, distances_to_tests, group_behaviours
+from icrl4aht_generation.teammates.distances import (
+    act_along,
+    common_records,
+    common_states,
+    distances_to_tests,
+    group_behaviours,
+    tested_policies,
+    tested_states,
+)
 from icrl4aht_generation.teammates.draws import (
     DIVERSE_DISTANCE,
     DRAWS_PER_SEED,
@@ -144,11 +152,12 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: i
         candidates: entries of heuristic teammates.
         most: most teammates to choose.
     """
-    # All as mixtures, most with chance 0: a family's candidates share one compilation.
-    mixed = [entry | {"theta": {RANDOM_ACTIONS: 0.0} | entry["theta"]} for entry in candidates]
-    policies = [build_teammate(None, entry) for entry in mixed]
-    common = common_states(layout, _SPREAD_EPISODES)
-    actions = act_along(layout, policies, common.records)
+    # All as mixtures, most with chance 0, and with the test instances: so there is one compilation for each family.
+    plain = {RANDOM_ACTIONS: 0.0}
+    policies = [build_teammate(None, entry | {"theta": plain | entry["theta"]}) for entry in candidates]
+    tested, records = tested_policies(layout, plain), common_records(layout, _SPREAD_EPISODES)
+    actions = act_along(layout, [*tested, *policies], records)
+    common, actions = tested_states(records, actions[: len(tested)]), actions[len(tested) :]
     tests = distances_to_tests(common, actions)
     egos = reference_returns(layout, policies)  # with all of them, so that layouts share one compilation
     returns = np.stack([egos[ego] for ego in ("stay", "random", "oracle")], axis=1)

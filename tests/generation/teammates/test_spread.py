@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from icrl4aht_generation.policy import Situation
 from icrl4aht_generation.teammates import spread as module
-from icrl4aht_generation.teammates.distances import act_along, common_states, distances_to_tests
+from icrl4aht_generation.teammates.distances import (
+    act_along,
+    common_records,
+    distances_to_tests,
+    tested_policies,
+    tested_states,
+)
 from icrl4aht_generation.teammates.draws import DIVERSE_DISTANCE, find_draw
 from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS, Heuristic, Sampling
 from icrl4aht_generation.teammates.preference import WATCHER
@@ -148,8 +154,9 @@ def test_two_of_the_list_are_measured_again():
     spread = read_spread(layout.name)
     family = "assembly_line"
     chosen = [mate for mate in spread.chosen if mate.family == family and RANDOM_ACTIONS not in mate.theta][:2]
-    common = common_states(layout, 4)
-    actions = act_along(layout, [build_teammate(None, mate.entry) for mate in chosen], common.records)
+    records = common_records(layout, 4)
+    common = tested_states(records, act_along(layout, tested_policies(layout), records))
+    actions = act_along(layout, [build_teammate(None, mate.entry) for mate in chosen], records)
     assert (actions[0] != actions[1]).mean() >= DIVERSE_DISTANCE
     for mate, distances in zip(chosen, distances_to_tests(common, actions), strict=True):
         assert distances[common.instances.index(mate.nearest)] == pytest.approx(mate.distance, abs=1e-4)
