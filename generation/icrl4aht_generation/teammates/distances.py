@@ -86,11 +86,11 @@ def common_states(layout: Layout) -> CommonStates:
         UnknownNameError: if the layout is not one of the benchmark.
     """
     records = common_records(layout)
-    return tested_states(records, act_along(layout, tested_policies(layout), records))
+    return join_states(records, act_along(layout, instance_policies(layout), records))
 
 
-def tested_states(records: Array, actions: np.ndarray) -> CommonStates:
-    """Return common states of records, and the actions on all of them of `tested_policies`, int8 (instances, T, N)."""
+def join_states(records: Array, actions: np.ndarray) -> CommonStates:
+    """Return common states of records, and the actions on all of them of `instance_policies`, int8 (instances, T, N)."""
     each = records.shape[1] // len(TESTED_FAMILIES)
     # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
     parts = [
@@ -100,7 +100,7 @@ def tested_states(records: Array, actions: np.ndarray) -> CommonStates:
     return CommonStates(records, names, np.concatenate(parts))
 
 
-def tested_policies(layout: Layout, extra: Mapping[str, float] | None = None) -> list[Policy]:
+def instance_policies(layout: Layout, extra: Mapping[str, float] | None = None) -> list[Policy]:
     """Return the test instances of the layout that models of a layout are tested on, by family and number.
 
     Args:
@@ -127,7 +127,7 @@ def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T
     """
     if layout.name not in LAYOUT_NAMES:
         raise unknown("layout", layout.name, LAYOUT_NAMES)
-    families = [family for _, family in stacked_families(tested_policies(layout))]
+    families = [family for _, family in stacked_families(instance_policies(layout))]
     tables, expert, positions = padded_layout(layout)
     play = _play_tests(tuple(family._replace(params=()) for family in families), episodes)
     return play(tables, expert, [family.params for family in families], jax.random.key(_SEED))[..., positions]

@@ -18,8 +18,8 @@ from icrl4aht_generation.teammates.distances import (
     common_states,
     distances_to_tests,
     group_behaviours,
-    tested_policies,
-    tested_states,
+    instance_policies,
+    join_states,
 )
 from icrl4aht_generation.teammates.draws import (
     DIVERSE_DISTANCE,
@@ -155,9 +155,9 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: i
     # All as mixtures, most with chance 0, and with the test instances: so there is one compilation for each family.
     plain = {RANDOM_ACTIONS: 0.0}
     policies = [build_teammate(None, entry | {"theta": plain | entry["theta"]}) for entry in candidates]
-    tested, records = tested_policies(layout, plain), common_records(layout, _SPREAD_EPISODES)
+    tested, records = instance_policies(layout, plain), common_records(layout, _SPREAD_EPISODES)
     actions = act_along(layout, [*tested, *policies], records)
-    common, actions = tested_states(records, actions[: len(tested)]), actions[len(tested) :]
+    common, actions = join_states(records, actions[: len(tested)]), actions[len(tested) :]
     tests = distances_to_tests(common, actions)
     egos = reference_returns(layout, policies)  # with all of them, so that layouts share one compilation
     returns = np.stack([egos[ego] for ego in ("stay", "random", "oracle")], axis=1)

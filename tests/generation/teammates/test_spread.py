@@ -12,8 +12,8 @@ from icrl4aht_generation.teammates.distances import (
     act_along,
     common_records,
     distances_to_tests,
-    tested_policies,
-    tested_states,
+    instance_policies,
+    join_states,
 )
 from icrl4aht_generation.teammates.draws import DIVERSE_DISTANCE, find_draw
 from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS, Heuristic, Sampling
@@ -155,7 +155,7 @@ def test_two_of_the_list_are_measured_again():
     family = "assembly_line"
     chosen = [mate for mate in spread.chosen if mate.family == family and RANDOM_ACTIONS not in mate.theta][:2]
     records = common_records(layout, 4)
-    common = tested_states(records, act_along(layout, tested_policies(layout), records))
+    common = join_states(records, act_along(layout, instance_policies(layout), records))
     actions = act_along(layout, [build_teammate(None, mate.entry) for mate in chosen], records)
     assert (actions[0] != actions[1]).mean() >= DIVERSE_DISTANCE
     for mate, distances in zip(chosen, distances_to_tests(common, actions), strict=True):
