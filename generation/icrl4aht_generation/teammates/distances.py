@@ -90,7 +90,7 @@ def common_states(layout: Layout) -> CommonStates:
 
 
 def join_states(records: Array, actions: np.ndarray) -> CommonStates:
-    """Return common states of records, and the actions on all of them of `instance_policies`, int8 (instances, T, N)."""
+    """Return common states: records, and the actions of `instance_policies` on them, int8 (instances, T, N)."""
     each = records.shape[1] // len(TESTED_FAMILIES)
     # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
     parts = [
@@ -109,7 +109,7 @@ def instance_policies(layout: Layout, extra: Mapping[str, float] | None = None) 
     """
     tested = TESTED_ON.get(layout.name, layout.name)
     return [
-        build_teammate(None, {"family": family, "theta": theta | (extra or {})})
+        build_teammate(None, {"family": family, "theta": theta | dict(extra or {})})
         for family in TESTED_FAMILIES
         for theta in published_thetas(tested, family)
     ]

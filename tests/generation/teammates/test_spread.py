@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_generation.policy import Situation
+from icrl4aht_generation.policy import Noise, Situation
 from icrl4aht_generation.teammates import spread as module
 from icrl4aht_generation.teammates.distances import (
     act_along,
@@ -173,7 +173,7 @@ def always_interact(params, memory, scene):
 SIMPLE = Heuristic("simple", lambda key: (), always_interact, {"a": 0.5}, {}, Sampling((), {}), Sampling((), {}), {})
 
 
-def acted(theta: dict[str, float], noise="seeded", seed: int = 0, steps: int = 600) -> np.ndarray:
+def acted(theta: dict[str, float], noise: Noise = "seeded", seed: int = 0, steps: int = 600) -> np.ndarray:
     """Return the actions of the simple heuristic in one episode."""
     policy = SIMPLE.build(None, theta, noise=noise)
     layout = get_layout("cramped_up")
