@@ -226,7 +226,8 @@ def find_measured(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
 
 @lru_cache(maxsize=1)
 def _bundled_spreads() -> dict[str, LayoutSpread]:
-    return {spread.layout: spread for spread in read_spread_table(SPREAD_TABLE)}
+    table = read_spread_table(SPREAD_TABLE) if SPREAD_TABLE.is_file() else []
+    return {spread.layout: spread for spread in table}
 
 
 def read_spread_table(path: Path) -> list[LayoutSpread]:
