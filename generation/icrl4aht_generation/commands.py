@@ -312,24 +312,36 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
     help="Write the table here.",
     show_default="the package's file",
 )
+@click.option("--spread", is_flag=True, help="Choose the teammates that differ most instead, and print their numbers.")
 @click.option("--overwrite", is_flag=True, help="Measure again what the table has.")
-def draws(layouts: tuple[str, ...], out: Path | None, overwrite: bool) -> None:
+def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: bool) -> None:
     """Measure the heuristic teammates that tasks may draw.
 
     Draws parameters from the training ranges and diverse ones, of each 32 for training and 8 for validation of each
     family on each layout. Writes for each draw which test instance acts most like it, and what the egos stay, random
-    and oracle earn with it. Layouts that the table has are kept, so that a stopped command resumes.
+    and oracle earn with it. With --spread, chooses widely different teammates for the profiles' tasks.spread. Layouts
+    that the table has are kept, so that a stopped command resumes.
     """
     from icrl4aht_generation.teammates.draws import DRAWS_TABLE
-    from icrl4aht_generation.teammates.measuring import fill_draws_table
+    from icrl4aht_generation.teammates.measuring import fill_draws_table, fill_spread_table
+    from icrl4aht_generation.teammates.spread import SPREAD_TABLE, read_spread_table, spread_rows
 
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or list(TESTED_ON)
     for name in names:
         if name not in TESTED_ON:
             raise unknown("training layout", name, TESTED_ON)
-    path = out or DRAWS_TABLE
+    path = out or (SPREAD_TABLE if spread else DRAWS_TABLE)
     with progress_bars(unit="layouts") as show:
-        fill_draws_table(path, names, lambda done, name: show("draws", done, len(names), name), overwrite)
+        fill = fill_spread_table if spread else fill_draws_table
+        fill(path, names, lambda done, name: show("draws", done, len(names), name), overwrite)
+    if spread:
+        rows = spread_rows(read_spread_table(path))
+        from rich.table import Table
+
+        table = Table(*(name.replace("_", " ") for name in rows[0]))
+        for row in rows:
+            table.add_row(*(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
+        console.print(table)
     console.print(f"wrote {path}")
 
 

@@ -11,7 +11,10 @@ import pytest
 from icrl4aht_generation.collection.task_folder import artefact_settings
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.profiles import FOLDER, Profile, load_profile, profile_names
+from icrl4aht_generation.profiles import profile as profile_module
+from icrl4aht_generation.teammates import spread as spread_module
 from icrl4aht_generation.teammates.registry import heuristic_teammate
+from icrl4aht_generation.teammates.spread import LayoutSpread, SpreadTeammate, spread_teammates
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, PREFERENCE_LAYOUTS, SCRIPTED_SOURCES, TRACKS
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, task_fields, task_id, write_tasks
@@ -180,6 +183,67 @@ def test_sampled_teammates_of_both_sources(changed):
     ]
 
 
+@pytest.fixture
+def listed(monkeypatch) -> None:
+    """Lists of teammates on the two layouts, in place of the shipped ones: four for training, one for validation."""
+
+    def spread(layout: str) -> LayoutSpread:
+        chosen = tuple(
+            SpreadTeammate(split, "utility_greedy", k, {"w": k / 2}, "H4/t0", 0.5, "H1/t2", 0.4, 0.25, 0.0, 1.0, 30.0)
+            for k, split in enumerate(["train"] * 4 + ["validation"])
+        )
+        return LayoutSpread(layout, 9, 6, 5, chosen)
+
+    monkeypatch.setattr(
+        spread_module, "_bundled_spreads", lambda: {k: spread(k) for k in ("coord_simple", "cramped_up")}
+    )
+
+
+def spread_profile(changed, more: str, spread: str = "per_layout = 2\nppo = 1\nvalidation = 1") -> Profile:
+    return load_profile(changed(PRESETS, f'sources = ["ppo", "noise"]\n{more}\n[tasks.spread]\n{spread}'))
+
+
+def test_spread_teammates_of_both_sources(changed, listed):
+    works = spread_profile(changed, "").works()
+    for layout in ("coord_simple", "cramped_up"):
+        own = [work for work in works if work.task.layout.name == layout]
+        train, validation = (spread_teammates(layout, split, n) for split, n in (("train", 2), ("validation", 1)))
+        assert [(work.source, work.task.split) for work in own] == [
+            ("ppo", "train"),
+            *[("noise", "train")] * 2,
+            ("noise", "validation"),
+        ]
+        assert [work.task.teammate for work in own] == [train[0], *train, *validation]
+    sampled = load_profile("noise").works() + load_profile("small").works()
+    seeds = [work.task.seed for work in works + load_profile("mini").works()]
+    assert len({*seeds}) == len(seeds)
+    assert not {*seeds[: len(works)]} & {work.task.seed for work in sampled}
+
+
+def test_sampled_and_spread_teammates_on_other_layouts(changed, listed):
+    sampled = f"sampled = {{ {H3}, per_layout = {{ coord_simple = 1 }} }}"
+    profile = spread_profile(changed, sampled, "per_layout = { cramped_up = 2 }")
+    assert [profile.tasks_on(layout, "noise") for layout in profile.layouts] == [1, 2]
+    with pytest.raises(OptionError, match=r"coord_simple: 1 teammates of tasks.sampled and 3 of tasks.spread"):
+        spread_profile(changed, sampled)
+
+
+def test_more_spread_teammates_than_the_list_has(changed, listed):
+    with pytest.raises(OptionError, match=r"mine.toml: coord_simple: 5 train teammates requested of .* which has 4"):
+        spread_profile(changed, "", "per_layout = 5")
+    with pytest.raises(OptionError, match=r"2 validation teammates requested of .* which has 1"):
+        spread_profile(changed, "", "per_layout = 4\nvalidation = 2")
+
+
+def test_no_validation_teammate_trains(changed, monkeypatch):
+    entry = heuristic_teammate("utility_greedy", "high_inertia", 3)
+    monkeypatch.setattr(profile_module, "spread_teammates", lambda layout, split, count: [entry] * count)
+    counts = "per_layout = 0\nvalidation = { coord_simple = 1 }"
+    spread_profile(changed, 'presets = ["default"]', counts)
+    with pytest.raises(OptionError, match=r"1 of the validation tasks have a teammate that also trains, such as team"):
+        spread_profile(changed, PRESETS, counts)
+
+
 def test_presets_of_both_sources(changed):
     works = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\npresets =')).works()
     assert [(work.source, work.task.seed) for work in works] == [
@@ -258,6 +322,8 @@ H3 = 'families = ["assembly_line"]'
         ("presets =", f"sampled = {{ {H3}, per_layout = 2, ppo = 3 }}\npresets =", "ppo"),
         ("presets =", f"sampled = {{ {H3}, per_layout = 999 }}\npresets =", "999 drawn training teammates"),
         ("presets =", f"sampled = {{ {H3} }}\npresets =", "per_layout"),
+        ("presets =", "spread = { per_layout = 1, ppo = 2 }\npresets =", r"tasks\.spread\.ppo = 2"),
+        ("presets =", f"spread = {{ {H3}, per_layout = 1 }}\npresets =", "families"),
         ("presets =", f"sampled = {{ {H3}, per_layout = 1, validation = 1 }}\npresets =", "validation"),
         ("total_steps = 32000", "total_steps = 13500", "total_steps"),
         ("[ego]", "[ego", r"Expected '\]' at the end of a table declaration \(at line 2"),

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts, with_four_recipes
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.teammates.draws import find_draw
 from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate
+from icrl4aht_generation.teammates.spread import find_measured
 
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
@@ -262,7 +262,7 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     """
     matters: dict[str, bool] = {}
     for task in tasks:
-        draw = find_draw(task.layout.name, task.teammate)
+        draw = find_measured(task.layout.name, task.teammate)
         own = draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
         matters[task.layout.name] = matters.get(task.layout.name, False) or own
     if dataset is not None:

@@ -20,8 +20,8 @@ from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.resume import METRICS, TIMING, differing_settings, last_line, run_lock
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.distances import act_along, common_states, group_behaviours
-from icrl4aht_generation.teammates.draws import find_draw
 from icrl4aht_generation.teammates.registry import build_teammate
+from icrl4aht_generation.teammates.spread import find_measured
 from msgspec import structs, to_builtins
 
 from icrl4aht_baselines.agents.bundled import bundled_models
@@ -124,7 +124,7 @@ def with_headroom(tasks: Iterable[Task]) -> list[Task]:
             cell = cells.get((task.layout.name, task.teammate_family))
             matters = cell is None or has_headroom(cell)
         else:
-            draw = find_draw(task.layout.name, task.teammate) if task.layout.name in TESTED_ON else None
+            draw = find_measured(task.layout.name, task.teammate) if task.layout.name in TESTED_ON else None
             matters = draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
         kept += [task] if matters else []
     return kept

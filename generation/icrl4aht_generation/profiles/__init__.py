@@ -11,6 +11,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, PREFERENCE_LAYOUTS, REBUILT_SOURCES
+from icrl4aht_data.benchmark.tasks import teammate_id
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import add_layouts, get_layout
@@ -18,7 +19,8 @@ from icrl4aht_data.utils.options import Count, Natural, replace_options
 from icrl4aht_generation.layouts.families import generate_layouts
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
-from icrl4aht_generation.profiles.profile import Profile, SampledConfig, TeammateConfig
+from icrl4aht_generation.profiles.profile import Profile, SampledConfig, SpreadConfig, TeammateConfig
+from icrl4aht_generation.profiles.work import Work
 
 FOLDER = Path(__file__).parent
 
@@ -38,13 +40,18 @@ class _Release(Struct, forbid_unknown_fields=True):
     least_rise: _Return | None = None
 
 
-class _Sampled(Struct, forbid_unknown_fields=True):
-    """Section [tasks.sampled], where every value holds for all layouts or is a table of them."""
+class _Spread(Struct, forbid_unknown_fields=True, kw_only=True):
+    """Section [tasks.spread], where every value holds for all layouts or is a table of them."""
 
-    families: _Names | dict[str, _Names]
     per_layout: Natural | dict[str, Natural]
     ppo: Natural | dict[str, Natural] | None = None
     validation: Natural | dict[str, Natural] = 0
+
+
+class _Sampled(_Spread, kw_only=True):
+    """Section [tasks.sampled]."""
+
+    families: _Names | dict[str, _Names]
 
 
 class _Generated(Struct, forbid_unknown_fields=True):
@@ -66,6 +73,7 @@ class _Tasks(Struct, forbid_unknown_fields=True):
     learners: Count = 1
     presets: _Names = ()
     sampled: _Sampled | None = None
+    spread: _Spread | None = None
     algorithms: _Names | dict[str, _Names] = ()
     preference: _Names = ()
 
@@ -107,7 +115,10 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     with _named_errors(path):
         works = profile.works()  # raises for unknown presets, and for more sampled teammates than there are
         if not works and not profile.algorithms:
-            raise OptionError("no tasks: expected teammates in tasks.presets, tasks.sampled or tasks.algorithms")
+            raise OptionError(
+                "no tasks: expected teammates in tasks.presets, tasks.sampled, tasks.spread or tasks.algorithms"
+            )
+        _check_splits(works, profile.sampled, profile.spread)
     return profile
 
 
@@ -164,6 +175,7 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         learners=tasks.learners,
         presets=_distinct("tasks.presets", tasks.presets),
         sampled=_sampled(tasks.sampled, layouts, sources) if tasks.sampled else None,
+        spread=SpreadConfig(**_counts("tasks.spread", tasks.spread, layouts, sources)) if tasks.spread else None,
         algorithms={each: tuple(algorithms[each]) for each in layouts if algorithms.get(each)},
         policies=release.policies,
         oracle_actions=release.oracle_actions,
@@ -184,24 +196,60 @@ def _scripted(
 
 
 def _sampled(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
-    given = {"families": values.families, "per_layout": values.per_layout, "validation": values.validation}
-    given["ppo"] = values.per_layout if values.ppo is None else values.ppo
-    tables: dict[str, Any] = {key: _by_layout(f"tasks.sampled.{key}", value, layouts) for key, value in given.items()}
-    chosen = tables.pop("families")
+    counts = _counts("tasks.sampled", values, layouts, sources)
+    chosen: dict[str, Any] = _by_layout("tasks.sampled.families", values.families, layouts)
     families = {name: _distinct("tasks.sampled.families", chosen.get(name, ())) for name in layouts}
-    counts = {key: {name: table.get(name, 0) for name in layouts} for key, table in tables.items()}
     for name in layouts:
         _known("family", "tasks.sampled.families", families[name], HEURISTIC_KINDS)
         if (counts["per_layout"][name] or counts["validation"][name]) and not families[name]:
             raise OptionError(f"tasks.sampled.families: none for {name}, which has teammates in tasks.sampled")
+    return SampledConfig(**counts, families=families)
+
+
+def _counts(
+    section: str, values: _Spread, layouts: tuple[str, ...], sources: tuple[str, ...]
+) -> dict[str, dict[str, int]]:
+    """Return the numbers of drawn teammates: field of `DrawnConfig` -> layout -> number."""
+    given = {"per_layout": values.per_layout, "validation": values.validation}
+    given["ppo"] = values.per_layout if values.ppo is None else values.ppo
+    tables: dict[str, Any] = {key: _by_layout(f"{section}.{key}", value, layouts) for key, value in given.items()}
+    counts = {key: {name: table.get(name, 0) for name in layouts} for key, table in tables.items()}
+    for name in layouts:
         if counts["ppo"][name] > counts["per_layout"][name]:
             raise OptionError(
-                f"tasks.sampled.ppo = {counts['ppo'][name]} on {name}: expected at most per_layout = "
+                f"{section}.ppo = {counts['ppo'][name]} on {name}: expected at most per_layout = "
                 f"{counts['per_layout'][name]}"
             )
     if any(counts["validation"].values()) and "noise" not in sources:
-        raise OptionError("tasks.sampled.validation: validation teammates need 'noise' among tasks.sources")
-    return SampledConfig(families, **counts)
+        raise OptionError(f"{section}.validation: validation teammates need 'noise' among tasks.sources")
+    return counts
+
+
+def _check_splits(works: Sequence[Work], sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
+    """Check that no teammate of a layout is in the splits of training and of validation.
+
+    Raises:
+        OptionError: if one is, or if a layout has teammates of both tables, which were not compared.
+    """
+    for name in spread.per_layout if spread and sampled else ():
+        both = [config.per_layout[name] + config.validation[name] for config in (sampled, spread) if config]
+        if all(both):
+            raise OptionError(
+                f"{name}: {both[0]} teammates of tasks.sampled and {both[1]} of tasks.spread, whose validation "
+                f"behaviours may train in the other; expected one of them for a layout"
+            )
+    trained = {_behaviour(work) for work in works if work.task.split == "train"}
+    shared = {work.task.task_id for work in works if work.task.split == "validation" and _behaviour(work) in trained}
+    if shared:
+        raise OptionError(
+            f"{len(shared)} of the validation tasks have a teammate that also trains, such as {min(shared)}: leave it "
+            f"out of tasks.presets, or request fewer validation teammates"
+        )
+
+
+def _behaviour(work: Work) -> tuple[Any, ...]:
+    """Return what is equal for works with one teammate on one layout with one dish."""
+    return work.task.layout.name, work.task.recipes, teammate_id(work.task.teammate)
 
 
 def _teammates(values: dict[str, Any]) -> TeammateConfig:

@@ -28,6 +28,7 @@ from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.draws import drawn_teammates
 from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
+from icrl4aht_generation.teammates.spread import SPREAD_SEED, spread_teammates
 
 LEAST_EPISODES = 5
 """Episodes of a stream: its start and its end are means over five."""
@@ -36,6 +37,7 @@ VALIDATION_DRAWS = 1
 """The base seed of validation teammates; training teammates are drawn with 0, so that no draw is in both splits."""
 
 _SOURCE_SEEDS, _LAYOUT_SEEDS, _FAMILY_SEEDS, _DRAW_SEEDS = 1_000_000, 10_000, 1_000, 500
+_SPREAD_SEEDS = 250_000
 _UNSAMPLED_SEEDS = 500_000  # tasks with presets and learned teammates come behind those with drawn ones
 _GENERATED_SEEDS, _LAYOUT_TEAMMATES = 700_000, 16
 
@@ -68,17 +70,15 @@ class TeammateConfig:
 
 
 @dataclass(frozen=True)
-class SampledConfig:
-    """Heuristic teammates drawn from the published train ranges, see `teammates.draws`.
+class DrawnConfig:
+    """Numbers of heuristic teammates that were drawn and measured beforehand; base of two ways to choose them.
 
     Attributes:
-        families: layout -> families, which take turns.
         per_layout: layout -> number of training teammates, which the source "noise" has all of.
         ppo: layout -> how many of these, the first ones, learners of the source "ppo" play with.
         validation: layout -> number of validation teammates, which only the source "noise" has.
     """
 
-    families: dict[str, tuple[str, ...]]
     per_layout: dict[str, int]
     ppo: dict[str, int]
     validation: dict[str, int]
@@ -87,15 +87,42 @@ class SampledConfig:
         """Return the teammates of a source on a layout, and the splits of their tasks.
 
         Raises:
-            OptionError: if there are fewer draws that differ from the test instances.
+            OptionError: if fewer were measured that differ from the test instances.
         """
-        families, count = self.families[layout], self.ppo[layout] if source == "ppo" else None
-        drawn = drawn_teammates(layout, families, self.per_layout[layout])[:count]
-        found = [("train", entry) for entry, _ in drawn]
-        if source == "noise":
-            drawn = drawn_teammates(layout, families, self.validation[layout], VALIDATION_DRAWS)
-            found += [("validation", entry) for entry, _ in drawn]
-        return found
+        count = self.ppo[layout] if source == "ppo" else None
+        found = [("train", entry) for entry in self._entries(layout, "train")[:count]]
+        return found + [("validation", entry) for entry in self._entries(layout, "validation") if source == "noise"]
+
+    def _entries(self, layout: str, split: str) -> list[dict[str, Any]]:
+        """Return the entries of all teammates of a split on a layout."""
+        raise NotImplementedError
+
+    def _count(self, layout: str, split: str) -> int:
+        return (self.validation if split == "validation" else self.per_layout)[layout]
+
+
+@dataclass(frozen=True)
+class SampledConfig(DrawnConfig):
+    """Heuristic teammates drawn from the published train ranges, see `teammates.draws`.
+
+    Attributes:
+        families: layout -> families, which take turns.
+    """
+
+    families: dict[str, tuple[str, ...]]
+
+    def _entries(self, layout: str, split: str) -> list[dict[str, Any]]:
+        seed = VALIDATION_DRAWS if split == "validation" else 0
+        drawn = drawn_teammates(layout, self.families[layout], self._count(layout, split), seed)
+        return [entry for entry, _ in drawn]
+
+
+@dataclass(frozen=True)
+class SpreadConfig(DrawnConfig):
+    """Heuristic teammates that differ widely, see `teammates.spread`."""
+
+    def _entries(self, layout: str, split: str) -> list[dict[str, Any]]:
+        return spread_teammates(layout, split, self._count(layout, split))
 
 
 @dataclass(frozen=True)
@@ -113,6 +140,7 @@ class Profile:
         learners: independent learners of each task of the source "ppo".
         presets: teammates by the heuristic H4 `utility_greedy`, on every layout and of every source.
         sampled: teammates by heuristics with sampled parameters.
+        spread: teammates by heuristics that differ widely, on layouts without sampled ones.
         algorithms: layout -> algorithms of its learned teammates.
         ego_layouts: layout -> hyper-parameters of its egos, where they differ from `ego`.
         noise: histories of the source "noise".
@@ -142,6 +170,7 @@ class Profile:
     learners: int = 1
     presets: tuple[str, ...] = ()
     sampled: SampledConfig | None = None
+    spread: SpreadConfig | None = None
     algorithms: dict[str, tuple[str, ...]] = field(default_factory=dict)
     ego_layouts: dict[str, PPOConfig] = field(default_factory=dict)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -258,9 +287,7 @@ class Profile:
                 make_task(track, split, layout, entry, first + number)
                 for number, entry in enumerate(_drawn_for(layout, split, self.generated))
             ]
-        if self.sampled is None:
-            return tasks
-        entries = self.sampled.drawn(layout, source)
+        entries = [drawn for config in (self.sampled, self.spread) if config for drawn in config.drawn(layout, source)]
         return tasks + [
             make_task(track, split, layout, entry, _sampled_seed(layout, source, entry)) for split, entry in entries
         ]
@@ -288,7 +315,8 @@ def _drawn_for(layout: str, split: str, generated: Mapping[str, int]) -> list[di
 def _sampled_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:
     """Return a seed that no other task has, and that does not depend on the rest of the profile."""
     family = list(HEURISTIC_KINDS).index(entry["family"])
-    first = LAYOUT_NAMES.index(layout) * _LAYOUT_SEEDS + family * _FAMILY_SEEDS + entry["base_seed"] * _DRAW_SEEDS
+    first = LAYOUT_NAMES.index(layout) * _LAYOUT_SEEDS + family * _FAMILY_SEEDS
+    first += _SPREAD_SEEDS if entry["base_seed"] == SPREAD_SEED else entry["base_seed"] * _DRAW_SEEDS
     return _first_seed(source) + first + entry["theta_id"]
 
 

@@ -22,9 +22,10 @@ from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.populations.headroom import learned_headroom
 from icrl4aht_generation.releases.remembered import measured_once
 from icrl4aht_generation.teammates.distances import nearest_test
-from icrl4aht_generation.teammates.draws import Draw, find_draw, hosted_families, read_draws
+from icrl4aht_generation.teammates.draws import Draw, hosted_families, read_draws
 from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_returns
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
+from icrl4aht_generation.teammates.spread import find_measured
 
 _DIGITS = 4
 
@@ -67,7 +68,7 @@ def teammate_facts(
         groups.setdefault(task.teammate_key, []).append(task)
     found: dict[tuple[str, str], TeammateFacts] = {}
     for key, members in groups.items():
-        draw, made = find_draw(key[0], members[0].teammate), recorded.get(members[0].task_id)
+        draw, made = find_measured(key[0], members[0].teammate), recorded.get(members[0].task_id)
         if draw is not None:
             near = NearestTest(draw.nearest, draw.distance, draw.behaviour)
             if draw.other_distance < draw.distance:

@@ -9,9 +9,9 @@ are those of the layout that their models are tested on, acting on the training 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,10 +24,13 @@ from icrl4aht_data.format.provenance import NearestTest
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_generation.env import Environment
-from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
+from icrl4aht_generation.experts.padded import padded_layout
 from icrl4aht_generation.learners.rollout import init_rollout, roll_out
-from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.policy import Policy, Situation
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_thetas
 from icrl4aht_generation.teammates.references import REFERENCE_EGOS, player_in_some, stacked_families
 from icrl4aht_generation.teammates.registry import build_teammate
@@ -82,39 +85,76 @@ def common_states(layout: Layout) -> CommonStates:
     Raises:
         UnknownNameError: if the layout is not one of the benchmark.
     """
+    records = common_records(layout)
+    return join_states(records, act_along(layout, instance_policies(layout), records))
+
+
+def join_states(records: Array, actions: np.ndarray) -> CommonStates:
+    """Return common states: records, and the actions of `instance_policies` on them, int8 (instances, T, N)."""
+    each = records.shape[1] // len(TESTED_FAMILIES)
+    # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
+    parts = [
+        actions[k * INSTANCES : (k + 1) * INSTANCES, :, k * each : (k + 1) * each] for k in range(len(TESTED_FAMILIES))
+    ]
+    names = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
+    return CommonStates(records, names, np.concatenate(parts))
+
+
+def instance_policies(layout: Layout, extra: Mapping[str, float] | None = None) -> list[Policy]:
+    """Return the test instances of the layout that models of a layout are tested on, by family and number.
+
+    Args:
+        layout: the layout.
+        extra: further parameters of all of them.
+    """
+    tested = TESTED_ON.get(layout.name, layout.name)
+    return [
+        build_teammate(None, {"family": family, "theta": theta | dict(extra or {})})
+        for family in TESTED_FAMILIES
+        for theta in published_thetas(tested, family)
+    ]
+
+
+def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T N S"]:
+    """Return state records of episodes of the test instances, by family and instance.
+
+    Args:
+        layout: the layout.
+        episodes: episodes of each instance with each of the two egos.
+
+    Raises:
+        UnknownNameError: if the layout is not one of the benchmark.
+    """
     if layout.name not in LAYOUT_NAMES:
         raise unknown("layout", layout.name, LAYOUT_NAMES)
-    env = Environment(layout, KEPT_STEPS)
-    tested = TESTED_ON.get(layout.name, layout.name)
-    tests = [
-        [build_teammate(layout, {"family": family, "theta": theta}) for theta in published_thetas(tested, family)]
-        for family in TESTED_FAMILIES
-    ]
-    each = INSTANCES * 2 * _EPISODES
-    total = len(tests) * each
-    with_oracle = np.arange(total) // _EPISODES % 2 == 1
-    families = [next(stacked_families(policies))[1] for policies in tests]
+    families = [family for _, family in stacked_families(instance_policies(layout))]
+    tables, expert, positions = padded_layout(layout)
+    play = _play_tests(tuple(family._replace(params=()) for family in families), episodes)
+    return play(tables, expert, [family.params for family in families], jax.random.key(_SEED))[..., positions]
+
+
+@lru_cache(maxsize=2)
+def _play_tests(families: tuple[Policy, ...], episodes: int) -> Callable[..., Array]:
+    """Return a compiled function of tables, the oracle's and the test instances' parameters and a key, to records."""
+    each = INSTANCES * 2 * episodes
+    total = len(families) * each
+    with_oracle = np.arange(total) // episodes % 2 == 1
 
     @jax.jit
-    def play(own, key):
+    def play(tables: Tables, expert: Any, params: Sequence[Any], key: Key[Array, ""]) -> Array:
+        env = Environment(tables, KEPT_STEPS)
         players = [
             player_in_some(env, REFERENCE_EGOS["random"], (), EGO, np.flatnonzero(~with_oracle), total),
-            player_in_some(env, oracle(layout), (), EGO, np.flatnonzero(with_oracle), total),
+            player_in_some(env, SITUATION_ORACLE, expert, EGO, np.flatnonzero(with_oracle), total),
         ]
-        for k, (family, params) in enumerate(zip(families, own, strict=True)):
+        for k, (family, own) in enumerate(zip(families, params, strict=True)):
             envs = np.arange(k * each, (k + 1) * each)
-            repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2 * _EPISODES, axis=0), params)
+            repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2 * episodes, axis=0), own)
             players.append(player_in_some(env, family, repeated, TEAMMATE, envs, total, own_params=True))
         carry = init_rollout(env, players, jax.random.split(key, total))
         return roll_out(env, players, carry, env.max_steps, key)[1].record
 
-    records = play([family.params for family in families], jax.random.key(_SEED))
-    # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
-    actions = np.concatenate(
-        [act_along(layout, own, records)[:, :, k * each : (k + 1) * each] for k, own in enumerate(tests)]
-    )
-    names = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
-    return CommonStates(records, names, actions)
+    return play
 
 
 def act_along(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
@@ -137,22 +177,43 @@ def act_along(layout: Layout, policies: Sequence[Policy], records: Array, seed: 
 
 def _act_along(layout: Layout, family: Policy, records: Array, key: Key[Array, ""]) -> Array:
     keys = jax.random.split(key, records.shape[1])
+    if family.sees == "situation":
+        # Padded tables are arguments, so that all layouts share one compilation.
+        tables, _, positions = padded_layout(layout)
+        padded = jnp.zeros((*records.shape[:-1], record_size(tables)), jnp.uint8).at[..., positions].set(records)
+        return _in_situations(family._replace(params=()))(family.params, padded, keys, tables)
 
-    @jax.jit
-    def act(params):
-        def one(params):
-            memories = jax.vmap(family.init, in_axes=(None, 0))(params, keys)
+    def see(record: Array) -> Array:
+        return record if family.sees == "state" else observe(layout, record, TEAMMATE)
 
-            def step(memories, record):
-                view = record if family.sees == "state" else observe(layout, record, TEAMMATE)
-                actions, memories = jax.vmap(family.act, in_axes=(None, 0, 0, 0))(params, memories, view, keys)
-                return memories, actions.astype(jnp.int8)
+    return jax.jit(lambda params: _actions(family, see, params, records, keys))(family.params)
 
-            return jax.lax.scan(step, memories, records)[1]
 
-        return jax.lax.map(one, params)
+@lru_cache(maxsize=16)
+def _in_situations(family: Policy) -> Callable[..., Array]:
+    """Return a compiled function of parameters, padded records, keys and tables, to actions."""
 
-    return act(family.params)
+    def act(params: Any, records: Array, keys: Array, tables: Tables) -> Array:
+        return _actions(family, lambda record: Situation(tables, record), params, records, keys)
+
+    return jax.jit(act)
+
+
+def _actions(family: Policy, see: Callable[[Array], Any], params: Any, records: Array, keys: Array) -> Array:
+    """Return actions on records, int8 (policies, T, episodes). `see` makes the policies' view of one record."""
+
+    def one(params: Any) -> Array:
+        def step(memories: Any, record: Array) -> tuple[Any, Array]:
+            def act(memory: Any, single: Array, key: Array) -> Any:
+                return family.act(params, memory, see(single), key)
+
+            actions, memories = jax.vmap(act)(memories, record, keys)
+            return memories, actions.astype(jnp.int8)
+
+        memories = jax.vmap(family.init, in_axes=(None, 0))(params, keys)
+        return jax.lax.scan(step, memories, records)[1]
+
+    return jax.lax.map(one, params)
 
 
 def distances_to_tests(common: CommonStates, actions: np.ndarray) -> np.ndarray:

@@ -41,7 +41,8 @@ _DIVERSE_SEEDS = {"train": 2, "validation": 3}
 
 _DIVERSE_TEAMMATES = {"train": 12, "validation": 3}  # maximum for each layout and family
 
-_DIVERSE_DISTANCE = 0.1  # minimum distance of a diverse draw to the test instances of all families
+DIVERSE_DISTANCE = 0.1
+"""Minimum Hamming distance of a diverse teammate to the test instances of all families."""
 
 
 def ranges_of(base_seed: int) -> str:
@@ -50,7 +51,7 @@ def ranges_of(base_seed: int) -> str:
 
 
 def _least_distance(base_seed: int) -> float:
-    return _DIVERSE_DISTANCE if base_seed in _DIVERSE_SEEDS.values() else SAME_BEHAVIOUR
+    return DIVERSE_DISTANCE if base_seed in _DIVERSE_SEEDS.values() else SAME_BEHAVIOUR
 
 
 class Draw(NamedTuple):
@@ -208,11 +209,11 @@ def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
     if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
         return None
     draws = [draw for draw in read_draws(layout, str(family), seed) if draw.theta_id == theta_id]
-    same = draws and _equal(_sampled(str(family), draws[0].theta_id, seed)["theta"], teammate["theta"])
+    same = draws and equal_parameters(_sampled(str(family), draws[0].theta_id, seed)["theta"], teammate["theta"])
     return draws[0] if same else None
 
 
-def _equal(theta: Mapping[str, float], other: Mapping[str, float]) -> bool:
+def equal_parameters(theta: Mapping[str, float], other: Mapping[str, float]) -> bool:
     """Return whether two parameter sets are equal up to the last digit, in which compilations of a draw may differ."""
     return theta.keys() == other.keys() and all(math.isclose(theta[name], other[name], rel_tol=1e-6) for name in theta)
 

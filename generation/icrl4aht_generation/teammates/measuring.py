@@ -1,22 +1,54 @@
-"""Measurement of the draws of `teammates.draws`: distances to the test instances, behaviours, returns."""
+"""Measurement of the teammates of `teammates.draws` and `teammates.spread`: distances to the test instances and to each
+other, returns."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_generation.teammates.distances import act_along, common_states, distances_to_tests, group_behaviours
-from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED, Draw, ranges_of, read_draws_table, write_draws_table
+from icrl4aht_generation.teammates.distances import (
+    act_along,
+    common_records,
+    common_states,
+    distances_to_tests,
+    group_behaviours,
+    instance_policies,
+    join_states,
+)
+from icrl4aht_generation.teammates.draws import (
+    DIVERSE_DISTANCE,
+    DRAWS_PER_SEED,
+    Draw,
+    ranges_of,
+    read_draws_table,
+    write_draws_table,
+)
+from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES
 from icrl4aht_generation.teammates.references import reference_returns
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
+from icrl4aht_generation.teammates.spread import (
+    MOST_CHOSEN,
+    VALIDATES,
+    LayoutSpread,
+    SpreadTeammate,
+    choose_spread,
+    read_spread_table,
+    spread_candidates,
+    write_spread_table,
+)
 
 _DIGITS = 4
 """Decimal places of stored numbers: all digits of shares of 10,000 states, and of means of 20 returns."""
+
+_SPREAD_EPISODES = 4
+"""Episodes of the states on which spread teammates are compared, of each test instance with each of the two egos."""
 
 DRAW_NUMBERS = [
     (family, base_seed, theta_id)
@@ -85,3 +117,79 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
         )
         for k, (family, base_seed, theta_id) in enumerate(numbers)
     ]
+
+
+def fill_spread_table(
+    path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool
+) -> list[LayoutSpread]:
+    """Choose the spread teammates of layouts that a table does not have yet, and write it after each of them.
+
+    Args:
+        path: the table; a missing one is started.
+        layouts: short names of training layouts.
+        on_layout: called with the number of finished layouts and the name of the next one.
+        overwrite: also measure the layouts that the table has.
+
+    Returns:
+        The table.
+    """
+    spreads = {spread.layout: spread for spread in read_spread_table(path)} if path.is_file() else {}
+    candidates = spread_candidates()
+    for number, name in enumerate(layouts):
+        on_layout(number, name)
+        if overwrite or name not in spreads or spreads[name].tried != len(candidates):
+            spreads[name] = measure_spread(get_layout(name), candidates)
+            write_spread_table(path, spreads.values())
+    on_layout(len(layouts), "")
+    return list(spreads.values())
+
+
+def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: int = MOST_CHOSEN) -> LayoutSpread:
+    """Choose teammates of a training layout that differ widely.
+
+    Args:
+        layout: the layout.
+        candidates: entries of heuristic teammates.
+        most: most teammates to choose.
+    """
+    # All as mixtures, most with chance 0, and with the test instances: so there is one compilation for each family.
+    plain = {RANDOM_ACTIONS: 0.0}
+    policies = [build_teammate(None, entry | {"theta": plain | entry["theta"]}) for entry in candidates]
+    tested, records = instance_policies(layout, plain), common_records(layout, _SPREAD_EPISODES)
+    actions = act_along(layout, [*tested, *policies], records)
+    common, actions = join_states(records, actions[: len(tested)]), actions[len(tested) :]
+    tests = distances_to_tests(common, actions)
+    egos = reference_returns(layout, policies)  # with all of them, so that layouts share one compilation
+    returns = np.stack([egos[ego] for ego in ("stay", "random", "oracle")], axis=1)
+    unlike = tests.min(axis=1) >= DIVERSE_DISTANCE
+    headroom = unlike & (np.ptp(returns, axis=1) >= LEAST_HEADROOM)
+    usable = np.flatnonzero(headroom if headroom.any() else unlike)
+    order, separations = choose_spread(_pairwise(actions[usable]), DIVERSE_DISTANCE, most)
+    families = np.repeat(TESTED_FAMILIES, INSTANCES)
+    chosen = []
+    for number, (place, separation) in enumerate(zip(usable[order], separations, strict=True)):
+        entry, distances = candidates[place], tests[place]
+        own = families == entry["family"]
+        near, other = (int(np.where(mask, distances, np.inf).argmin()) for mask in (own, ~own))
+        chosen.append(
+            SpreadTeammate(
+                "validation" if number % VALIDATES == VALIDATES - 1 else "train",
+                entry["family"],
+                entry["theta_id"],
+                entry["theta"],
+                common.instances[near],
+                round(float(distances[near]), _DIGITS),
+                common.instances[other],
+                round(float(distances[other]), _DIGITS),
+                round(separation, _DIGITS),
+                *(round(float(value), _DIGITS) for value in returns[place]),
+            )
+        )
+    return LayoutSpread(layout.name, len(candidates), int(unlike.sum()), int(headroom.sum()), tuple(chosen))
+
+
+def _pairwise(actions: np.ndarray) -> np.ndarray:
+    """Return Hamming distances, int8 (policies, T, N) -> float64 (policies, policies)."""
+    flat = actions.reshape(len(actions), -1)
+    # Row by row: all pairs at once would take gigabytes.
+    return np.array([(flat != own).mean(axis=1) for own in flat]).reshape(len(flat), len(flat))

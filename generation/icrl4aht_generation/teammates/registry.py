@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_generation.policy import Noise, Policy
 from icrl4aht_generation.teammates import learned
 from icrl4aht_generation.teammates.heuristics.assembly_line import ASSEMBLY_LINE
-from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic
+from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS, Heuristic
 from icrl4aht_generation.teammates.heuristics.recipe_aware_button import RECIPE_AWARE_BUTTON
 from icrl4aht_generation.teammates.heuristics.territory import TERRITORY
 from icrl4aht_generation.teammates.heuristics.utility_greedy import UTILITY_GREEDY
@@ -148,7 +148,7 @@ def recover_teammate(dataset: Dataset, history_id: int, episode: int = 0) -> Pol
 
 
 def check_theta(teammate: dict[str, Any]) -> None:
-    """Validate a heuristic's entry: every parameter, no other, and each within its range.
+    """Validate a heuristic's entry: every parameter, perhaps `RANDOM_ACTIONS`, no other, and each within its range.
 
     Raises:
         UnknownNameError: for a family that does not exist.
@@ -156,10 +156,10 @@ def check_theta(teammate: dict[str, Any]) -> None:
     """
     heuristic, theta = _family(teammate["family"]), teammate["theta"]
     names = set(heuristic.defaults)
-    if set(theta) != names:
+    if set(theta) - {RANDOM_ACTIONS} != names:
         raise TaskFormatError(
             f"teammate {teammate['family']}: missing parameters {sorted(names - set(theta))}, "
-            f"unknown parameters {sorted(set(theta) - names)}"
+            f"unknown parameters {sorted(set(theta) - names - {RANDOM_ACTIONS})}"
         )
     wrong = [
         f"{name} = {value!r} (expected {heuristic.describe(name)})"

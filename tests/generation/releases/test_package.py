@@ -17,10 +17,10 @@ from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADAT
 from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.releases import measures
-from icrl4aht_generation.releases.measures import TeammateFacts, find_draw, teammate_facts, unhosted_families
+from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unhosted_families
 from icrl4aht_generation.releases.package import package_release, recorded_sources
 from icrl4aht_generation.teammates import draws as draws_table
-from icrl4aht_generation.teammates.draws import Draw
+from icrl4aht_generation.teammates.draws import Draw, find_draw
 from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
 
 from icrl4aht_data import load_icrl4aht, verify_release

@@ -16,7 +16,11 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_generation.paths import Scene
-from icrl4aht_generation.policy import Noise, Policy, Situation, on_layout
+from icrl4aht_generation.policy import Noise, Policy, Situation, on_layout, sometimes_random
+
+RANDOM_ACTIONS = "random_actions"
+"""Optional parameter of every family: chance that a step's action is drawn uniformly from the six instead. It is not
+the paper's (see E3T, Yan et al. 2023)."""
 
 SHARES = [0.0, 0.0, 0.25, 0.5, 0.75]
 """Values of a chance of not doing one's part, for `Heuristic.diverse`: none for two teammates in five."""
@@ -75,14 +79,15 @@ class Heuristic:
 
         Args:
             layout: the layout whose state records it sees; None for a teammate that sees a `Situation` of any layout.
-            theta: a value for every parameter.
+            theta: a value for every parameter, and perhaps for `RANDOM_ACTIONS`.
             slot: 0 or 1, the agent it plays.
             noise: source of its randomness.
         """
-        init, act = _functions(self, slot, noise)
+        init, act = _functions(self, slot, noise, RANDOM_ACTIONS in theta)
         params = {
             name: (jnp.int32 if isinstance(default, int) else jnp.float32)(theta[name])
-            for name, default in self.defaults.items()
+            for name, default in (self.defaults | {RANDOM_ACTIONS: 0.0}).items()
+            if name in theta
         }
         policy = Policy(params, init, act, "situation")
         return policy if layout is None else on_layout(policy, layout)
@@ -92,12 +97,12 @@ class Heuristic:
         if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
             return False
         # JSON has no integers of its own: 2.0 is a valid value of an integer parameter.
-        integral = isinstance(self.defaults[name], float) or float(value).is_integer()
+        integral = isinstance(self.defaults.get(name, 0.0), float) or float(value).is_integer()
         return integral and 0 <= float(value) <= self._highest(name)
 
     def describe(self, name: str) -> str:
         """Return the valid values of a parameter in words, such as "a number in 0..1"."""
-        kind = "an integer" if isinstance(self.defaults[name], int) else "a number"
+        kind = "an integer" if isinstance(self.defaults.get(name, 0.0), int) else "a number"
         highest = self._highest(name)
         return f"{kind} from 0" if math.isinf(highest) else f"{kind} in 0..{highest:g}"
 
@@ -108,8 +113,8 @@ class Heuristic:
 
 
 @lru_cache(maxsize=64)
-def _functions(heuristic: Heuristic, slot: int, noise: Noise):
-    """Return `init` and `act` of a policy."""
+def _functions(heuristic: Heuristic, slot: int, noise: Noise, mixed: bool):
+    """Return `init` and `act` of a policy, which `mixed` mixes with random actions."""
 
     # Cached, so that policies of one family are the same functions, and JAX compiles them once.
     def init(params, key: Key[Array, ""]) -> Any:
@@ -120,7 +125,17 @@ def _functions(heuristic: Heuristic, slot: int, noise: Noise):
         action, memory = heuristic.act(params, memory, Scene(view.tables, view.record, slot))
         return action.astype(jnp.int32), memory
 
-    return init, act
+    # The chain of keys of the random actions is apart from the published one, so that the heuristic draws as without.
+    def mixed_init(params, key: Key[Array, ""]) -> Any:
+        start = jax.random.key(slot) if noise == "fixed" else key
+        return init(params, key), jax.random.fold_in(start, 1)
+
+    def mixed_act(params, memory: Any, view: Situation, key: Key[Array, ""]):
+        action, own = act(params, memory[0], view, key)
+        following, drawn = jax.random.split(memory[1])
+        return sometimes_random(drawn, params[RANDOM_ACTIONS], action), (own, following)
+
+    return (mixed_init, mixed_act) if mixed else (init, act)
 
 
 def next_key(key: Key[Array, ""]) -> Key[Array, ""]:

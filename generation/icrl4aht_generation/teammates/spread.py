@@ -1,0 +1,327 @@
+"""Heuristic teammates that differ widely: from each other, and from all test instances.
+
+`spread.jsonl` has one line per training layout, chosen and measured by `icrl4aht-data research draws --spread`, so that
+tasks are known without any simulation. The candidates are presets, specialists that do one part of the work, a teammate
+that only watches, diverse draws of all families, and mixtures of these with random actions. Of those that act unlike
+the test instances, the farthest from all chosen ones is chosen next, until none is far enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, layout_order
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
+from icrl4aht_generation.teammates.draws import Draw, equal_parameters, find_draw
+from icrl4aht_generation.teammates.heuristics.assembly_line import PLATER, RUNNER
+from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS
+from icrl4aht_generation.teammates.heuristics.territory import (
+    BLOCKER,
+    COUNTER,
+    HOARDER,
+    HORIZONTAL,
+    INVADER,
+    LAZY,
+    STATIONS,
+)
+from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
+
+SPREAD_TABLE = Path(__file__).with_name("spread.jsonl")
+"""Table of the chosen teammates."""
+
+SPREAD_SEED = 4
+"""The base_seed of their entries; `theta_id` is the candidate's number in its family, see `spread_candidates`."""
+
+_DRAWS = 32
+"""Diverse draws of each family among the candidates."""
+
+_MIXED_DRAWS = 8
+"""Draws of each family that are also mixed with random actions."""
+
+_CHANCES = (0.25, 0.5, 0.75)
+"""Chances of a random action in mixtures, in turn."""
+
+_FIRST_DRAW, _FIRST_MIXTURE = 100, 200  # numbers of the candidates: presets and specialists are before them
+
+MOST_CHOSEN = 45
+"""Most teammates of a layout."""
+
+VALIDATES = 5
+"""Every fifth chosen teammate validates: so both splits are spread over all behaviours."""
+
+_SPECIALISTS: dict[str, tuple[dict[str, float], ...]] = {
+    "recipe_aware_button": (
+        {"task_specialization": 1.0},  # only plates and delivers
+        {"wrong_ingredient_prob": 1.0},  # fetches what nobody wants
+        {"path_blocking": 1.0},  # stands at pots and goals
+        {"plate_timing": 1.0},  # fetches its plate first
+        {"idle_prob": 0.5},
+    ),
+    "territory": (
+        {"behavior_mode": LAZY, "action_probability": 0.0},  # only watches
+        {"behavior_mode": LAZY, "action_probability": 0.5},
+        {"behavior_mode": BLOCKER},
+        {"behavior_mode": HOARDER},  # carries everything to counters
+        {"behavior_mode": HOARDER, "split_mode": HORIZONTAL, "strictness": 1.0, "shared_margin": 0},
+        {"behavior_mode": COUNTER},  # hands dishes over at a counter
+        {"behavior_mode": COUNTER, "split_mode": HORIZONTAL, "strictness": 1.0, "shared_margin": 0},
+        {"behavior_mode": INVADER, "strictness": 1.0, "shared_margin": 0},
+        {"behavior_mode": INVADER, "split_mode": STATIONS, "strictness": 1.0, "shared_margin": 0},
+    ),
+    "assembly_line": (
+        {"role_mode": RUNNER, "handoff_style": 1},  # only fetches, hands over at the middle counters
+        {"role_mode": RUNNER, "handoff_style": 2},  # or near its partner
+        {"role_mode": PLATER, "task_abandon_prob": 0.5},
+        {"task_abandon_prob": 1.0},  # puts down whatever it fetches
+        {"wrong_action_prob": 1.0},
+        {"stubbornness": 1.0},
+        {"timing_mismatch": 1.0},
+    ),
+    "utility_greedy": (
+        {"w_press_L": 20.0},  # lights the recipe whenever it can
+        {"w_fetch_ingredient": 0.0, "w_get_plate": 20.0},
+        {"w_fetch_ingredient": 20.0, "w_get_plate": 0.0},
+        {"w_stage_on_counter": 20.0, "counter_preference": 1.0},
+        {"dist_weight": 10.0},
+        {RANDOM_ACTIONS: 1.0},
+    ),
+}
+"""Parameters that differ from the defaults of each family."""
+
+
+class SpreadTeammate(Struct, forbid_unknown_fields=True):
+    """A chosen teammate of a layout.
+
+    Attributes:
+        split: "train" or "validation".
+        family: kind of the heuristic.
+        theta_id: number of the candidate.
+        theta: all parameters.
+        nearest: test instance of its family that acts most like it, such as "H3/t1".
+        distance: Hamming distance to that instance, see `icrl4aht_generation.teammates.distances`.
+        other: test instance of the other families that acts most like it.
+        other_distance: Hamming distance to that instance.
+        separation: Hamming distance to the nearest of the teammates chosen before it; 1 for the first.
+        stay: mean return of the ego `stay` with it in 20 episodes of 100 steps.
+        random: mean return of the ego `random`.
+        oracle: mean return of the ego `oracle`.
+    """
+
+    split: str
+    family: str
+    theta_id: int
+    theta: dict[str, int | float]
+    nearest: str
+    distance: float
+    other: str
+    other_distance: float
+    separation: float
+    stay: float
+    random: float
+    oracle: float
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Its entry in a task."""
+        return _entry(self.family, self.theta_id, dict(self.theta))
+
+
+class LayoutSpread(Struct, forbid_unknown_fields=True):
+    """The teammates of a layout, in the order in which they were chosen, and what they were chosen from.
+
+    Attributes:
+        layout: short name of a training layout.
+        tried: number of candidates.
+        unlike_tests: those at Hamming distance `DIVERSE_DISTANCE` or more from every test instance.
+        headroom: those of these with which the returns of the reference egos differ by `LEAST_HEADROOM` or more. Others
+            are chosen only where none has headroom.
+        chosen: the chosen ones.
+    """
+
+    layout: str
+    tried: int
+    unlike_tests: int
+    headroom: int
+    chosen: tuple[SpreadTeammate, ...]
+
+    def of_split(self, split: str) -> list[SpreadTeammate]:
+        """Return the teammates of split "train" or "validation", in order."""
+        return [mate for mate in self.chosen if mate.split == split]
+
+
+def read_spread(layout: str) -> LayoutSpread:
+    """Return the list of a training layout.
+
+    Raises:
+        UnknownNameError: for a layout without training tasks.
+        OptionError: for a layout that was not measured.
+    """
+    name = get_layout(layout).name
+    if name not in TESTED_ON:
+        raise unknown("training layout", layout, TESTED_ON)
+    if name not in _bundled_spreads():
+        raise OptionError(f"{SPREAD_TABLE}: no line for {name}: `icrl4aht-data research draws --spread` measures it")
+    return _bundled_spreads()[name]
+
+
+def spread_teammates(layout: str, split: str, count: int) -> list[dict[str, Any]]:
+    """Return the entries of the first teammates of a layout's list: those that differ most.
+
+    Args:
+        layout: a training layout.
+        split: "train" or "validation".
+        count: number of teammates.
+
+    Raises:
+        UnknownNameError: for a layout without training tasks.
+        OptionError: for a layout that was not measured, and for more teammates than its list has.
+    """
+    if count == 0:
+        return []
+    spread = read_spread(layout)
+    found = spread.of_split(split)
+    if count > len(found):
+        raise OptionError(
+            f"{spread.layout}: {count} {split} teammates requested of teammates/spread.jsonl, which has {len(found)}: "
+            f"of {spread.tried} candidates {spread.unlike_tests} act unlike the tests, and {spread.headroom} of "
+            f"these have headroom; request fewer"
+        )
+    return [mate.entry for mate in found[:count]]
+
+
+def find_measured(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
+    """Return what was measured with the teammate of an entry, of either table, or None. Behaviours are numbers in the
+    layout's list."""
+    if teammate.get("kind") != "heuristic" or teammate.get("base_seed") != SPREAD_SEED:
+        return find_draw(layout, teammate)
+    spread = _bundled_spreads().get(layout)
+    for number, mate in enumerate(spread.chosen if spread else ()):
+        if (mate.family, mate.theta_id) == (teammate["family"], teammate["theta_id"]):
+            if not equal_parameters(mate.theta, teammate["theta"]):
+                return None
+            returns = (mate.stay, mate.random, mate.oracle)
+            return Draw(
+                layout,
+                mate.family,
+                SPREAD_SEED,
+                mate.theta_id,
+                mate.nearest,
+                mate.distance,
+                number,
+                *returns,
+                other=mate.other,
+                other_distance=mate.other_distance,
+            )
+    return None
+
+
+@lru_cache(maxsize=1)
+def _bundled_spreads() -> dict[str, LayoutSpread]:
+    table = read_spread_table(SPREAD_TABLE) if SPREAD_TABLE.is_file() else []
+    return {spread.layout: spread for spread in table}
+
+
+def read_spread_table(path: Path) -> list[LayoutSpread]:
+    """Return the layouts of a table, in its order.
+
+    Raises:
+        TaskFormatError: names the file and the line.
+    """
+    found = []
+    for number, line in enumerate(read_lines(path), start=1):
+        try:
+            found.append(msgspec.convert(parse_json(line), LayoutSpread))
+        except (msgspec.ValidationError, Icrl4ahtError) as error:
+            raise TaskFormatError(f"{path}, line {number}: {error}") from error
+    return found
+
+
+def write_spread_table(path: Path, spreads: Iterable[LayoutSpread]) -> None:
+    """Write one JSON line per layout, in the benchmark's order."""
+    lines = [msgspec.json.encode(spread) for spread in sorted(spreads, key=lambda one: layout_order(one.layout))]
+    with atomic_write(path) as partial:
+        partial.write_bytes(b"".join(line + b"\n" for line in lines))
+
+
+def spread_rows(spreads: Iterable[LayoutSpread]) -> list[dict[str, Any]]:
+    """Return the numbers of each layout: candidates, behaviours of each split, those with headroom, least distances.
+
+    Returns:
+        One row per layout; distances are None where nobody was chosen.
+    """
+    return [
+        {
+            "layout": spread.layout,
+            "candidates": spread.tried,
+            "unlike_tests": spread.unlike_tests,
+            "with_headroom": spread.headroom,
+            **{split: len(spread.of_split(split)) for split in ("train", "validation")},
+            "families": " ".join(
+                f"{HEURISTIC_KINDS[family]}:{sum(mate.family == family for mate in spread.chosen)}"
+                for family in HEURISTIC_FAMILIES
+            ),
+            "least_distance": min((mate.separation for mate in spread.chosen), default=None),
+            "least_to_tests": min((min(mate.distance, mate.other_distance) for mate in spread.chosen), default=None),
+        }
+        for spread in spreads
+    ]
+
+
+def spread_candidates() -> list[dict[str, Any]]:
+    """Return the entries of all candidates, by family: presets and specialists, diverse draws, mixtures."""
+    return [entry for family in HEURISTIC_FAMILIES for entry in _family_candidates(family)]
+
+
+def _family_candidates(family: str) -> Iterator[dict[str, Any]]:
+    heuristic = HEURISTIC_FAMILIES[family]
+    shapes = [*heuristic.presets.values(), *_SPECIALISTS[family]]
+    fixed = [heuristic.defaults | shape for shape in shapes]
+    drawn = [sample_teammate(family, number, "diverse", SPREAD_SEED)["theta"] for number in range(_DRAWS)]
+    mixed = [
+        theta | {RANDOM_ACTIONS: _CHANCES[number % len(_CHANCES)]}
+        for number, theta in enumerate([*fixed, *drawn[:_MIXED_DRAWS]])
+        if RANDOM_ACTIONS not in theta
+    ]
+    for first, thetas in ((0, fixed), (_FIRST_DRAW, drawn), (_FIRST_MIXTURE, mixed)):
+        yield from (_entry(family, number, theta) for number, theta in enumerate(thetas, start=first))
+
+
+def _entry(family: str, theta_id: int, theta: dict[str, Any]) -> dict[str, Any]:
+    return {"kind": "heuristic", "family": family, "theta_id": theta_id, "base_seed": SPREAD_SEED, "theta": theta}
+
+
+def choose_spread(distances: np.ndarray, least: float, most: int) -> tuple[list[int], list[float]]:
+    """Choose items by farthest-point selection (greedy max-min).
+
+    The first is the one with the farthest other item; then always the one whose nearest chosen item is farthest.
+    Items at equal distance are taken by number.
+
+    Args:
+        distances: symmetric, float64 (N, N).
+        least: least distance of any two chosen items.
+        most: most items.
+
+    Returns:
+        Numbers of the chosen items in order, and the distance of each to the nearest one before it, 1 for the first.
+    """
+    chosen: list[int] = []
+    separations: list[float] = []
+    nearest = distances.max(axis=1, initial=0.0)
+    while len(chosen) < min(most, len(distances)):
+        best = int(nearest.argmax())
+        if chosen and nearest[best] < least:
+            break
+        separations.append(float(nearest[best]) if chosen else 1.0)
+        nearest = np.minimum(nearest, distances[best]) if chosen else distances[best].copy()
+        chosen.append(best)
+        nearest[chosen] = -1.0
+    return chosen, separations
