@@ -14,7 +14,7 @@ from icrl4aht_data.errors import CacheError, OptionError
 from icrl4aht_data.format import cached_arrays as module
 from icrl4aht_data.format.cached_arrays import cached_arrays, new_mapped_array
 from tests.helpers.damages import DAMAGES, contents, flip_bit
-from tests.robustness.limits import can_mount, file_size_limit, permissions_count, small_disk
+from tests.robustness.limits import can_mount, permissions_count, small_disk
 
 KEY = f"histories-{0:032x}"
 SIZE = 8 * 150_000 + 300
@@ -130,24 +130,6 @@ def test_a_cache_folder_that_can_only_be_read(folder):
     finally:
         folder.chmod(0o755)
         (folder / KEY).chmod(0o755)
-
-
-def test_a_limit_of_file_size_is_an_error_that_leaves_nothing(folder):
-    with file_size_limit(100_000), pytest.raises(CacheError, match=rf"{folder}: the cache folder has no room for"):
-        cached_arrays(KEY, SIZE, build)
-    assert not list(folder.iterdir())
-    check(cached_arrays(KEY, SIZE, build))
-
-
-@pytest.mark.skipif(not can_mount(), reason="needs the right to mount a disk")
-@pytest.mark.parametrize("announced", [SIZE, 0], ids=["known before", "noticed while writing"])
-def test_a_full_disk_is_an_error_that_leaves_nothing(folder, announced):
-    with small_disk(folder, 2**20):
-        with pytest.raises(
-            CacheError, match=r"has no room for .*No space left on device; [\d,]+ of [\d,]+ bytes are free.*\); free"
-        ):
-            cached_arrays(KEY, announced, build)
-        assert not list(folder.iterdir())
 
 
 @pytest.mark.skipif(not can_mount(), reason="needs the right to mount a disk")

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import Curriculum, load_icrl4aht
-from icrl4aht_data.errors import ShardCorruptError, UnknownNameError
-from icrl4aht_data.format.chunks import chunk_table_name
+from icrl4aht_data.errors import UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.sources import choose_cache
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.batches import CACHES, assert_equal, samplers
-from tests.helpers.random_releases import SHARD, random_release
+from tests.helpers.random_releases import random_release
 
 LAYOUTS = ("coord_simple", "demo_simple", "coord_ring")
 """Layouts with observations of one shape and state records of several sizes."""
@@ -77,18 +76,6 @@ class TestCaches:
         assert choose_cache("stream", 1).cache == "stream"
         with pytest.raises(UnknownNameError, match="unknown cache 'disk'; valid: auto, ram, mmap, stream"):
             load_icrl4aht(lite[0], cache="disk")  # type: ignore[arg-type]
-
-    @pytest.mark.parametrize("cache", CACHES)
-    def test_damaged_files_are_an_error(self, damaged, cache, tmp_path, monkeypatch):
-        monkeypatch.setenv(
-            "ICRL4AHT_CACHE_DIR", str(tmp_path / "cache")
-        )  # drops cached arrays of the undamaged release
-        data = bytearray((damaged / SHARD).read_bytes())
-        data[int(np.load(damaged / chunk_table_name(SHARD))["offset"][0])] ^= 1
-        (damaged / SHARD).write_bytes(data)
-        sampler = load_icrl4aht(damaged, layout="coord_simple", cache=cache).ad(batch_size=64, length=9)
-        with pytest.raises(ShardCorruptError, match="chunk 0 of state in history 0"):
-            sampler[0]
 
     def test_threads_share_a_sampler(self, lite):
         sampler = load_icrl4aht(lite[0], layout="demo_wide", cache="stream", threads=2).ad(batch_size=9, length=30)
