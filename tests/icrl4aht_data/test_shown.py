@@ -81,13 +81,6 @@ def test_batches_print_shapes_wherever_their_arrays_are(bundled):
     assert "obs             P('data',)" in repr(ADBatch(*[jax.sharding.PartitionSpec("data")] * 6))
 
 
-def test_provenance_is_a_mapping_with_a_short_repr(bundled):
-    found = bundled.provenance
-    assert set(found) == set(bundled.counts("task_id")) and repr(found) == f"ProvenanceByTask({len(found)} tasks)"
-    task_id = bundled[0].entry.task_id
-    assert found[task_id] is found.get(task_id) and found.get("none") is None
-
-
 SCRIPT = Path(__file__).with_name("user_script.py")
 
 

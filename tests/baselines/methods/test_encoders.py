@@ -74,15 +74,6 @@ def test_words_give_the_loss_and_gradient_of_the_paper(lite, name):
     assert_equal_results(found, loss_and_gradient(paper, params, batch_of(lite[0], name, "uint8")), params)
 
 
-@pytest.mark.slow
-def test_entries_give_the_loss_and_gradient_of_observations(lite):
-    plain, entries = made("ad", "mlp", plain_view), made("ad", "mlp")
-    params = random_parameters(plain)
-    found = loss_and_gradient(entries, params, batch_of(lite[0], "ad", "state"))
-    assert "distinct_observations" not in found[0][1]
-    assert_equal_results(found, loss_and_gradient(plain, params, batch_of(lite[0], "ad", "uint8")), params)
-
-
 @pytest.mark.parametrize("collide", [False, True])
 def test_equal_observations_are_in_one_group(monkeypatch, collide):
     """If hashes collide, each observation is its own group."""

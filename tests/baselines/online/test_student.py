@@ -39,7 +39,7 @@ def idle(layout: Any) -> Policy:
     return stay(layout)._replace(sees="ego_input")
 
 
-COOK, IDLE = NamedEgo("cook", cook, {"version": 1}), NamedEgo("idle", idle)
+COOK = NamedEgo("cook", cook, {"version": 1})
 
 
 @pytest.fixture(scope="module")

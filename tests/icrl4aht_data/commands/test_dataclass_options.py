@@ -121,21 +121,12 @@ def test_values_of_tables_replace_fields_of_nested_dataclasses():
     ("values", "message"),
     [
         ({"steps": 0}, "steps = 0: expected `int` >= 1"),
-        ({"steps": 1.5}, "steps = 1.5: expected `int`, got `float`"),
         ({"steps": True}, "steps = True: expected `int`, got `bool`"),
-        ({"steps": "5"}, "steps = '5': expected `int`, got `str`"),
         ({"learning_rate": float("nan")}, "learning_rate = nan: expected"),
-        ({"learning_rate": float("inf")}, "learning_rate = inf: expected a finite number"),
         ({"dropout": 1}, "dropout = 1: expected `float` < 1.0"),
-        ({"discounts": ()}, r"discounts = \(\): expected `array` of length >= 1"),
         ({"discounts": (0.5, -1.0)}, r"discounts = \(0.5, -1.0\): expected `float` >= 0.0 - at `\$\[1\]`"),
     ],
 )
 def test_a_dataclass_checks_its_own_values(values, message):
     with pytest.raises(OptionError, match=message):
         Options(**values)
-
-
-def test_an_invalid_choice_raises_unknown_name():
-    with pytest.raises(UnknownNameError, match="unknown positions 'ropes'; valid: none, rope"):
-        Options(positions="ropes")  # type: ignore[arg-type]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pathlib
 import re
 import sys
 
@@ -142,20 +141,6 @@ def test_an_episode_becomes_an_endless_gif_with_a_frame_a_step(tmp_path):
         assert apart[0] < apart[1], caption
     assert len(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)) <= 128
     assert [entry.name for entry in tmp_path.iterdir()] == ["episode.gif"]
-
-
-def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "frame.png"
-    path.write_text("old")
-
-    def fail(self, target, **options):
-        self.write_text("half")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(pathlib.Path, "write_bytes", fail)
-    with pytest.raises(OSError, match="disk full"):
-        save_episode(path, COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up")))
-    assert [(entry.name, entry.read_text()) for entry in tmp_path.iterdir()] == [("frame.png", "old")]
 
 
 def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):

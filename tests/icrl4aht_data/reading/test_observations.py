@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from icrl4aht_generation.commands import generate
 
-from icrl4aht_data import Curriculum, load_icrl4aht, verify_release
+from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError
 from icrl4aht_data.format.manifest import write_manifest
@@ -23,7 +23,7 @@ from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import PUBLISHED_FIELDS, from_published, to_published
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from tests.helpers.batches import CACHES, assert_equal
+from tests.helpers.batches import CACHES
 from tests.helpers.published_files import KEPT, SHARD
 from tests.helpers.random_releases import long_index, make_tasks, random_history, random_release
 
@@ -269,25 +269,6 @@ class TestWithoutStates:
 
 
 class TestBatches:
-    @pytest.mark.parametrize("obs", ["float32", "uint8"])
-    @pytest.mark.parametrize("cache", CACHES)
-    def test_ad_batches_equal_those_of_the_original(self, lite, full, reconverted_release, obs, cache):
-        options = {"batch_size": 6, "seed": 5, "teammate_actions": True}
-        for root in (lite[0], full[0]):
-            original = load_icrl4aht(root, layout="demo_wide", obs=obs)
-            dataset = load_icrl4aht(reconverted_release, layout="demo_wide", obs=obs, cache=cache, threads=2)
-            for length in (1, 40, 130):  # the last length exceeds the histories
-                for i in (0, 3, 1000):
-                    one, two = (d.ad(length=length, **options)[i] for d in (original, dataset))
-                    assert two.obs.dtype == obs
-                    assert_equal(one, two)
-        plan = Curriculum(batches=10, first=(0.0, 0.5), last=(0.5, 1.0))
-        one, two = (
-            d.ad(batch_size=6, length=50, episodes=(1, 4), curriculum=plan, weights="length")[7]
-            for d in (original, dataset)
-        )
-        assert_equal(one, two)
-
     @pytest.mark.parametrize("cache", CACHES)
     @pytest.mark.parametrize("order", ["contiguous", "random"])
     @pytest.mark.parametrize("options", [{}, {"episodes": (1, 3)}, {"episodes": (-1, None)}])
@@ -366,8 +347,3 @@ class TestCombine:
             combine_releases(tmp_path / "mixed", [reconverted_release, converted_release])
         with pytest.raises(OptionError, match=r"kind 'lite'.*combine releases of one kind"):
             combine_releases(tmp_path / "mixed", [converted_release, lite[0]])
-
-    def test_combining_one_release_gives_equal_bytes(self, reconverted_release, tmp_path):
-        combine_releases(tmp_path / "out", [reconverted_release])
-        for name in (SHARD, "meta/tasks.jsonl", "meta/histories.jsonl", "meta/info.json"):
-            assert (tmp_path / "out" / name).read_bytes() == (reconverted_release / name).read_bytes()
