@@ -91,17 +91,6 @@ def test_invalid_values_are_a_misuse(words, message):
     assert message in " ".join(output.split())
 
 
-def test_help_has_topics_and_shows_each_default_once():
-    text = " ".join(call("--help")[1].split())
-    assert "Options: --out TEXT [default: runs] --help" in text
-    assert "Training: --steps INTEGER Training steps. [default: the size's; >= 1]" in text
-    assert "--discounts FLOAT Discount; repeatable. [default: 0.9, 0.99; >= 0; < 1]" in text
-    assert "--positions none|rope Position embedding. [default: none]" in text
-    assert "--teammate-actions, --ta Also input actions. -" in text
-    assert "--normalize / --no-normalize Normalize. [default: normalize]" in text
-    assert "--limit INTEGER Most steps. [default: no limit; >= 1]" in text
-
-
 def test_values_of_tables_replace_fields_of_nested_dataclasses():
     base = Options(steps=7)
     changed = replace_options(base, {"dropout": 0.2, "widths": {"hidden": 8}, "discounts": [0.5]})

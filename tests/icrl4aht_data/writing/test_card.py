@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from io import StringIO
 from typing import Any
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
@@ -24,12 +22,10 @@ from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.writing.card import (
     card_texts,
     episode_texts,
-    evaluated_on,
     facts,
     render_card,
     write_card,
 )
-from icrl4aht_data.writing.statistics import print_learning
 
 KINDS_OF = {family: kind for kind, family in HEURISTIC_KINDS.items()}
 LEFT_OUT = LeftOutTask("task", "demo_wide", "H1/t3", "ppo", 2, 128, 1.25, 2.5, "the learners did not learn")
@@ -159,23 +155,10 @@ def test_how_histories_were_made(write):
     assert "Not recorded" in render_card(write(change=lambda of: Provenance()))
 
 
-def test_learning_is_printed(write):
-    output = StringIO()
-    print_learning(write(), Console(file=output, width=80))
-    lines = [line.replace("|", "").split() for line in output.getvalue().splitlines()]
-    assert ["demo_wide", "noise", "train", "2", "0.50", "43.00", "unknown", "1.00"] in lines
-    assert "left out: demo_wide with H1/t3 (ppo): the learners did not learn" in output.getvalue()
-
-
 def test_the_bundled_card_is_short_and_current():
     content = facts(MINI)
     assert (MINI / "README.md").read_text() == render_card(content)
     assert len((MINI / "README.md").read_text().split()) <= 2500
-
-
-def test_layouts_of_the_benchmark():
-    assert evaluated_on(["demo_wide", "asymm_both"]) == ["demo_wide", "asymm_right", "cramped_down"]
-    assert evaluated_on(["cramped_up", "cramped_down"]) == ["cramped_down"]
 
 
 def test_every_field_is_described():
