@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -288,6 +289,7 @@ def test_task_files_round_trip(tmp_path):
     assert list(json.loads(lines[0])) == ["task_id", "track", "split", "layout_name", "seed", "teammate"]
 
 
+@cache
 def _lines() -> list[str]:
     return [json.dumps(task_fields(work.task)) for work in load_profile("mini").works()[:2]]
 
