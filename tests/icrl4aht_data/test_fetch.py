@@ -222,8 +222,7 @@ fetch_planned(plan_download(sys.argv[1], to=Path(sys.argv[2]) if len(sys.argv) >
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["http", "hub"])
-@pytest.mark.parametrize("to", [None, "mine"])
+@pytest.mark.parametrize(("kind", "to"), [("http", "mine"), ("hub", None)])
 def test_a_killed_download_is_resumed_by_file(kind, to, lite, tmp_path):
     arguments = [str(tmp_path / to)] if to else []
     with served(kind, lite[0]) as (url, server):

@@ -165,9 +165,8 @@ def test_behaviours_of_the_test_tasks_are_added_up():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["test_wide", "demo_wide"])
-def test_behaviours_of_the_test_tasks(name):
-    states = common_states(LAYOUTS[name])
+def test_behaviours_of_the_test_tasks():
+    states = common_states(LAYOUTS["demo_wide"])
     for number, family in enumerate(HEURISTICS):
         own = states.actions[number * INSTANCES : (number + 1) * INSTANCES]
-        assert len(set(group_behaviours(own))) == behaviours_of_tests()[family][name]
+        assert len(set(group_behaviours(own))) == behaviours_of_tests()[family]["demo_wide"]
