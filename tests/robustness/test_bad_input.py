@@ -56,13 +56,6 @@ def test_unknown_names_list_the_valid_and_the_nearest(lite, options, message):
         load_icrl4aht(lite[0], **options)
 
 
-def test_unknown_field_of_a_history(lite):
-    with pytest.raises(
-        UnknownNameError, match=r"unknown field 'action'; valid: state, actions.*Did you mean 'actions'"
-    ):
-        load_icrl4aht(lite[0])[0].read("action")
-
-
 @pytest.mark.parametrize("options", [{"split": "test"}, {"layout": "coord_ring"}, {"teammate_family": "rl"}])
 def test_a_valid_filter_without_data_says_what_exists(lite, options):
     with pytest.raises(EmptySelectionError, match="has split train; layout coord_simple, demo_wide; teammate_family"):

@@ -266,12 +266,6 @@ def test_commands(tmp_path):
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])
     assert "report: exists" in str(result.exception)
     assert CliRunner().invoke(cli, ["report", str(tmp_path / "run"), "--overwrite"]).exit_code == 0
-    other = ["--out", str(tmp_path / "new"), "--html", str(tmp_path / "two.jsonl")]
-    result = CliRunner().invoke(cli, ["report", str(tmp_path / "run"), "--overwrite", *other])
-    assert "two.jsonl: expected a name that ends in .html" in result.output
-    watched = ["watch", "--layout", "demo_wide", "--out", str(tmp_path / "mine.gif")]
-    (tmp_path / "mine.gif").write_text("mine")
-    assert "exists; give another name" in str(CliRunner().invoke(cli, watched).exception)
     (tmp_path / "two.jsonl").write_text("{}\n")
     result = CliRunner().invoke(cli, ["evaluate", "--agent", "stay", *options])
     assert "line 1" in str(result.exception)

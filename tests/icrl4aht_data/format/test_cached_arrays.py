@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from pathlib import Path
 
@@ -57,26 +56,6 @@ def test_wrong_sizes_and_headers_are_built_again(folder, damage):
         check(cached_arrays(KEY, SIZE, build))
         assert contents(folder / KEY) == right
         assert [path.name for path in folder.iterdir()] == [KEY]
-
-
-@pytest.mark.parametrize("what", ["file", "link", "pipe", "empty folder", "array of other set"])
-def test_foreign_files_with_a_sets_name_are_replaced(folder, what):
-    other = f"histories-{1:032x}"
-    cached_arrays(other, 8, lambda path: np.save(path / "a.npy", np.arange(3)))
-    target = folder / KEY
-    if what == "file":
-        target.write_text("hello")
-    elif what == "link":
-        target.symlink_to(folder / "nowhere")
-    elif what == "pipe":
-        os.mkfifo(target)
-    elif what == "empty folder":
-        target.mkdir()
-    else:
-        cached_arrays(KEY, SIZE, build)
-        shutil.copy(folder / other / "a.npy", target / "a.npy")
-    check(cached_arrays(KEY, SIZE, build))
-    assert sorted(path.name for path in folder.iterdir()) == [KEY, other]
 
 
 def test_leftovers_of_killed_processes_are_removed_after_a_day(folder):

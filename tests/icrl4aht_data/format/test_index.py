@@ -13,7 +13,6 @@ import pytest
 from icrl4aht_data.errors import EmptySelectionError, IndexFormatError, UnknownNameError
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.schema import Entry
-from tests.helpers.damages import DAMAGES, contents
 from tests.helpers.random_releases import long_index
 
 
@@ -131,23 +130,6 @@ def test_a_changed_index_is_parsed_again(tmp_path, folder):
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # even if the modification time is unchanged
     assert read_index(root).entry(9).env_idx != entries[9].env_idx
     assert len(cached(folder)) == 2
-
-
-def test_a_damaged_cache_is_rebuilt(long, folder):
-    """Each file of the cached columns is damaged differently."""
-    root, entries = long
-    read_index(root)
-    (made,) = cached(folder)
-    right = contents(folder / made)
-    damages = [name for name in DAMAGES if "bit" not in name]  # sizes and headers do not reveal a flipped bit
-    assert len(right) > 3 * len(damages)
-    for (name, data), damage in zip(list(right.items())[::3], damages, strict=False):
-        DAMAGES[damage](folder / made / name)
-        index = read_index(root)
-        assert (index.entry(2999), index.entry(0)) == (entries[2999], entries[0]), (damage, name)
-        assert (folder / made / name).read_bytes() == data, (damage, name)
-    shutil.rmtree(folder / made)
-    assert read_index(root).entry(2999) == entries[2999]
 
 
 @pytest.mark.parametrize("where", [0, 1500, 2999])

@@ -15,7 +15,7 @@ from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import LeftOutTask, describe
-from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos, TeammateSuite
+from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, HISTORIES, INFO, PROVENANCE, TASKS
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import write_json
@@ -114,24 +114,6 @@ def test_long_tables_move_to_card_json(write, tmp_path):
     assert len(tables["learning"]) == 4
 
 
-def test_text_of_the_card(write):
-    card = render_card(write())
-    for text in (
-        "6 histories of 4 tasks, 720 transitions; each history has 120 steps.",
-        "Sources: `ppo` (3 histories), `noise` (3 histories).",
-        "Labels: expert actions in every history, oracle actions in 3 histories.",
-        "the script knows the full state",
-        "must infer what the script knew",
-        "No headroom: on coord_simple the ego hardly matters",
-        "Left out: 1 task that were planned or collected; `card.json` has the reasons.",
-        "| demo_wide | `demo_cook_wide` | 11 x 6 | 45 | 5 | 600 | 28.0 | 2 of 2 |",
-        "They earn less than half of the histories' end in 1 task of ppo on coord_simple",
-        'labels="oracle"',
-    ):
-        assert text in card, text
-    assert "No teammates" not in card and "figures/" not in card and "configs" not in card
-
-
 def test_teammates_that_act_like_the_test_are_named(write):
     own = "None acts like a test teammate of its own family"
     card = render_card(write())
@@ -143,16 +125,6 @@ def test_teammates_that_act_like_the_test_are_named(write):
     assert "(distance below 0.02): H3 on demo_wide like H1/t0." in card
     assert "Training and validation teammates of H3 are heuristics whose parameters were drawn" in card and own in card
     assert "Its training teammates H1 are heuristics, in place of the learned teammates" in card
-
-
-def test_how_histories_were_made(write):
-    noise = {"histories": 8, "episodes": 60, "start": [0.9, 1.0], "end": [0, 0], "begin": [0, 0.3], "finish": [0.6, 1]}
-    suite = TeammateSuite(algorithms={"demo_wide": ["fcp"]}, members=2, train=3, total_steps=10**6, threshold=20.0)
-    card = render_card(write(change=lambda of: replace(of, noise=noise | {"power": [0.5, 2.0]}, suite=suite)))
-    assert "8 histories of 60 episodes a task. The chance of a random action falls from 0.9-1.0 to 0" in card
-    assert "a population has 2 policies, each trained for 1,000,000 steps. Algorithms: fcp on demo_wide." in card
-    assert "if it earns more than 20 with its own partner" in card
-    assert "Not recorded" in render_card(write(change=lambda of: Provenance()))
 
 
 def test_the_bundled_card_is_short_and_current():
