@@ -126,16 +126,6 @@ def test_baselines_use_only_what_playing_needs():
     assert used <= BASELINES_MAY_USE
 
 
-def test_libraries_for_pictures_are_imported_where_they_draw():
-    faults = [
-        found
-        for found in project()[1]
-        if found.imported.split(".")[0] in PICTURES and found.place == "top"
-        if not found.importer.startswith(("benchmarks", "tests"))
-    ]
-    assert faults == []
-
-
 def test_importing_the_reader_loads_nothing_heavy():
     code = "import sys, icrl4aht_data; print(sorted({name.split('.')[0] for name in sys.modules}))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

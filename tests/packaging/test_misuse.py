@@ -54,30 +54,22 @@ download s3://a/b --to file | 'file' is a file
 convert --out out | give the form to convert to: --to full, lite, observations, published,
 convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps is for published files
 release build a b --out c | unexpected extra argument
-upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
-generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, search, small, smoke.
 generate --out g --address there:1 | --address needs --executor ray
-teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
-train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline, rl2.
-train ad --layout demo_wide --learning-rate nan | learning_rate = 'nan': expected `float` > 0
 train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
 train rl2 --layout demo_wide --size tiny | --size: not with rl2, which learns by playing
 train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: not with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
-research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2,
 research reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states its results
 research reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 results | Missing option '--out'
 submit empty --out r.json --about a | Missing option '--data'
-research tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid: ad, dpt, hybrid_ad, amago_offline.
 evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent empty --out e | empty: not a run: config.json is missing
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
 evaluate --agent stay --out e --split train | unknown split 'train'; valid: test, validation
 evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --split: not with --manifest
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
-watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """
 
@@ -89,12 +81,8 @@ list htps://x | not an address that fsspec opens: Protocol not known: htps; expe
 convert {MINI} --out file/x --to lite | file: File exists; a file is where a folder is needed
 convert {MINI} --out none/index --to parquet | none/index: No such file or directory; check the path;
 combine --out out {MINI} --data-version banana | data version 'banana': expected one such as 1.0.0
-combine --out out {MINI} {MINI} | leave one of them out
-check none empty | none: no such folder
 research diversity --suite empty | empty: no layout has all its populations finished; `icrl4aht-data
 train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
-train amago_offline --layout demo_wide --labels oracle | amago_offline learns from the histories' own
-train rl2 --layout demo_wide --every 2 | every = 2: rl2 learns by playing, not from histories
 train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
 collect --agent stay --source student --out c | source = student: none of Dataset(
 collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON

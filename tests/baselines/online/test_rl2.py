@@ -346,15 +346,8 @@ class TestPreparing:
                 ("layout", "train", "diverse"),
                 "asymm_right: neither a chosen history nor a task of a manifest",
             ),
-            (
-                PlayOptions(rearranged=1),
-                HistoryOptions(("cramped_up",), teammate_family=("rl",)),
-                None,
-                "cramped_up: rearranged layouts and four recipes need heuristic",
-            ),
             (PlayOptions(), CHOICE, ("layout", "test"), "none of the 40 tasks is on cramped_up, but on asymm_right, "),
             (PlayOptions(), HistoryOptions(("cramped_up",), queries=7), None, "queries = 7: rl2 learns by playing"),
-            (PlayOptions(), HistoryOptions(("cramped_up",), channels="own"), None, "rl2 takes canonical channels"),
         ],
     )
     def test_invalid_choices_of_teammates(self, play, choice, manifest, message):
