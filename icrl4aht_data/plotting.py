@@ -203,30 +203,6 @@ def plot_source_curves(curves: SourceCurves, path: Path | None = None) -> Figure
     return _plot_bands(path, panels, labels, what, size, columns=min(4, len(curves)))
 
 
-def plot_curves(path: Path | None, panels: Sequence[tuple[str, dict[str, np.ndarray]]]) -> Figure:
-    """Plot panels of learning curves with equal limits and one legend.
-
-    A line is the mean over streams, smoothed by a running mean over a twentieth of the episodes. A band spans the 10th
-    to 90th percentile of the streams, without smoothing.
-
-    Args:
-        path: the file to write; None to write none.
-        panels: for each panel its title, and label -> returns, float (streams, episodes).
-
-    Raises:
-        OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
-    """
-
-    def band(returns: np.ndarray) -> _Band:
-        episodes = returns.shape[1]
-        return _Band(np.arange(1, episodes + 1), running_mean(returns.mean(axis=0), episodes // 20), returns)
-
-    shown = [(title, {label: band(returns) for label, returns in curves.items()}) for title, curves in panels]
-    labels = list(dict.fromkeys(label for _, curves in panels for label in curves))
-    what = "Return of the kept steps by episode (lines: running means of the mean; bands: 10th to 90th percentile)"
-    return _plot_bands(path, shown, labels, what, (4.2, 2.7))
-
-
 class _Band(NamedTuple):
     """A line with a band around it.
 

@@ -39,8 +39,8 @@ COMPILATION_CACHE: dict[str, Any] = {
     "jax_persistent_cache_min_compile_time_secs": 0.1,  # with a warm cache a third less CPU time than 0.5
 }
 COSTLIEST = """
-collect notebooks suite rl2 wheel reference run generate noise heuristics fetch controls responses commands docs hostile
-faults
+collect notebooks wheel reference generate run heuristics scripted suite fetch gymnasium_env rl2 docs models trainer
+rollout ppo population_updates oracle hostile faults experiments responses commands controls
 """
 """The files that take longest, in their order; `test_collect.py` makes what others read."""
 QUICK_COMPILATION = (

@@ -18,7 +18,7 @@ from icrl4aht_data.overcooked.observe import observe_both
 from icrl4aht_data.overcooked.state import State, columns, unpack
 from tests.helpers.states import random_records, state_record
 
-CRAMPED, ASYMM = LAYOUTS["cramped_up"], LAYOUTS["asymm_both"]
+CRAMPED = LAYOUTS["cramped_up"]
 PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
 FOUR_RECIPES = np.array([3 * ZERO, 2 * ZERO + ONE, ZERO + 2 * ONE, 3 * ONE], np.uint8)
 

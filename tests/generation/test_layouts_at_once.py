@@ -77,7 +77,7 @@ def test_every_layout_plays_as_alone(played, number):
 def test_layouts_are_drawn_at_each_reset():
     env = Environment(GROUP, max_steps=1, redraws=True)
     step = jax.jit(lambda state: env.step(state, jnp.full((ENVS, 2), 4)).state)
-    states = [env.init(keys_of(ENVS))]
+    states = [jax.jit(env.init)(keys_of(ENVS))]
     for _ in range(30):
         states.append(step(states[-1]))
     numbers = np.array([state.layout for state in states])
@@ -120,6 +120,6 @@ class TestTables:
 
 def test_numbers_of_layouts_can_be_chosen():
     env = Environment(GROUP, max_steps=STEPS)
-    state = env.init(keys_of(2), jnp.array([3, 1]))
+    state = jax.jit(env.init)(keys_of(2), jnp.array([3, 1]))
     assert state.layout is not None and state.layout.tolist() == [3, 1]
     assert all(GROUP[number].walkable[cells].all() for number, cells in zip([3, 1], state.record[:, :2], strict=True))

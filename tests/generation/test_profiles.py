@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -289,39 +290,21 @@ H3 = 'families = ["assembly_line"]'
     [
         ("[release]", "[releases]", "'?releases'?"),
         ("rollout = 40", "rolout = 40", "rolout"),
-        ("gru = 8", "grus = 8", "grus"),
-        ("presets =", "preset =", "preset"),
-        ("keep = 8", "", "keep"),
         (PRESETS, "", r"tasks\.presets"),
         (PRESETS, 'algorithms = ["fpc"]', "fpc.*'fcp'"),
         ('"coord_simple"', '"coord_simpel"', "coord_simpel.*'coord_simple'"),
-        ('"default"', '"defualt"', "defualt.*'default'"),
         ("presets =", 'algorithms = { demo_wide = ["fcp"] }\npresets =', "demo_wide"),
-        ("presets =", 'algorithms = { cramped_up = ["fcp", "fcp"] }\npresets =', "cramped_up"),
-        ("presets =", 'algorithms = "fcp"\npresets =', "algorithms"),
-        ("[ego]\n", "noise = 5\n[ego]\n", "noise"),
         ("keep = 8", "keep = 9", r"keep = 9: expected 1\.\.8"),
-        ("keep = 8", "keep = true", "keep"),
-        ('data_version = "0.2.0"', "data_version = 2", "data_version"),
         ("minibatches = 4", "minibatches = 3", "minibatches = 3"),
-        ("rollout = 40", "rollout = -40", "rollout"),
-        ("rollout = 40", 'rollout = 40\nlearning_rate = "fast"', "learning_rate"),
-        ("gru = 8", "gru = 8.5", "gru"),
         ("presets =", 'sources = ["ppo", "nois"]\npresets =', "nois"),
         ("presets =", 'sources = ["ppo", "search"]\npresets =', r"tasks\.preference = \[\]"),
         ("presets =", 'preference = ["all"]\npresets =', r"tasks\.preference = \['all'\].*expected .* source search"),
-        ("presets =", 'preference = ["demo_wide"]\npresets =', "preference.*demo_wide"),
-        ("presets =", "learners = 0\npresets =", "learners"),
-        ("[release]", "[noise]\nstart = 1.5\n[release]", "start"),
+        ("presets =", 'algorithms = { cramped_up = ["fcp", "fcp"] }\npresets =', "cramped_up"),
         ("[release]", "[noise]\nend = [0.3, 0.1]\n[release]", "end"),
         ("[release]", "[noise]\nbegin = [0, 0.7]\nfinish = 0.5\n[release]", "begin"),
-        ("[release]", "[noise]\nepisodes = 3\n[release]", "episodes"),
         ("[release]", "[ego.layouts.demo_wide]\nentropy = 0.02\n[release]", "demo_wide"),
-        ("keep = 8", "keep = 8\nleast_rise = nan", "least_rise"),
         ("presets =", 'sampled = { families = ["territori"], per_layout = 1 }\npresets =', "territori.*'territory'"),
         ("presets =", f"sampled = {{ {H3}, per_layout = 2, ppo = 3 }}\npresets =", "ppo"),
-        ("presets =", f"sampled = {{ {H3}, per_layout = 999 }}\npresets =", "999 drawn training teammates"),
-        ("presets =", f"sampled = {{ {H3} }}\npresets =", "per_layout"),
         ("presets =", "spread = { per_layout = 1, ppo = 2 }\npresets =", r"tasks\.spread\.ppo = 2"),
         ("presets =", f"spread = {{ {H3}, per_layout = 1 }}\npresets =", "families"),
         ("presets =", f"sampled = {{ {H3}, per_layout = 1, validation = 1 }}\npresets =", "validation"),
@@ -372,16 +355,13 @@ def test_task_files_round_trip(tmp_path):
     assert list(json.loads(lines[0])) == ["task_id", "track", "split", "layout_name", "seed", "teammate"]
 
 
+@cache
 def _lines() -> list[str]:
     return [json.dumps(task_fields(work.task)) for work in load_profile("mini").works()[:2]]
 
 
 def _with(line: str, **fields) -> str:
     return json.dumps(json.loads(line) | fields)
-
-
-def _without(line: str, field: str) -> str:
-    return json.dumps({name: value for name, value in json.loads(line).items() if name != field})
 
 
 @pytest.mark.parametrize(
@@ -391,25 +371,14 @@ def _without(line: str, field: str) -> str:
             lambda first, line: _with(line, color="blue"),
             r".*unknown field `color`; expected the fields task_id, ",
         ),
-        (lambda first, line: _without(line, "seed"), r".*missing required field `seed`; expected the fields "),
         (lambda first, line: first, r"duplicate task_id 'teammate_train_grounded_coord_simple_utility_greedy_t0_s0_"),
         (lambda first, line: _with(line, seed=9), r"task_id '.*_s1_.*' does not match .*expected '.*_s9_"),
-        (
-            lambda first, line: _with(line, task_id=line.split('"')[3][:-8] + "00000000"),
-            r"task_id '.*_00000000' does not match",
-        ),
-        (lambda first, line: _with(line, layout_name="demo_cook_wild"), r"unknown layout .*mean 'demo_cook_wide'\?"),
         (lambda first, line: _with(line, track="teammates"), r"unknown track 'teammates'; .*mean 'teammate'\?"),
-        (lambda first, line: _with(line, split="tests"), r"unknown split 'tests'; .*mean 'test'\?"),
         (
             lambda first, line: _with(line, teammate={"kind": "heuristic"}),
             r"teammate: Object missing required field `family`; expected the fields kind, family, ",
         ),
-        (lambda first, line: _with(line, seed="1"), r"expected `int`, got `str` - at `\$\.seed`"),
-        (lambda first, line: _with(line, track=["teammate"]), r"expected `str`, got `array` - at `\$\.track`"),
-        (lambda first, line: _with(line, layout_name="asymm_advantages_recipes_right"), r"unknown layout of the train"),
         (lambda first, line: line[:-1], r"not JSON: "),
-        (lambda first, line: "", r"not JSON: "),
         (lambda first, line: "[1, 2]", r"expected `object`, got `array`; expected the fields .*, found \[1, 2\]"),
     ],
 )

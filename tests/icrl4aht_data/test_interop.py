@@ -54,13 +54,6 @@ class TestPasses:
         for i, obs in zip((2, 5, 8), found, strict=True):
             np.testing.assert_array_equal(obs, sampler[i].obs)
 
-    def test_prefetched_batches_continue_after_a_loop_is_left(self, sampler):
-        with sampler.batches() as batches:
-            for _ in zip(range(3), batches, strict=False):
-                pass
-            state = batches.state_dict()
-            assert_equal(next(batches), sampler[state["next"]])
-
     def test_grain_continues_and_resumes_over_passes(self, sampler):
         import grain
 

@@ -98,13 +98,6 @@ def test_invalid_settings(elsewhere, monkeypatch, value):
     assert remote == "ICRL4AHT_REMOTE='example.org/icrl4aht': expected an address"
 
 
-def test_offline_is_no_problem(elsewhere, monkeypatch):
-    monkeypatch.setenv("ICRL4AHT_OFFLINE", "1")
-    facts, text = run_doctor()
-    assert facts["ok"] and facts["network"]["offline"] == ["ICRL4AHT_OFFLINE"]
-    assert 'offline: ["ICRL4AHT_OFFLINE"]' in text
-
-
 def test_damaged_bundled_release(elsewhere, monkeypatch, damaged):
     shard = damaged / SHARD
     shard.write_bytes(shard.read_bytes()[:-1])
@@ -140,19 +133,6 @@ def test_broken_jax(elsewhere, monkeypatch):
     assert any("JAX cannot be used: ImportError: libcuda.so" in problem for problem in problems())
 
 
-def test_installation_without_jax(elsewhere, monkeypatch):
-    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
-    facts, _ = run_doctor()
-    assert facts["ok"] and "jax" not in facts["devices"]
-
-
-def test_gpu_that_jax_does_not_use(elsewhere, monkeypatch):
-    monkeypatch.setattr(shutil, "which", lambda name: name)
-    facts, text = run_doctor()
-    assert facts["ok"]
-    assert "JAX sees no GPU" in text
-
-
 def test_every_optional_package_has_its_extra(elsewhere):
     """The constant hints agree with the metadata of the installed package."""
     listed = [Requirement(line) for line in importlib.metadata.requires("icrl4aht-data") or []]
@@ -162,9 +142,9 @@ def test_every_optional_package_has_its_extra(elsewhere):
     assert EXTRAS.keys() <= run_doctor()[0]["packages"].keys()
 
 
-def test_package_that_is_not_installed(elsewhere, monkeypatch):
-    def missing(name: str) -> None:
-        raise importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(doctor, "version", missing)
-    assert problems() == {"icrl4aht-data: not installed": "pip install icrl4aht-data, or -e . in a checkout"}
+def test_what_is_no_problem_is_shown(elsewhere, monkeypatch):
+    """Offline mode, and a GPU that JAX does not use."""
+    monkeypatch.setenv("ICRL4AHT_OFFLINE", "1")
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    facts, text = run_doctor()
+    assert facts["ok"] and 'offline: ["ICRL4AHT_OFFLINE"]' in text and "JAX sees no GPU" in text

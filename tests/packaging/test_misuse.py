@@ -42,74 +42,47 @@ def say(capsys, monkeypatch, tmp_path):
 MISUSED = """
 lst | unknown command 'lst'; valid: list, show,
 list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
-list --source nois | unknown source 'nois'; valid: ppo, noise, agent, search. Did you mean 'noise'?
 verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
-verify --deeep | No such option
 show 158 | 158: no such folder; give a history's id as --history 158
-show --history -1 | -1 is not in the range x>=0
 show --history 9999 | this selection has no history [9999], ids are within 0..
 browse --out page.txt | page.txt: expected a name that ends in .html
 browse --out none/page.html | no folder none: make it first, or give another path
-browse --histories 0 | 0 is not in the range x>=1
 show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
-show --plot none/curves.png | no folder none: make it first, or give another path
 download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 download s3://a/b --to file | 'file' is a file
 convert --out out | give the form to convert to: --to full, lite, observations, published,
 convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps is for published files
-convert {MINI} --out out --to lite --kept-steps 0 | 0 is not in the range x>=1
 release build a b --out c | unexpected extra argument
-upload {MINI} folder | folder: expected an address such as hf://datasets/<org>/<repo>
-generate --out g --profile smke | unknown profile 'smke'; valid: cpu, mini, noise, paper, search, small, smoke.
-generate --out g --seed -1 | -1 is not in the range 0<=x<=4294967295
 generate --out g --address there:1 | --address needs --executor ray
-teammates --algorithm fpc --suite s | unknown algorithm 'fpc'; valid: fcp, brdiv, lbrdiv, comedi.
-train da --layout demo_wide | unknown method 'da'; valid: ad, dpt, hybrid_ad, amago_offline, rl2.
-train ad --layout demo_wide --order rnd | unknown order 'rnd'; valid: contiguous, random.
-train ad --layout demo_wide --batch-size 0 | batch_size = '0': expected `int` >= 1
-train ad --layout demo_wide --learning-rate nan | learning_rate = 'nan': expected `float` > 0
 train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
 train rl2 --layout demo_wide --size tiny | --size: not with rl2, which learns by playing
 train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: not with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
-collect --agent stay --out c --episodes 5 | 5 is not in the range x>=10
-collect --agent stay --out c --noise 2 0 | noise = '2': expected `float` <= 1
-research reference --name ad-nois | unknown reference model 'ad-nois'; valid: rl2,
 research reference --name rl2 --no-evaluate --bundle-as rl2-x | its card states its results
 research reference --name rl2 --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
 results | Missing option '--out'
 submit empty --out r.json --about a | Missing option '--data'
-research tracks --method rl2 --layout demo_wide | unknown method 'rl2'; valid: ad, dpt, hybrid_ad, amago_offline.
 evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
-evaluate --agent none --out e | A trained model is named by its folder
 evaluate --agent empty --out e | empty: not a run: config.json is missing
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
 evaluate --agent stay --out e --split train | unknown split 'train'; valid: test, validation
 evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --split: not with --manifest
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
-watch --layout demo_wide --out e.gif --teammate H9/t0 | unknown teammate 'H9/t0'; valid: H1/t0,
-research headroom --protocol x | unknown protocol 'x'; valid: published, seeded, swap.
-research sweep size --only smal | unknown setting of sweep size 'smal'; valid: small, medium, large.
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """
 
 FAILED = """
 list none | none: no release here, expected meta/info.json in it; give the folder of a release
 list empty | empty: no release here, expected meta/info.json in it; give the folder of a release
-list --split test | no history has split=['test']. This release has split train, validation; layout
 verify none | none: no such folder; give the folder or the address of a release none: 1 problem; checked
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
 convert {MINI} --out file/x --to lite | file: File exists; a file is where a folder is needed
 convert {MINI} --out none/index --to parquet | none/index: No such file or directory; check the path;
 combine --out out {MINI} --data-version banana | data version 'banana': expected one such as 1.0.0
-combine --out out {MINI} {MINI} | leave one of them out
-check none empty | none: no such folder
 research diversity --suite empty | empty: no layout has all its populations finished; `icrl4aht-data
 train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
-train amago_offline --layout demo_wide --labels oracle | amago_offline learns from the histories' own
-train rl2 --layout demo_wide --every 2 | every = 2: rl2 learns by playing, not from histories
 train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
 collect --agent stay --source agent --out c | source = agent: none of Dataset(
 collect --agent stay --out c --manifest {MINI}/meta/info.json | meta/info.json, line 1: not JSON

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 from collections import defaultdict
 from collections.abc import Iterator
 
@@ -11,9 +10,6 @@ from tests.helpers.paths import PACKAGES, ROOT
 
 LONGEST = 500
 """Most lines of a source file, as CONTRIBUTING.md says."""
-
-OPENING = re.compile(r"(Of|The same|By|Its)\b")
-"""Openings of sentences that only the previous docstring explains."""
 
 
 def sources(*names: str) -> Iterator[tuple[str, str]]:
@@ -43,17 +39,6 @@ def test_public_names_are_unique():
         for name in public_names(ast.parse(text)):
             modules[name].add(path)
     assert {name: paths for name, paths in modules.items() if len(paths) > 1 and name not in ("main", "VERBS")} == {}
-
-
-def test_docstrings_make_sense_alone():
-    strings = [
-        (path, statement.lineno, statement.value.value)
-        for path, text in sources(*PACKAGES)
-        for node in ast.walk(ast.parse(text))
-        for statement in (node.body if isinstance(getattr(node, "body", None), list) else [])  # type: ignore[attr-defined]
-        if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-    ]
-    assert [found for found in strings if OPENING.match(str(found[2]))] == []
 
 
 def test_source_files_are_short():

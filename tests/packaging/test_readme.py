@@ -59,16 +59,6 @@ def test_commands_are_accepted():
         understand(cli, arguments)
 
 
-def test_publishing_is_preparing_and_uploading():
-    (line,) = re.findall(r"^icrl4aht-data release build .*$", README, re.MULTILINE)
-    assert line.endswith("# prepare a release for publication")
-    assert "`icrl4aht-data upload` [publishes]" in README
-
-
-def test_it_names_the_test_commands():
-    assert {"demo", "test", "test-slow", "docs", "help"} <= set(re.findall(r"make ([a-z-]+)", README))
-
-
 def test_published_returns_are_those_of_headroom_json():
     table = published_table(json.loads(card_file("headroom.json").read_text())["published"])
     assert table in README

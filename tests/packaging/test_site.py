@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.paths import PACKAGES, ROOT
+from tests.helpers.paths import ROOT
 from tests.packaging.test_docs import DOCS, PAGES, rows
 
 FILES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(DOCS / f"{page}.md" for page in PAGES)]
@@ -60,20 +60,6 @@ def test_extras_are_listed():
     listed = {name for cells in rows("start", "extra") for name in cells[0].split(", ")}
     assert listed == project["optional-dependencies"].keys() - {"browser", "peers"}
     assert re.search(r"\[.*\bbrowser\b.*\]", project["optional-dependencies"]["dev"][0]), "tests of pages need it"
-
-
-def test_messages_of_the_faq_are_those_of_the_code():
-    """Every part of a message between "..." is in the source, whose adjacent string literals are joined."""
-    folders = [folder for name, folder in PACKAGES.items() if name.startswith("icrl4aht")]
-    sources = "".join(path.read_text(encoding="utf-8") for folder in folders for path in folder.rglob("*.py"))
-    joined = re.sub(r"[\"']\s*f?[\"']", "", sources).lower()
-    titles = re.findall(r"^### (.*)$", PAGES["faq"], re.MULTILINE)
-    foreign = "Namespace icrl4aht not found"  # Gymnasium's message
-    messages = [title for title in titles if not title.endswith("?") and title != foreign]
-    assert len(messages) > 20
-    for message in messages:
-        for part in message.lower().split("..."):
-            assert part.strip(" ,;") in joined, message
 
 
 @pytest.fixture(scope="module")

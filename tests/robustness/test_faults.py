@@ -296,23 +296,16 @@ def test_two_processes_at_once(release, batches, caches, tmp_path, what):
 
 
 @SLOW
-@pytest.mark.parametrize("moment", [0.02, 0.1, 0.2, 0.4])
-@pytest.mark.parametrize("what", ["download", "build"])
-def test_what_a_killed_process_left_is_used_or_replaced(release, batches, caches, tmp_path, what, moment):
-    to = tmp_path / "copy"
-    with http_server(release) as server:
-        server.faults.next(Slow(0.02), times=10**9)
-        process = start(CODE[what] + "\nsys.stdin.readline()", release if what == "build" else server.url, to)
-        assert process.stdin is not None
-        process.stdin.write("\n")
-        process.stdin.flush()
-        time.sleep(moment)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
-        process.communicate()
-        if what == "download":
-            fetch_planned(plan_download(server.url, to=to))
-            assert contents(to) == contents(release)
+@pytest.mark.parametrize("moment", [0.02, 0.1, 0.3])
+def test_what_a_killed_process_left_is_used_or_replaced(release, batches, caches, moment):
+    process = start(CODE["build"] + "\nsys.stdin.readline()", release)
+    assert process.stdin is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+    time.sleep(moment)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    process.communicate()
     for _ in range(2):  # the first builds what is missing, the second finds it
         assert hash_batches(load_icrl4aht(release, obs="uint8", cache="mmap")) == batches
 

@@ -71,10 +71,8 @@ def card(**changes: Any) -> str:
     [
         (card(widths={"gru": 2**40}), None, "gru = 1099511627776: expected `int` <= 8192"),
         (card(widths={"spatial": [1] * 10**6}), None, "expected `array` of length <= 16"),
-        (card(widths=[8]), None, "not a checkpoint"),
         (card(shapes={"params/a": [2**40]}), None, "the card states"),
         ("[]", None, "policy.json is not an object"),
-        ("[" * 10**5, None, "not a checkpoint"),
         (card(), (2**63 - 1).to_bytes(8, "little") + b"{}", "not a checkpoint"),
         (
             card(),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict
 from pathlib import Path
 
 import jax
@@ -13,13 +12,11 @@ import pytest
 from click.testing import CliRunner
 from icrl4aht_baselines.agents import bundled
 from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
-from icrl4aht_baselines.agents.egos import PlayMode, find_agent
+from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import get_protocol
-from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.report.results import ResultCell, as_run
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.trainer import train
@@ -80,21 +77,6 @@ def test_a_bundled_model_keeps_its_play_mode(run, tmp_path, monkeypatch):
     assert find_ego("--agent", str(run), greedy=False).name == "AD+mlp (sampled)"
     result = CliRunner().invoke(cli, ["models"], catch_exceptions=False)
     assert result.output.endswith("(source noise), draws its actions\n")
-
-
-def test_overlap_marks_depend_on_the_track():
-    """Only one track's model was trained with H2."""
-    entries = {
-        "teammate": [{"layout": "demo_wide", "family": "H1"}],
-        "layout": [{"layout": "cramped_up", "family": "H2"}],
-    }
-    settings = {"agent": "two", "seeds": [0], "protocol": asdict(get_protocol("seeded")), "code_version": "0"}
-    settings |= {"details": {"model": "two", "trained_on": entries}}
-    tasks = [published_task(layout, "H2/t0") for layout in ("demo_wide", "cramped_down")]
-    run = as_run([Result(task.task_id, settings, [[0.0] * 100]) for task in tasks])
-    assert [source.layouts for source in run.sources] == [("demo_wide",), ("cramped_down",)]
-    assert run.overlaps([ResultCell("demo_wide", "H2")]) == ()
-    assert run.overlaps([ResultCell("cramped_down", "H2")]) == ("family",)
 
 
 def test_layouts_outside_the_track_are_refused(models):
@@ -159,8 +141,3 @@ class TestPlayMode:
         assert find_agent(run, greedy=False).name == "AD+mlp (sampled)"
         with pytest.raises(UnknownNameError, match=r"unknown acting 'exat'.*Did you mean 'exact'"):
             find_agent(run, acting="exat")  # type: ignore[arg-type]
-
-    def test_details_and_back(self):
-        for mode in (PlayMode(), PlayMode("exact", False)):
-            assert PlayMode.from_details(mode.details) == mode
-        assert PlayMode().details == {"acting": "cached"}

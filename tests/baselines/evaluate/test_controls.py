@@ -290,8 +290,6 @@ def test_controls_command(programs, tmp_path, monkeypatch):
         assert len(list((tmp_path / folder / "tasks").glob("*.json"))) == 2
     result = run("run", "--controls", "--forget")
     assert result.exit_code == 2 and "--controls: not with --forget" in result.output
-    result = run("swap", "--protocol", "swap", "--episodes", "50")
-    assert result.exit_code == 0 and "(swap), 2 test cells" in result.output, result.output
     result = run("forgets", "--episodes", "4", "--forget")
     assert result.exit_code == 0, result.output
     assert read_run(tmp_path / "forgets").table.equals(read_run(tmp_path / "run/forgets").table)

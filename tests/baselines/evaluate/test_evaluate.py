@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, find_agent, random, stay
+from icrl4aht_baselines.agents.egos import find_agent, random, stay
 from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
-from icrl4aht_baselines.evaluate.results import Result, read_result, write_result
-from icrl4aht_baselines.report import results as results_of_runs
-from icrl4aht_baselines.report.page import csv_text, markdown
-from icrl4aht_baselines.report.results import OWN_TASKS, as_run, read_run
+from icrl4aht_baselines.evaluate.results import read_result
+from icrl4aht_baselines.report.results import read_run
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_tasks
 
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import read_headroom
-from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
+from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS
@@ -243,18 +240,6 @@ def test_unknown_names():
         get_protocol("publish")
 
 
-def test_report_shows_the_published_numbers(together):
-    run = as_run(evaluate("random", random, SIMPLE, PUBLISHED))
-    text = markdown([run])
-    assert "paper 35.2 ± 0.4" in text
-    assert "<br>no headroom |" in text
-    mean = np.mean([together[task.task_id] for task in SIMPLE])
-    assert f"| H4 | random | {mean:.1f} ± " in text
-    header, *lines = csv_text([run]).splitlines()
-    assert header.startswith("agent,training,protocol,control,layout,family,")
-    assert {tuple(line.split(",")[:6]) for line in lines} == {("random", "0", "published", "", "coord_simple", "H4")}
-
-
 def test_tasks_and_episodes_are_limited():
     assert limit_tasks(SIMPLE + RING, 2) == SIMPLE[:2] + RING[:2]
     assert limit_tasks(SIMPLE, None) == SIMPLE
@@ -281,51 +266,9 @@ def test_commands(tmp_path):
     result = CliRunner().invoke(cli, ["report", str(tmp_path / "run")])
     assert "report: exists" in str(result.exception)
     assert CliRunner().invoke(cli, ["report", str(tmp_path / "run"), "--overwrite"]).exit_code == 0
-    other = ["--out", str(tmp_path / "new"), "--html", str(tmp_path / "two.jsonl")]
-    result = CliRunner().invoke(cli, ["report", str(tmp_path / "run"), "--overwrite", *other])
-    assert "two.jsonl: expected a name that ends in .html" in result.output
-    watched = ["watch", "--layout", "demo_wide", "--out", str(tmp_path / "mine.gif")]
-    (tmp_path / "mine.gif").write_text("mine")
-    assert "exists; give another name" in str(CliRunner().invoke(cli, watched).exception)
     (tmp_path / "two.jsonl").write_text("{}\n")
     result = CliRunner().invoke(cli, ["evaluate", "--agent", "stay", *options])
     assert "line 1" in str(result.exception)
-
-
-def test_validation_tasks_are_reported_separately(tmp_path, monkeypatch):
-    """Results of both splits may share a folder; reading them needs no bundled manifest."""
-    tasks = [make_task("teammate", "validation", "coord_simple", task.teammate, 5) for task in SIMPLE[:2]]
-    write_tasks(tmp_path / "teammate_validation.jsonl", tasks)
-    write_tasks(tmp_path / "teammate_test.jsonl", SIMPLE)
-
-    def path(track: str, split: str, teammates: str = "") -> Path:
-        return tmp_path / ("_".join(filter(None, (track, teammates, split))) + ".jsonl")
-
-    for track in TRACKS:
-        write_tasks(path(track, "validation", "diverse"), [])
-    write_tasks(path("layout", "validation"), [])
-    write_tasks(path("layout", "test"), [])
-    monkeypatch.setattr("icrl4aht_baselines.evaluate.protocols.manifest_path", path)
-    # Entries cached from other manifests would leak into later tests.
-    monkeypatch.setattr(results_of_runs, "bundled_by_id", results_of_runs.bundled_by_id.__wrapped__)
-    monkeypatch.setattr(
-        "icrl4aht_baselines.commands.train_commands.find_ego",
-        lambda option, name, **mode: NamedEgo(name, AGENTS[name]),
-    )
-    settings = {"agent": "stay", "seeds": [0], "protocol": dataclasses.asdict(PUBLISHED), "code_version": "0"}
-
-    def write_results(name, ego, tasks, protocol, *, out, **options):
-        for task in tasks:
-            write_result(out, Result(task.task_id, settings, [[1.0, 2.0]]))
-
-    monkeypatch.setattr("icrl4aht_baselines.evaluate.evaluator.evaluate", write_results)
-    command = ["evaluate", "--agent", "stay", "--track", "teammate", "--out", str(tmp_path / "run")]
-    for split in (["--split", "validation"], ["--split", "test"], []):
-        result = CliRunner().invoke(cli, [*command, *split])
-        assert result.exit_code == 0, result.output
-    assert read_tasks(tmp_path / "run" / OWN_TASKS) == tasks
-    sizes = {cell: len(returns) for cell, returns in read_run(tmp_path / "run").cells.items()}
-    assert sizes == {("coord_simple", "H4", "test"): 5, ("coord_simple", "H4", "validation"): 2}
 
 
 def test_headroom_cards_cover_every_cell():

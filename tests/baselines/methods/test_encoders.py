@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,17 +31,15 @@ def two_layouts(tmp_path_factory) -> Path:
     return root
 
 
-def made(name: str, kind: Any, view: Any = None) -> Method:
-    return get_method(name)(
+def made(kind: Any, view: Any = None) -> Method:
+    return get_method("ad")(
         dataclasses.replace(OPTIONS, encoder=kind), overcooked_world([get_layout("demo_wide")], kind, view)
     )
 
 
-@cache
-def batch_of(root: Path, name: str, obs: Any) -> Any:
+def batch_of(root: Path, obs: Any) -> Any:
     dataset = load_icrl4aht(root, layout="demo_wide", obs=obs)
-    shared: Any = {"batch_size": 3, "teammate_actions": True}
-    return dataset.dpt(context=8, **shared)[2] if name == "dpt" else dataset.ad(length=9, **shared)[2]
+    return dataset.ad(length=9, batch_size=3, teammate_actions=True)[2]
 
 
 def loss_and_gradient(method: Method, params: Any, batch: Any) -> Any:
@@ -63,24 +60,14 @@ def assert_equal_results(one: Any, two: Any, params: Any) -> None:
     jax.tree.map(compare, gradient, other_gradient)
 
 
-@pytest.mark.parametrize("name", ["ad", pytest.param("dpt", marks=pytest.mark.slow)])
-def test_words_give_the_loss_and_gradient_of_the_paper(lite, name):
+def test_words_give_the_loss_and_gradient_of_the_paper(lite):
     """The paper's encoder gets observations, `words` gets state records."""
-    paper, words = made(name, "paper", plain_view), made(name, "words")
+    paper, words = made("paper", plain_view), made("words")
     params = random_parameters(paper)
     jax.tree.map(np.testing.assert_array_equal, params, random_parameters(words))
-    found = loss_and_gradient(words, params, batch_of(lite[0], name, "state"))
+    found = loss_and_gradient(words, params, batch_of(lite[0], "state"))
     assert 0 < found[0][1]["distinct_observations"] < 1
-    assert_equal_results(found, loss_and_gradient(paper, params, batch_of(lite[0], name, "uint8")), params)
-
-
-@pytest.mark.slow
-def test_entries_give_the_loss_and_gradient_of_observations(lite):
-    plain, entries = made("ad", "mlp", plain_view), made("ad", "mlp")
-    params = random_parameters(plain)
-    found = loss_and_gradient(entries, params, batch_of(lite[0], "ad", "state"))
-    assert "distinct_observations" not in found[0][1]
-    assert_equal_results(found, loss_and_gradient(plain, params, batch_of(lite[0], "ad", "uint8")), params)
+    assert_equal_results(found, loss_and_gradient(paper, params, batch_of(lite[0], "uint8")), params)
 
 
 @pytest.mark.parametrize("collide", [False, True])

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -47,7 +46,7 @@ def idle(layout: Any) -> Policy:
     return stay(layout)._replace(sees="ego_input")
 
 
-COOK, IDLE = NamedEgo("cook", cook, {"version": 1}), NamedEgo("idle", idle)
+COOK = NamedEgo("cook", cook, {"version": 1})
 
 
 @pytest.fixture(scope="module")
@@ -224,12 +223,3 @@ def test_histories_like_those_of_reference_models(monkeypatch, tmp_path):
     result = CliRunner().invoke(cli, [*arguments, "--noise", "1", "0", "--episodes", "60"])
     assert result.exit_code == 2 and len(made) == 1
     assert "--like: not with --episodes, --noise, which it sets" in " ".join(result.output.split())
-
-
-def test_memory_of_the_noise():
-    policy = with_noise(idle(None), 3)
-    memory = policy.init(policy.params, jax.random.key(0))
-    for step in range(5):
-        action, memory = policy.act(policy.params, memory, jnp.zeros(0), jax.random.key(step))
-        assert int(action) == STAY
-    assert int(memory.steps) == 5 and memory.labels.tolist() == [STAY] * 3 and memory.labeller is None

@@ -14,7 +14,7 @@ from icrl4aht_baselines import report
 from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.report import gifs, merge, write_report
-from icrl4aht_baselines.report.cards import model_card, training_sentence, write_headroom_cards
+from icrl4aht_baselines.report.cards import training_sentence, write_headroom_cards
 from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
 from icrl4aht_baselines.report.page import REPORT_FILES, markdown, write_page, write_page_with_episodes
@@ -142,32 +142,6 @@ def trained(run: EvaluationRun, **model) -> EvaluationRun:
     config = {"method": "dpt", "model": model, "train": {"seed": 3}, "package_version": "0", "histories": histories}
     content = {"config": config, "manifest_sha256": "ab12", "run_hash": json.dumps(config)}
     return dataclasses.replace(run, sources=tuple(source._replace(trained=content) for source in run.sources))
-
-
-def test_the_card_of_a_bundled_model():
-    greedy = {"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}
-    first = trained(evaluated_run("AD", trained_on=[greedy], acting="cached"), layers=4, recurrent_layers=2)
-    other = trained(evaluated_run("AD", ("asymm_right",), trained_on=None, acting="cached"), layers=2)
-    own = [make_task("teammate", "validation", "demo_wide", TEST_TASKS[0].teammate, number) for number in (1, 2)]
-    (both,) = merge([first, other])
-    card = model_card(both, "dpt-reference", "python -m x", [evaluated_run("AD", tasks=own)], {"a/b.png": "A curve"})
-    parts = [
-        "\n# dpt-reference, a model for the ICRL4AHT benchmark\n",
-        "| method | dpt |\n",
-        "| data | the local release `icrl4aht@v1`, data version 1.0.0 |",
-        "| made by | `python -m x` |",
-        "| demo_wide | 14 of demo_wide; the release's manifest has SHA-256 `ab12` | demo_wide; with utility_greedy (1) "
-        "| 3 | protocol seeded, 1 seed (0), 40 episodes of 100 steps, cached acting, 5 instances in a cell |",
-        "| asymm_right | 14 of asymm_right; ",
-        "Tested on demo_wide:\n\n* layers: 4\n* seed: 3\n* queries: 201\n* every: 1\n* labels: oracle\n",
-        "Tested on asymm_right:\n\n* layers: 2",
-        "| H4 | AD | 11.0 ± 0.0 †<br>",
-        "Each model is one run, of seed 3",
-        "### Validation tasks, seeded\n",
-        "## Curves\n\nA curve:\n\n![b](a/b.png)\n",
-    ]
-    assert [part for part in parts if part not in card] == []
-    assert card.count("* † the agent was trained with other teammates of this family") == 2, "at the table, in limits"
 
 
 def test_cards_say_what_a_model_was_trained_on():

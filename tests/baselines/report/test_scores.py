@@ -29,7 +29,6 @@ from icrl4aht_baselines.report.tables import (
     find_headlines,
     published_cells,
     published_score,
-    read_published,
     returns_tables,
     table_score,
 )
@@ -39,7 +38,6 @@ from icrl4aht_data.benchmark import best_responses
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS
-from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.errors import OptionError
 from tests.helpers.evaluated import SPAN, TEST_TASKS, evaluated_run, write_measured
 
@@ -144,22 +142,13 @@ def test_the_summary_of_a_run(measured):
     )
 
 
-def test_results_without_a_score_say_why(measured, monkeypatch):
-    tasks = [task for task in TEST_TASKS if task.layout.name == "demo_wide"]
-    own = make_task("teammate", "validation", "demo_wide", tasks[-1].teammate | {"theta_id": 70}, 3)
-    test, validation = find_headlines(evaluated_run("mine", tasks=[tasks[0], own]))
-    assert test.score is None and not test.mean.range()
-    assert test.why_no_score.startswith(
-        "No score: it needs all tasks of a cell with a best response, in episodes of 100"
-    )
-    assert validation.why_no_score == "No score: no best response measured."
+def test_results_without_a_score_say_why(measured):
     (short,) = find_headlines(evaluated_run("mine", steps=20))
-    assert short.why_no_score == test.why_no_score
+    assert short.score is None and short.why_no_score.startswith("No score: it needs all tasks of a cell with a best")
     (flat,) = find_headlines(evaluated_run("mine", ("coord_simple",)))
     assert flat.why_no_score == "No score: no best response earns 5 more than `stay` in these cells."
     (published,) = find_headlines(evaluated_run("mine", protocol="published"))
     assert published.why_no_score == "No score: best responses were measured under protocol seeded."
-    assert "return 11.0; by episode" in test.text, "no interval of a single instance"
 
 
 def test_other_episode_lengths_have_no_paper_numbers():
@@ -196,15 +185,6 @@ def test_published_numbers_of_groups_of_cells():
     assert (found[0], found[2]) == (None, (-7.6, None)) and found[1] == tuple(
         published_cells("AD")["test_wide"][AVERAGE]
     )
-
-
-def test_the_papers_averages_equal_the_means_of_its_cells():
-    """This check finds copying errors; the numbers are rounded to a tenth."""
-    for layouts in read_published()["methods"].values():
-        for families in layouts.values():
-            if "H1" in families:
-                mean = np.mean([families[family][0] for family in HEURISTICS])
-                assert abs(mean - families[AVERAGE][0]) < 0.11
 
 
 def test_incomplete_and_flat_groups_are_marked(measured):

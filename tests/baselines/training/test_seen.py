@@ -80,9 +80,7 @@ def test_records_join_the_entries_of_a_kind():
     [
         None,
         "demo_wide",
-        ["demo_wide"],
         [{"layout": "demo_wide"}],
-        [{"layout": 3, "family": "H4"}],
         [{"layout": "demo_wide", "family": "H5"}],
         [{"layout": "demo_wide", "family": "H4", "algorithm": "fcp"}],
         [{"layout": "demo_wide", "family": "H4", "teammates": [3]}],

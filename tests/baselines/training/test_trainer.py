@@ -384,14 +384,10 @@ class TestHeldOut:
         ("method", "context", "choice", "message"),
         [
             ("ad", 121, {}, r"context = 121: the shortest history of .* has 120 steps for a window"),
-            ("dpt", 121, {}, r"context = 121: the shortest history has \d+ transitions; take fewer"),
             ("ad", 41, {"every": 3}, "context = 41: .* has 40 steps .* every = 3 and first = all;"),
             ("ad", 61, {"first": 3}, "context = 61: .* has 60 steps .* every = 1 and first = 3;"),
             ("dpt", 7, {"every": 2}, "every = 2: dpt learns from contexts of one part"),
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
-            ("amago_offline", 7, {"labels": "expert"}, "amago_offline learns from the histories' own actions"),
-            ("ad", 7, {"layouts": ("demo_wide", "coord_simple"), "channels": "own"}, "channels = own: .*: leave out"),
-            ("rl2", 7, {}, "rl2 learns by playing, not from histories"),
         ],
     )
     def test_impossible_trainings(self, long_ppo, method, context, choice, message):

@@ -33,9 +33,8 @@ def env():
 
 # Gymnasium's advice for images, which observations of 5x5 cells are not.
 @pytest.mark.filterwarnings("ignore:.*resize")
-@pytest.mark.parametrize("channels", ["own", "canonical"])
-def test_check_env(channels):
-    check_env(gymnasium.make(NAME, channels=channels, render_mode="rgb_array").unwrapped)
+def test_check_env():
+    check_env(gymnasium.make(NAME, channels="canonical", render_mode="rgb_array").unwrapped)
 
 
 def test_every_published_test_task_has_an_id():
@@ -46,10 +45,9 @@ def test_every_published_test_task_has_an_id():
     assert len(ids) == len(tasks) == 160
 
 
-@pytest.mark.parametrize("imports", ["gymnasium, icrl4aht_data", "gymnasium"], ids=["imported", "by its prefix"])
-def test_importing_the_package_registers_the_ids(imports):
-    name = NAME if "icrl4aht_data" in imports else f"icrl4aht_data:{NAME}"
-    code = f"import {imports}; print(gymnasium.make({name!r}).spec.id)"
+def test_the_prefix_of_an_id_imports_the_package():
+    """Importing the package registers the ids, on which the other tests rely."""
+    code = f"import gymnasium; print(gymnasium.make('icrl4aht_data:{NAME}').spec.id)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == NAME
 
@@ -92,7 +90,6 @@ def play_recorded(env, history, start: int, steps: int) -> tuple[list, list, lis
     "filters",
     [
         {"layout": "demo_wide", "source": "noise"},
-        {"layout": "asymm_both", "source": "ppo"},
         {"layout": "demo_wide", "teammate_family": "rl"},
     ],
     ids=str,
@@ -176,10 +173,7 @@ def test_episodes_that_do_not_exist_are_errors():
             OptionError,
             r"state: expected integers in 0\.\.255 of shape \(\d+,\)",
         ),
-        ({"state": np.zeros(99, float)}, OptionError, "found float64"),
         ({"state": "zeros"}, OptionError, "state: expected a state record of demo_wide, found a position that is not"),
-        ({"key": [1, 2, 3]}, OptionError, r"key: .* of shape \(2,\)"),
-        ({"episode": -1}, OptionError, "episode = -1"),
         ({"teammate_actions": [0, 6]}, OptionError, r"teammate_actions: expected integers in 0\.\.5 .* values 0\.\.6"),
         ({"recipes": [1]}, OptionError, "recipes: expected items of demo_wide's recipes"),
     ],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 import time
@@ -22,8 +21,6 @@ from icrl4aht_generation.collection.task_folder import (
     DiskFullError,
     partial_folder,
 )
-from icrl4aht_generation.jobs import job
-from icrl4aht_generation.jobs.job import FailureLog, JobOutcome
 from icrl4aht_generation.learners.resume import StateFile
 from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_generation.profiles.work import Work
@@ -199,17 +196,3 @@ def test_a_full_disk_keeps_the_saved_state(task, tmp_path):
     with pytest.raises(DiskFullError, match="task: the disk is full: this task needs "):
         run_task(task, tmp_path / "task", fill, save_seconds=0)
     assert StateFile(partial_folder(tmp_path / "task") / LEARNER).progress == 6
-
-
-def test_failures_wait_for_room(task, tmp_path, monkeypatch):
-    def full(path):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    log, outcome = FailureLog(tmp_path / "failed.jsonl"), JobOutcome(task[0], "failed", 1, "DiskFullError: no room")
-    with monkeypatch.context() as patch:
-        patch.setattr(job, "atomic_write", full)
-        log.add(outcome)
-        assert not log.is_written
-    log.forget(["another"])
-    assert log.is_written
-    assert json.loads((tmp_path / "failed.jsonl").read_text())["error"] == "DiskFullError: no room"

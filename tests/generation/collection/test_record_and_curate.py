@@ -10,16 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from icrl4aht_generation.collection import curate, record
-from icrl4aht_generation.env import Environment
-from icrl4aht_generation.experts.oracle import oracle
 from icrl4aht_generation.learners.config import PPOConfig, Widths
 from icrl4aht_generation.learners.network import ActorCritic
-from icrl4aht_generation.learners.rollout import Rollout, init_rollout, policy_player, random_player, roll_out
+from icrl4aht_generation.learners.rollout import Rollout
 
-from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
+from icrl4aht_data.overcooked.actions import EGO
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.overcooked.state import record_size, start
+from icrl4aht_data.overcooked.state import record_size
 from tests.helpers.states import random_records
 
 LAYOUT = LAYOUTS["cramped_up"]
@@ -223,36 +221,3 @@ def test_labels_need_the_memory_and_its_restart(labelled):
     assert (np.stack(labels) != without).mean() > 0.1
     assert (np.stack(labels)[:, 100:] != across[:, 100:]).any()
     np.testing.assert_array_equal(across[:, :100], logits["episode"][:, :100].argmax(axis=-1))
-
-
-@pytest.mark.slow
-def test_oracle_labels_are_what_the_oracle_does():
-    """If the oracle is the ego, the labels equal its actions in every step."""
-    envs, episodes = 3, 2
-    env = Environment(LAYOUT, 100)
-    players = [policy_player(env, oracle(LAYOUT), (), EGO, envs), random_player(TEAMMATE, envs)]
-
-    @jax.jit
-    def play(key) -> Rollout:
-        carry = init_rollout(env, players, jax.random.split(key, envs))
-        return roll_out(env, players, carry, 100 * episodes, key)[1]
-
-    played = play(jax.random.key(1))
-    states, taken = (np.asarray(array).swapaxes(0, 1) for array in (played.record, played.actions[..., EGO]))
-    assert len(np.unique(taken)) == 6
-    labels = [curate.oracle_labels(LAYOUT, *one) for one in zip(states, taken.astype(np.int8), strict=True)]
-    assert [(label.shape, label.dtype) for label in labels] == [((200,), np.int8)] * envs
-    np.testing.assert_array_equal(labels, taken)
-
-
-def test_oracle_labels_follow_the_actions_that_the_ego_took():
-    """The state does not change in both cases. The oracle waits a step after an ego that tried to move, but not after
-    one that stayed."""
-    cells = LAYOUT.agent_cells
-    free = next(action for action in range(4) if LAYOUT.moves[cells[EGO], action] not in cells)
-    (record,) = start(LAYOUT, np.array([cells], np.uint8), np.zeros((1, 2), np.uint8), LAYOUT.recipe_items[:1])
-    states = np.broadcast_to(record, (2, 200, len(record)))
-    actions = np.repeat([[free], [STAY]], 200, axis=1).astype(np.int8)
-    moves, stays = (curate.oracle_labels(LAYOUT, *one) for one in zip(states, actions, strict=True))
-    assert moves[0] == stays[0] != STAY
-    assert moves[1] == STAY != stays[1]

@@ -9,7 +9,6 @@ import sys
 import time
 from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -120,22 +119,6 @@ def test_waiting_for_the_other_collector(tasks, built, tmp_path):
     before = (folder / "metadata.json").stat().st_mtime_ns
     assert run_job(CollectionJob(work, profile, folder.parent), wait=True) == "done"
     assert (folder / "metadata.json").stat().st_mtime_ns == before
-
-
-def test_a_full_disk_ends_one_task(tasks, built, tmp_path, monkeypatch):
-    """The first task fails on the full disk, the second finishes, and the failure is logged."""
-    works = tasks[0][::-1]
-    second = tmp_path / "artefacts" / works[1].name
-    shutil.copytree(artefact(built / "a"), partial_folder(second))
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=10**9, used=10**9, free=5_000))
-    output = StringIO()
-    with pytest.raises(FailedJobsError, match=f"1 of 2 jobs are unfinished: {works[0].name}; "):
-        collect((works, tasks[1]), tmp_path, Console(file=output, width=500))
-    assert second.is_dir()
-    (failure,) = failures(tmp_path)
-    assert failure["error"].startswith("DiskFullError: ")
-    assert "failed once: DiskFullError: " in output.getvalue()
-    assert "Traceback" not in output.getvalue()
 
 
 def test_exit_code_1_and_nothing_packed_if_a_task_is_missing(tasks, built, tmp_path, monkeypatch, capsys):

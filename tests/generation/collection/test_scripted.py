@@ -25,7 +25,7 @@ from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.releases.check import compare_rebuilds
 from icrl4aht_generation.teammates.distances import act_along
 from icrl4aht_generation.teammates.learned import build_learned
-from icrl4aht_generation.teammates.preference import WATCHER
+from icrl4aht_generation.teammates.preference import WATCHER, all_dishes
 from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
 from icrl4aht_data.benchmark.tasks import make_task
@@ -214,6 +214,9 @@ def test_a_searcher_finds_the_dish_and_remembers_it(profile, tmp_path):
     for found in (one, other):
         np.testing.assert_array_equal(found["actions"], found["script_actions"])
         returns = found["rewards"].reshape(8, 10, 100).sum(axis=-1)
+        for own in found["rewards"]:
+            assert (own < 0).sum() < len(all_dishes(get_layout("asymm_both_plain"))), "a dish is refused once at most"
+            assert not (own[(own > 0).argmax() :] < 0).any(), "no refusal after the first dish that was paid"
         assert (returns[:, 5:] > 0).all(), returns
         assert returns[:, 5:].mean() > returns[:, 0].mean() + 20
         assert (returns[:, 0] < 0).any(), "some histories begin with a wrong dish"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 from itertools import cycle
 
 import numpy as np
@@ -30,7 +29,6 @@ from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_data.utils.install_hints import install_command
 
 GOLDEN = {
     "rearranged": "40f6dac5bd75f870cf4813c9d5a9248dfaa7bb1315b5a03b4c6cfc9fd616d4ab",
@@ -193,12 +191,6 @@ def test_the_command_lists_and_draws(tmp_path):
     assert [(one["name"], tuple(one["rows"]), one["split"]) for one in found] == [
         (one.name, one.rows, "train") for one in wanted
     ]
-
-
-def test_a_sheet_needs_pillow(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    result = CliRunner().invoke(cli, ["layouts", "--family", "rooms", "--count", "1", "--out", str(tmp_path / "a.png")])
-    assert result.exit_code == 1 and install_command("plot") in str(result.exception) and not any(tmp_path.iterdir())
 
 
 @pytest.mark.slow

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.encoder import CompactView, WindowEncoder, WindowEntries, WindowWords
 
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -97,9 +95,3 @@ def test_what_the_rules_exclude_is_not_a_number():
     params = jax.jit(module.init)(jax.random.key(1), view(jnp.asarray(RECORDS)))
     wrong = np.isnan(np.asarray(jax.jit(module.apply)(params, view(jnp.asarray(broken))))).any(axis=-1)
     assert np.argwhere(wrong).tolist() == [[1, 4]]
-
-
-def test_widths_name_the_encoder():
-    assert Widths() == Widths(encoder="paper")
-    flat = replace(Widths(), encoder="mlp")
-    assert (flat.pointwise, flat.spatial) == ((), ())

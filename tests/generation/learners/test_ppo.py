@@ -129,11 +129,6 @@ def trained(update, untrained) -> Played:
     return play(update, untrained, CONFIG.updates)
 
 
-def joined(rollouts: list[Rollout]) -> Rollout:
-    """Return successive roll-outs as one."""
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *rollouts)
-
-
 def egos(rollout: Rollout) -> Choice:
     """Return the ego's actions, log-probabilities and values."""
     return rollout.choices[EGO]

@@ -83,11 +83,13 @@ class Played(NamedTuple):
     rollout: Rollout  # of both roll-outs
 
 
-def play(players: list[Player], restart: Any = None) -> Played:
+PLAYERS = [scripted(slots) for slots in SLOTS]
+scripted_rollout = jax.jit(lambda carry, key: roll_out(ENV, PLAYERS, carry, STEPS, key))
+
+
+def play(run: Any) -> Played:
     """Return two roll-outs, one after the other, as one; NumPy."""
-    more = () if restart is None else (restart,)
-    run = jax.jit(lambda carry, key: roll_out(ENV, players, carry, STEPS, key, *more))
-    start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), ENVS))
+    start = init_rollout(ENV, PLAYERS, jax.random.split(jax.random.key(0), ENVS))
     middle, one = run(start, jax.random.key(1))
     carry, other = run(middle, jax.random.key(2))
     return Played(start, carry, jax.tree.map(lambda *parts: np.concatenate(parts), one, other))
@@ -95,12 +97,12 @@ def play(players: list[Player], restart: Any = None) -> Played:
 
 @pytest.fixture(scope="module")
 def played() -> Played:
-    return play([scripted(slots) for slots in SLOTS])
+    return play(scripted_rollout)
 
 
 @pytest.fixture(scope="module")
 def restarted() -> Played:
-    return play([scripted(slots) for slots in SLOTS], marked)
+    return play(jax.jit(lambda carry, key: roll_out(ENV, PLAYERS, carry, STEPS, key, marked)))
 
 
 @pytest.fixture(scope="module")
@@ -190,14 +192,13 @@ def test_memories_restart_with_each_episode(played):
 
 def test_only_players_of_an_ended_episode_restart():
     """The third environment is two steps ahead of the others."""
-    players = [scripted(slots) for slots in SLOTS]
-    start = init_rollout(ENV, players, jax.random.split(jax.random.key(0), ENVS))
-    start = start._replace(env=start.env._replace(clock=jnp.array([0, 0, 2, 0])))
-    run = jax.jit(lambda carry: roll_out(ENV, players, carry, 4, jax.random.key(1)))
-    carry, rollout = run(start)
-    np.testing.assert_array_equal(rollout.done, np.array([[0, 0, n == 2, 0] for n in range(4)], bool))
+    clock = np.array([0, 0, 2, 0])
+    start = init_rollout(ENV, PLAYERS, jax.random.split(jax.random.key(0), ENVS))
+    start = start._replace(env=start.env._replace(clock=jnp.asarray(clock)))
+    carry, rollout = scripted_rollout(start, jax.random.key(1))
+    np.testing.assert_array_equal(rollout.done, (np.arange(STEPS)[:, None] + clock) % EPISODE == EPISODE - 1)
     for notes, slots in zip(carry.memories, SLOTS, strict=True):
-        np.testing.assert_array_equal(notes.steps, np.where(slots % ENVS == 2, 1, 4))
+        np.testing.assert_array_equal(notes.steps, (clock[slots % ENVS] + STEPS) % EPISODE)
 
 
 def test_returns_are_sums_over_the_episode_across_roll_outs(played):
@@ -207,8 +208,7 @@ def test_returns_are_sums_over_the_episode_across_roll_outs(played):
         def step(self, state, actions):
             return super().step(state, actions)._replace(reward=(actions.sum(axis=1) + state.clock).astype(jnp.float32))
 
-    env, players = Paying(LAYOUT, EPISODE), [scripted(slots) for slots in SLOTS]
-    run = jax.jit(lambda carry, key: roll_out(env, players, carry, STEPS, key))
+    run = jax.jit(lambda carry, key: roll_out(Paying(LAYOUT, EPISODE), PLAYERS, carry, STEPS, key))
     middle, first = run(played.start, jax.random.key(1))
     after, second = run(middle, jax.random.key(2))
     reward, returns = (

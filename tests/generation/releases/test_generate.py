@@ -94,15 +94,6 @@ def test_damaged_or_different_artefacts_are_unfinished(built, tmp_path):
     assert not artefacts.is_task_finished(folder, work, profile)
 
 
-def test_an_existing_folder_is_not_overwritten(built, tmp_path):
-    shutil.copytree(built / "a" / "artefacts", tmp_path / "artefacts")
-    (tmp_path / "lite").mkdir()
-    (tmp_path / "lite" / "notes.txt").write_text("mine")
-    with pytest.raises(OptionError, match="is not a release"):
-        build.build_releases(load_profile(str(built / "tiny.toml")), tmp_path, ["lite"], Console(file=StringIO()))
-    assert (tmp_path / "lite" / "notes.txt").read_text() == "mine"
-
-
 def test_a_folder_with_other_files_is_refused(built, tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(OptionError, match=r"has other files \(thesis.txt\), expected a rebuild"):

@@ -192,20 +192,6 @@ def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
     assert verify_release(root).ok
 
 
-@pytest.mark.parametrize(("share", "weak"), [(0.4, True), (0.6, False)])
-def test_the_card_marks_labels_that_earn_less_than_half_of_the_end(task, tmp_path, share, weak):
-    chosen, profile, folder = task
-    rewards = np.load(folder / "rewards.npy")
-    rewards[:, 0::100] = 20
-    np.save(folder / "rewards.npy", rewards)
-    ends = rewards.reshape(8, 5, 100).sum(axis=-1).mean()
-    with_returns(folder, [ends * share] * 5)
-    root = package_release(folder.parent, tmp_path / "lite", [Work(chosen)], profile, tmp_path, "lite")
-    card = (root / "README.md").read_text()
-    assert ("histories' end in 1 task of ppo on demo_wide" in card) == weak
-    assert ("The labels of 1 task earn less than half" in card) == weak
-
-
 # The policy in the release.
 
 

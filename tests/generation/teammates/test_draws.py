@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 from icrl4aht_generation.teammates import draws
@@ -83,13 +85,19 @@ def test_no_chosen_teammate_acts_like_a_test_instance_of_its_family(layout):
                 drawn_teammates(layout, [family], 1, seed)
 
 
+@cache
+def training_theta(family: str, theta_id: int) -> dict[str, Any]:
+    return sample_teammate(family, theta_id, "train")["theta"]
+
+
 def test_no_validation_teammate_is_a_training_teammate():
     for track in TRACKS:
         for task in validation_tasks(track):
             layout, family = task.layout.name, task.teammate["family"]
             assert task.teammate["base_seed"] == 1
-            thetas = [sample_teammate(family, found.theta_id, "train")["theta"] for found in read_draws(layout, family)]
-            assert task.teammate["theta"] not in thetas
+            assert task.teammate["theta"] not in [
+                training_theta(family, one.theta_id) for one in read_draws(layout, family)
+            ]
 
 
 def test_validation_tasks_are_four_a_layout_where_draws_allow_it():

@@ -4,40 +4,44 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 
+import pytest
 from icrl4aht_generation.layouts.families import find_generated, split_of
 from icrl4aht_generation.layouts.grids import canonical_map
 from icrl4aht_generation.teammates.instances import INSTANCES
 from icrl4aht_generation.teammates.preference import WATCHER, all_dishes, preference_tasks, training_dishes
 
 from icrl4aht_data.benchmark.facts import PREFERENCE, PREFERENCE_LAYOUTS
-from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
+from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks, teammate_id
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 
-SPLITS = {split: preference_tasks(split) for split in ("train", "validation", "test")}
+
+@pytest.fixture(scope="module")
+def by_split() -> dict[str, list[Task]]:
+    return {split: preference_tasks(split) for split in ("train", "validation", "test")}
 
 
-def test_manifests_have_these_tasks():
-    for split, tasks in SPLITS.items():
+def test_manifests_have_these_tasks(by_split):
+    for split, tasks in by_split.items():
         assert read_tasks(manifest_path(PREFERENCE, split)) == tasks
 
 
-def test_splits_are_disjoint():
+def test_splits_are_disjoint(by_split):
     """Test teammates, layouts of half of the tests and three of ten dishes are in no training."""
-    layouts = {split: {task.layout_name for task in tasks} for split, tasks in SPLITS.items()}
+    layouts = {split: {task.layout_name for task in tasks} for split, tasks in by_split.items()}
     assert layouts["train"] == layouts["validation"] == set(PREFERENCE_LAYOUTS["train"])
-    halves = Counter(task.layout_name in layouts["train"] for task in SPLITS["test"])
+    halves = Counter(task.layout_name in layouts["train"] for task in by_split["test"])
     assert halves == {True: 60, False: 60}
-    mates = {split: {teammate_id(task.teammate) for task in tasks} for split, tasks in SPLITS.items()}
+    mates = {split: {teammate_id(task.teammate) for task in tasks} for split, tasks in by_split.items()}
     assert not mates["train"] & (mates["test"] | mates["validation"])
     assert mates["validation"] & mates["test"] == {teammate_id(WATCHER)}
-    dishes = {split: {(t.layout_name, t.recipes) for t in tasks} for split, tasks in SPLITS.items()}
+    dishes = {split: {(t.layout_name, t.recipes) for t in tasks} for split, tasks in by_split.items()}
     for name in PREFERENCE_LAYOUTS["train"]:
         layout = get_layout(name)
         new = len(all_dishes(layout)) - len(training_dishes(layout))
         assert new == {4: 0, 10: 3}[len(all_dishes(layout))]
     assert any(pair not in dishes["train"] for pair in dishes["test"] if pair[0] in layouts["train"])
     of_dish = defaultdict(set)
-    for task in SPLITS["test"]:
+    for task in by_split["test"]:
         (dish,) = task.recipes or (None,)
         assert dish is not None
         held_out = dish not in training_dishes(task.layout)
@@ -45,7 +49,7 @@ def test_splits_are_disjoint():
         of_dish[number].add((task.teammate_family, task.teammate["theta_id"] == INSTANCES))
     assert of_dish.keys() == {None, 2, 5, 8}
     assert all(len(found) >= 4 for found in of_dish.values()), "each held-out dish meets several families"
-    families = {split: {task.teammate_family for task in tasks} for split, tasks in SPLITS.items()}
+    families = {split: {task.teammate_family for task in tasks} for split, tasks in by_split.items()}
     assert families["train"] == families["test"] == {"H1", "H2", "H3", "H4"}
 
 

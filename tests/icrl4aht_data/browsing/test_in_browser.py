@@ -203,20 +203,6 @@ def test_a_phone_does_not_scroll_sideways(open_page, dark):
     page.close()
 
 
-def test_a_partial_page_lists_its_episodes(open_page, dataset, tmp_path):
-    size = len(make_browser_page(dataset).html)
-    smaller = make_browser_page(dataset, megabytes=0.985 * size / 1e6)
-    save_browser_page(smaller, tmp_path / "small.html")
-    page = open_page("#history=0", tmp_path / "small.html")
-    shown = page.evaluate("index.histories[0].shown.map((episode) => episode + 1)")
-    assert len(shown) < 6
-    expected_text = (
-        f"{len(shown)} of 6 episodes can be watched, those with a mark below the curve: {', '.join(map(str, shown))}."
-    )
-    assert page.inner_text("#shown-text") == expected_text
-    page.close()
-
-
 def test_a_damaged_page_shows_an_error(open_page, file, tmp_path):
     text = file.read_text()
     at = text.index('"histories": ["') + 200

@@ -77,13 +77,6 @@ def test_embedded_episodes_are_those_of_the_reader(release):
     assert len(repr(page)) < 100
 
 
-def test_a_full_release_gives_the_same_page(release, tmp_path):
-    to_release(load_icrl4aht(release), tmp_path / "full", "full")
-    pages = [embedded(make_browser_page(load_icrl4aht(root)).html) for root in (release, tmp_path / "full")]
-    assert pages[0][1] == pages[1][1]
-    assert pages[0][0]["histories"] == pages[1][0]["histories"]
-
-
 def test_histories_without_labels_have_no_columns_of_labels(tmp_path):
     random_release(tmp_path / "r", labels=False, teammates=1, streams=1)
     index, _ = embedded(make_browser_page(load_icrl4aht(tmp_path / "r")).html)

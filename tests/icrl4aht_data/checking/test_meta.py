@@ -40,13 +40,10 @@ def test_the_unspoiled_release_is_valid(learned):
     ("name", "change", "message"),
     [
         (PROVENANCE, lambda c: first(c)["teammate"].update(kind="heuristic"), "Object contains unknown field `kind`"),
-        (PROVENANCE, lambda c: first(c)["teammate"].update(theta={}), "Object contains unknown field `theta`"),
-        (PROVENANCE, lambda c: first(c)["teammate"].update(slot=0), "Invalid enum value 0"),
         (PROVENANCE, lambda c: c.update(more=first(c)), "task 'more': has no history"),
         (PROVENANCE, lambda c: c.pop(next(iter(c))), "': missing"),
         (PROVENANCE, lambda c: first(c).update(seed=77), "seed: expected the task's"),
         (PROVENANCE, lambda c: first(c)["ego"].update(clip=0.3), "ego_hash: expected"),
-        (PROVENANCE, lambda c: first(c).update(ego_hash="0" * 16), "ego_hash: expected"),
         (
             PROVENANCE,
             lambda c: first(c).update(streams_recorded=17),
@@ -54,18 +51,8 @@ def test_the_unspoiled_release_is_valid(learned):
         ),
         (
             PROVENANCE,
-            lambda c: first(c).update(streams_kept=1),
-            "streams_kept: expected at least the {stored} histories",
-        ),
-        (
-            PROVENANCE,
             lambda c: first(c).update(streams_kept=9999),
             "streams_kept: expected at most the {recorded} recorded",
-        ),
-        (
-            PROVENANCE,
-            lambda c: first(c)["filter"]["before"].update(streams=9),
-            "filter.before.streams: expected {recorded}",
         ),
         (
             PROVENANCE,
@@ -84,10 +71,8 @@ def test_the_unspoiled_release_is_valid(learned):
             "less than the {recorded} recorded streams, found 9999",
         ),
         (HISTORIES, lambda c: c[-1].update(source="human"), "of one task: unlike ['source']"),
-        (HISTORIES, lambda c: c[-1].update(expert_return=7.0), "of one task: unlike ['expert_return']"),
         (HISTORIES, lambda c: [line.update(teammate_kind="territory") for line in c], "'territory' is of another fam"),
         (INFO, lambda c: c.update(data_version="../.."), "data version '../..': expected one such as 1.0.0"),
-        (INFO, lambda c: c.update(homepage="https://example.org"), "homepage: an unknown field"),
         (INFO, lambda c: first(c["statistics"]).update(disk_bytes=1), "statistics: expected"),
     ],
 )

@@ -118,26 +118,6 @@ def test_ranges_of_ids():
     assert [id_ranges(ids) for ids in ([7], [5, 4, 3], [1, 2, 5, 9, 8])] == ["7", "3-5", "1-2,5,8-9"]
 
 
-def test_show_accepts_the_ids_printed_by_list(lite):
-    root = str(lite[0])
-    for task in json.loads(CliRunner().invoke(cli, ["list", "--json", root]).output):
-        assert len(task["history_ids"]) == task["histories"]
-        arguments = ["show", "--json", "--history", str(task["history_ids"][-1]), root]
-        assert json.loads(CliRunner().invoke(cli, arguments).output)["task_id"] == task["task_id"]
-
-
-def test_piped_output_is_tab_separated_and_complete(lite):
-    release = load_icrl4aht(lite[0])
-    lines = CliRunner().invoke(cli, ["list", str(lite[0])]).output.splitlines()
-    names = lines[0].split("\t")
-    assert [line.split("\t")[names.index("task_id")] for line in lines[1:]] == list(release.counts("task_id"))
-    shown = CliRunner().invoke(cli, ["show", str(lite[0])]).output.splitlines()
-    facts = dict(line.split("\t") for line in shown)
-    assert facts["transitions"] == "1440"
-    assert json.loads(facts["layouts"])["demo_wide"]["histories"] == 6
-    assert json.loads(CliRunner().invoke(cli, ["show", "--json", str(lite[0])]).output)["summary"] == facts["summary"]
-
-
 def test_filters_by_source_reach_every_command(two_sources, tmp_path):
     """Regression: `--source` once clashed with arguments of `verify` and `convert`."""
     root, out = str(two_sources[0]), str(tmp_path / "noise")

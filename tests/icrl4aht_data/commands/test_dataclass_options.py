@@ -91,17 +91,6 @@ def test_invalid_values_are_a_misuse(words, message):
     assert message in " ".join(output.split())
 
 
-def test_help_has_topics_and_shows_each_default_once():
-    text = " ".join(call("--help")[1].split())
-    assert "Options: --out TEXT [default: runs] --help" in text
-    assert "Training: --steps INTEGER Training steps. [default: the size's; >= 1]" in text
-    assert "--discounts FLOAT Discount; repeatable. [default: 0.9, 0.99; >= 0; < 1]" in text
-    assert "--positions none|rope Position embedding. [default: none]" in text
-    assert "--teammate-actions, --ta Also input actions. -" in text
-    assert "--normalize / --no-normalize Normalize. [default: normalize]" in text
-    assert "--limit INTEGER Most steps. [default: no limit; >= 1]" in text
-
-
 def test_values_of_tables_replace_fields_of_nested_dataclasses():
     base = Options(steps=7)
     changed = replace_options(base, {"dropout": 0.2, "widths": {"hidden": 8}, "discounts": [0.5]})
@@ -121,21 +110,12 @@ def test_values_of_tables_replace_fields_of_nested_dataclasses():
     ("values", "message"),
     [
         ({"steps": 0}, "steps = 0: expected `int` >= 1"),
-        ({"steps": 1.5}, "steps = 1.5: expected `int`, got `float`"),
         ({"steps": True}, "steps = True: expected `int`, got `bool`"),
-        ({"steps": "5"}, "steps = '5': expected `int`, got `str`"),
         ({"learning_rate": float("nan")}, "learning_rate = nan: expected"),
-        ({"learning_rate": float("inf")}, "learning_rate = inf: expected a finite number"),
         ({"dropout": 1}, "dropout = 1: expected `float` < 1.0"),
-        ({"discounts": ()}, r"discounts = \(\): expected `array` of length >= 1"),
         ({"discounts": (0.5, -1.0)}, r"discounts = \(0.5, -1.0\): expected `float` >= 0.0 - at `\$\[1\]`"),
     ],
 )
 def test_a_dataclass_checks_its_own_values(values, message):
     with pytest.raises(OptionError, match=message):
         Options(**values)
-
-
-def test_an_invalid_choice_raises_unknown_name():
-    with pytest.raises(UnknownNameError, match="unknown positions 'ropes'; valid: none, rope"):
-        Options(positions="ropes")  # type: ignore[arg-type]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from icrl4aht_data.errors import CacheError, OptionError
 from icrl4aht_data.format import cached_arrays as module
 from icrl4aht_data.format.cached_arrays import cached_arrays, new_mapped_array
 from tests.helpers.damages import DAMAGES, contents, flip_bit
-from tests.robustness.limits import can_mount, file_size_limit, permissions_count, small_disk
+from tests.robustness.limits import can_mount, permissions_count, small_disk
 
 KEY = f"histories-{0:032x}"
 SIZE = 8 * 150_000 + 300
@@ -57,26 +56,6 @@ def test_wrong_sizes_and_headers_are_built_again(folder, damage):
         check(cached_arrays(KEY, SIZE, build))
         assert contents(folder / KEY) == right
         assert [path.name for path in folder.iterdir()] == [KEY]
-
-
-@pytest.mark.parametrize("what", ["file", "link", "pipe", "empty folder", "array of other set"])
-def test_foreign_files_with_a_sets_name_are_replaced(folder, what):
-    other = f"histories-{1:032x}"
-    cached_arrays(other, 8, lambda path: np.save(path / "a.npy", np.arange(3)))
-    target = folder / KEY
-    if what == "file":
-        target.write_text("hello")
-    elif what == "link":
-        target.symlink_to(folder / "nowhere")
-    elif what == "pipe":
-        os.mkfifo(target)
-    elif what == "empty folder":
-        target.mkdir()
-    else:
-        cached_arrays(KEY, SIZE, build)
-        shutil.copy(folder / other / "a.npy", target / "a.npy")
-    check(cached_arrays(KEY, SIZE, build))
-    assert sorted(path.name for path in folder.iterdir()) == [KEY, other]
 
 
 def test_leftovers_of_killed_processes_are_removed_after_a_day(folder):
@@ -130,24 +109,6 @@ def test_a_cache_folder_that_can_only_be_read(folder):
     finally:
         folder.chmod(0o755)
         (folder / KEY).chmod(0o755)
-
-
-def test_a_limit_of_file_size_is_an_error_that_leaves_nothing(folder):
-    with file_size_limit(100_000), pytest.raises(CacheError, match=rf"{folder}: the cache folder has no room for"):
-        cached_arrays(KEY, SIZE, build)
-    assert not list(folder.iterdir())
-    check(cached_arrays(KEY, SIZE, build))
-
-
-@pytest.mark.skipif(not can_mount(), reason="needs the right to mount a disk")
-@pytest.mark.parametrize("announced", [SIZE, 0], ids=["known before", "noticed while writing"])
-def test_a_full_disk_is_an_error_that_leaves_nothing(folder, announced):
-    with small_disk(folder, 2**20):
-        with pytest.raises(
-            CacheError, match=r"has no room for .*No space left on device; [\d,]+ of [\d,]+ bytes are free.*\); free"
-        ):
-            cached_arrays(KEY, announced, build)
-        assert not list(folder.iterdir())
 
 
 @pytest.mark.skipif(not can_mount(), reason="needs the right to mount a disk")

@@ -56,12 +56,9 @@ def test_expert_fields_are_kept():
         ({"seed": "3"}, r"Expected `int \| null`, got `str` - at `\$\.seed`"),
         ({"ego": {"total_steps": 1}}, "missing required field `environments`"),
         ({"streams_recorded": -1}, "Expected `int` >= 0"),
-        ({"xla_threads": 0}, "Expected `int` >= 1"),
         ({"expert": {"policy_sha256": "0" * 64, "action": "", "return_greedy": 1e300}}, "Expected `float` <"),
         ({"filter": {"before": {}, "after": {}}}, "missing required field `streams`"),
-        ({"ego": 3}, "Expected `object"),
         ([], "an object of objects"),
-        (1, "an object of objects"),
     ],
 )
 def test_a_malformed_provenance_is_named(tmp_path, note, message):
@@ -76,11 +73,8 @@ def test_a_malformed_provenance_is_named(tmp_path, note, message):
     ("change", "message"),
     [
         ({"kind": "heavy"}, "Invalid enum value 'heavy'"),
-        ({"histories": True}, r"Expected `int`, got `bool` - at `\$\.histories`"),
         ({"environment": {"max_steps": 400, "kept_steps": 0}}, "Expected `int` >= 1"),
         ({"environment": {"max_steps": 400, "kept_steps": 100, "speed": 2}}, "unknown field `speed`"),
-        ({"shards": {"a": -1}}, "Expected `int` >= 0"),
-        ({"data_version": "01.0.0"}, "data version '01.0.0': expected one such as 1.0.0"),
         ({"data_version": "1.0.0-.."}, r"data version '1\.0\.0-\.\.': expected one such as 1.0.0"),
         ({"data_version": "\x1b[2J"}, r"data version '\\x1b\[2J': expected one such as 1.0.0"),
     ],

@@ -95,15 +95,3 @@ def test_a_file_without_permission_to_read(damaged, tmp_path, monkeypatch, name,
     with permissions_count(), pytest.raises(ReleaseError, match=f"{damaged / name}: cannot be read: Permission denied"):
         load_icrl4aht(damaged, layout="coord_simple", cache=cache, threads=1).ad(batch_size=2, length=5)[0]
     shutil.rmtree(tmp_path / "cache", ignore_errors=True)
-
-
-def test_a_folder_without_permission_to_read(damaged):
-    (damaged / "meta").chmod(0)
-    with permissions_count(), pytest.raises(ReleaseError, match=r"meta/info\.json.*Permission denied"):
-        load_icrl4aht(damaged)
-    (damaged / "meta").chmod(0o755)
-    dataset = load_icrl4aht(damaged, threads=1)
-    (damaged / SHARD).parent.chmod(0)
-    with permissions_count(), pytest.raises(ReleaseError, match="Permission denied"):
-        dataset[0].read("actions")
-    (damaged / SHARD).parent.chmod(0o755)

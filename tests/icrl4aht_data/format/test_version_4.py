@@ -117,13 +117,11 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
     [
         (HISTORIES, lambda c: c[5].update(learner=2), "history 5: learner: expected less than the 2 learners, found 2"),
         (HISTORIES, lambda c: c[4].update(learner=0), "history 4: stream 0 of its task appears twice"),
-        (HISTORIES, lambda c: c[5].update(env_idx=0), "history 5: stream 0 of learner 1 of its task appears twice"),
         (
             HISTORIES,
             lambda c: c[5].update(env_idx=2),
             "5: env_idx: expected less than the 2 environments",
         ),
-        (HISTORIES, lambda c: c[1].update(source="ppo"), "histories 0 and 1, of one task: unlike ['source']"),
         (
             HISTORIES,
             lambda c: [line.update(source="ppo") for line in c],
@@ -135,14 +133,9 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
             lambda c: last(c).update(streams_recorded=2),
             "expected 4, 2 of each of 2 learners, found 2",
         ),
-        (PROVENANCE, lambda c: first(c)["noise"].update(histories=1), "noise.histories: expected at least the 2"),
         (PROVENANCE, lambda c: first(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history 0"),
-        (PROVENANCE, lambda c: first(c)["noise"].update(start=[0.9, 1.1]), "Expected `float` <= 1"),
         (PROVENANCE, lambda c: first(c)["noise"].update(end=[0.2, 0.1]), "noise.end: expected a range [least, most]"),
-        (PROVENANCE, lambda c: first(c)["noise"].update(power=2), "Expected `array"),
-        (PROVENANCE, lambda c: first(c)["references"].pop("stay"), "missing required field `stay`"),
         (PROVENANCE, lambda c: first(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
-        (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="no"), "matching regex"),
         (PROVENANCE, lambda c: first(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise histories"),
     ],
 )
@@ -216,8 +209,6 @@ def test_conversions_keep_left_out_tasks(lite_mixed, tmp_path):
     [
         ({"layout": "nowhere"}, "unknown layout 'nowhere'"),
         ({"reason": "\x1b[2J"}, "printable characters"),
-        ({"learners": -1}, "Expected `int` >= 0"),
-        ({"streams": None}, "Expected `int`, got `null`"),
     ],
 )
 def test_left_out_tasks_are_checked(lite_mixed, tmp_path, change, message):

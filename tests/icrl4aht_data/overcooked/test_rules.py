@@ -25,7 +25,7 @@ from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import columns, unpack
 from tests.helpers.states import state_record
 
-CRAMPED, ASYMM, RING, DEMO = (LAYOUTS[name] for name in ("cramped_up", "asymm_both", "coord_ring", "demo_simple"))
+CRAMPED, ASYMM, RING = (LAYOUTS[name] for name in ("cramped_up", "asymm_both", "coord_ring"))
 
 PLATE, COOKED, ZERO, ONE = 1, 2, 4, 16  # item bytes; ZERO and ONE are a piece of ingredient 0 and of ingredient 1
 RECIPE_000, RECIPE_001, RECIPE_111 = 3 * ZERO, 2 * ZERO + ONE, 3 * ONE

@@ -130,13 +130,6 @@ def test_filter_by_expert_return(measured):
             load_icrl4aht(measured, min_expert_return=wrong)  # type: ignore[arg-type]
 
 
-def test_a_history_has_its_expert_return(measured):
-    dataset = load_icrl4aht(measured)
-    assert "labels 9.5, source ppo)" in repr(dataset[0])
-    assert "labels -30.0, source search)" in repr(dataset[4])
-    assert "labels" not in repr(dataset[6])
-
-
 class TestWeakLabels:
     """Random play earns slightly less than 0 in all tasks."""
 

@@ -31,15 +31,6 @@ def test_learners(two_sources):
         load_icrl4aht(two_sources[0], learner="first")  # type: ignore[arg-type]
 
 
-def test_representations_say_sources_and_splits(two_sources):
-    dataset = load_icrl4aht(two_sources[0])
-    assert "; splits train (28), validation (12); sources ppo (16), noise (24); 4,800 transitions" in repr(dataset)
-    one = dataset.filter(split="validation")
-    assert "; split validation; source noise; " in repr(one)
-    assert "source noise" in repr(one[0])
-    assert repr(dataset.filter(learner=1)[0]).endswith("source ppo, learner 1)")
-
-
 def test_counts_and_describe(two_sources):
     dataset = load_icrl4aht(two_sources[0], layout="demo_wide")
     assert dataset.counts("source") == {"ppo": 8, "noise": 12}

@@ -138,9 +138,3 @@ def test_selections(root):
         load_icrl4aht(root, channels="canonic")  # type: ignore[arg-type]
     with pytest.raises(UnknownNameError, match="unknown channels 46"):
         own.with_options(channels=46)  # type: ignore[arg-type]
-
-
-def test_a_batch_larger_than_the_memory(lite):
-    dataset = canonical(lite[0])
-    with pytest.raises(OptionError, match=r"batch_size = 1000000000000, length = 7: obs.*memory"):
-        dataset.ad(batch_size=10**12, length=7)[0]

@@ -14,7 +14,6 @@ from icrl4aht_data.interop import hf_episodes
 from icrl4aht_data.reading.history import LABELS
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.batches import CACHES, assert_equal
-from tests.helpers.random_releases import random_release
 from tests.helpers.two_sources import two_source_release
 
 OPTIONS: dict[str, Any] = {"batch_size": 16, "context": 9, "seed": 4}
@@ -117,11 +116,6 @@ class TestMissingLabels:
         monkeypatch.setattr(type(dataset), "column", only_noise)
         with pytest.raises(LabelsMissingError, match=r"8 of 20 .*, 12 have oracle actions: .*has_labels\('oracle'"):
             dataset.dpt(labels="oracle", **OPTIONS)
-
-    def test_of_a_release_without_any(self, tmp_path):
-        random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
-        with pytest.raises(LabelsMissingError, match=r"no expert actions.*, 0 have oracle actions"):
-            load_icrl4aht(tmp_path / "r").dpt(**OPTIONS)
 
 
 def test_weak_oracles_cause_a_warning(two_sources, monkeypatch):

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import Curriculum, load_icrl4aht
-from icrl4aht_data.errors import ShardCorruptError, UnknownNameError
-from icrl4aht_data.format.chunks import chunk_table_name
+from icrl4aht_data.errors import UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.sources import choose_cache
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.batches import CACHES, assert_equal, samplers
-from tests.helpers.random_releases import SHARD, random_release
+from tests.helpers.random_releases import random_release
 
 LAYOUTS = ("coord_simple", "demo_simple", "coord_ring")
 """Layouts with observations of one shape and state records of several sizes."""
@@ -46,18 +45,6 @@ class TestCaches:
                         assert_equal(sampler[i], other[i])
                 assert_equal(pickle.loads(pickle.dumps(others[-1]))[5], sampler[5])
 
-    def test_shown_states_are_the_observations(self, lite):
-        states = samplers(load_icrl4aht(lite[0], layout="demo_wide", obs="state"))
-        shown = samplers(load_icrl4aht(lite[0], layout="demo_wide", obs="uint8"))
-        layout = states[0].layouts[0]
-        for one, two in zip(states, shown, strict=True):
-            for name in ("obs", "query_obs", "context_obs", "context_next_obs"):
-                if name in one[0]._fields:
-                    rendered = observe(layout, getattr(one[0], name), 0)
-                    if name == "obs":
-                        rendered[~one[0].attention_mask] = 0
-                    np.testing.assert_array_equal(getattr(two[0], name), rendered)
-
     def test_histories_may_be_reordered_and_repeated(self, lite):
         mixed = load_icrl4aht(lite[0], layout="demo_wide", obs="state").select([9, 6, 9, 11])
         sampler = mixed.ad(batch_size=9, length=20)
@@ -77,18 +64,6 @@ class TestCaches:
         assert choose_cache("stream", 1).cache == "stream"
         with pytest.raises(UnknownNameError, match="unknown cache 'disk'; valid: auto, ram, mmap, stream"):
             load_icrl4aht(lite[0], cache="disk")  # type: ignore[arg-type]
-
-    @pytest.mark.parametrize("cache", CACHES)
-    def test_damaged_files_are_an_error(self, damaged, cache, tmp_path, monkeypatch):
-        monkeypatch.setenv(
-            "ICRL4AHT_CACHE_DIR", str(tmp_path / "cache")
-        )  # drops cached arrays of the undamaged release
-        data = bytearray((damaged / SHARD).read_bytes())
-        data[int(np.load(damaged / chunk_table_name(SHARD))["offset"][0])] ^= 1
-        (damaged / SHARD).write_bytes(data)
-        sampler = load_icrl4aht(damaged, layout="coord_simple", cache=cache).ad(batch_size=64, length=9)
-        with pytest.raises(ShardCorruptError, match="chunk 0 of state in history 0"):
-            sampler[0]
 
     def test_threads_share_a_sampler(self, lite):
         sampler = load_icrl4aht(lite[0], layout="demo_wide", cache="stream", threads=2).ad(batch_size=9, length=30)
@@ -124,21 +99,6 @@ class TestSeveralLayouts:
             np.testing.assert_array_equal(batch.obs[row, :120], observe(layout, state, 0))
             np.testing.assert_array_equal(batch.target_actions[row, :120], written[history_id]["actions"])
             assert not batch.obs[row, 120:].any()
-
-    @pytest.mark.parametrize("order", ["contiguous", "random"])
-    def test_contexts(self, three, cache, order):
-        root, written = three
-        shown, states = (
-            load_icrl4aht(root / "states", obs=obs, cache=cache).dpt(batch_size=16, context=30, order=order)
-            for obs in ("uint8", "state")
-        )
-        query, coded = shown[0], states[0]
-        assert coded.layouts is not None
-        for row, number in enumerate(coded.layouts):
-            layout, size = states.layouts[number], written[3 * number]["state"].shape[1]
-            for name in ("query_obs", "context_obs", "context_next_obs"):
-                record = getattr(coded, name)[row][..., :size]
-                np.testing.assert_array_equal(getattr(query, name)[row], observe(layout, record, 0))
 
     @pytest.mark.parametrize("obs", ["float32", "uint8"])
     def test_without_states(self, three, cache, obs):

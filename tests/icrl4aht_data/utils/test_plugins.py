@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,13 +13,11 @@ from icrl4aht_generation.teammates.registry import heuristic_teammate
 
 from icrl4aht_data import get_layout, load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, layout_number, track_of
-from icrl4aht_data.benchmark.tasks import make_task, manifest_path, read_tasks
+from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, PluginError, UnknownNameError
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_positions
 from icrl4aht_data.overcooked.layouts import LAYOUTS
-from icrl4aht_data.utils import plugins
-from tests.helpers.paths import ROOT
 from tests.helpers.plugins import installed, write_package
 from tests.helpers.random_releases import random_release
 
@@ -94,40 +89,12 @@ def test_a_registered_layout_is_known(rooms, tmp_path):
     assert load_icrl4aht(tmp_path / "release").layouts[0].rows == layout.rows
 
 
-def test_subprocesses_find_plugins(rooms, tmp_path):
-    """Subprocesses find plugins, also as choices of commands."""
-    with installed(rooms):
-        random_release(tmp_path / "release", layouts=("plain_room", "demo_wide"))
-    code = "from icrl4aht_data.commands.cli import main; main()"
-    path = os.pathsep.join(map(str, (rooms, ROOT, ROOT / "generation", ROOT / "baselines")))
-    command = ["list", str(tmp_path / "release"), "--json", "--layout", "plain_room"]
-    done = subprocess.run(
-        [sys.executable, "-c", code, *command],
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "plain_room" in json.dumps(json.loads(done.stdout))
-
-
 def test_plugins_do_not_change_the_benchmark(rooms):
     before = CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES]
     with installed(rooms):
         assert before == (CANONICAL_CHANNELS, tuple(LAYOUTS), [track_of(name) for name in LAYOUT_NAMES])
         assert [layout_number(name) for name in LAYOUT_NAMES] == list(range(10))
         assert 10 <= layout_number("plain_room") == layout_number("plain_room") < 20_000
-
-
-def test_published_names_do_not_read_metadata(monkeypatch):
-    monkeypatch.setattr(plugins, "entry_points", None)
-    with installed():
-        assert get_layout("grounded_coord_ring") is LAYOUTS["coord_ring"]
-        assert len(read_tasks(manifest_path("teammate", "test"))) == 120
-        assert len(load_icrl4aht(split="train", layout="demo_wide")) > 0
-        with pytest.raises(TypeError):
-            get_layout("other")
 
 
 def test_more_ingredients_than_canonical_channels(rooms):

@@ -42,21 +42,6 @@ def test_a_line_has_count_speed_and_time_left(seconds, expected):
     assert output.getvalue() == f"x: {expected}\n"
 
 
-def test_the_speed_falls_without_progress():
-    clock, output = Clock(), io.StringIO()
-    lines = PlainLines(Console(file=output), clock=clock)
-    for number in (0, 200, 500, 800):
-        lines.show("x", number, 1600)
-        clock.wait(1 if number < 800 else 0)
-    for _ in range(2):
-        lines.print_lines()
-        clock.wait(10)
-    assert output.getvalue().splitlines() == [
-        "x: 800 of 1,600 (50 %) after 3 s, 300.0 per second, 3 s left",
-        "x: 800 of 1,600 (50 %) after 13 s, 50.0 per second, 16 s left",
-    ]
-
-
 def test_resumed_work_does_not_count_as_speed():
     clock, output = Clock(), io.StringIO()
     lines = PlainLines(Console(file=output), clock=clock)
@@ -84,14 +69,6 @@ def test_a_thread_prints_lines_on_stderr_while_a_step_takes_long(monkeypatch, ca
                 break
     assert printed.startswith("download: 3.0 MB of 10.0 MB (30 %) after 0 s")
     assert "progress" not in {thread.name for thread in threading.enumerate()}
-
-
-def test_quiet_commands_print_nothing(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "FIRST_LINE_SECONDS", 0.01)
-    with progress_bars(quiet=True) as show:
-        show("x", 1, 2)
-        time.sleep(0.05)
-    assert capsys.readouterr().err == ""
 
 
 def test_terminals_get_bars(monkeypatch, capsys):

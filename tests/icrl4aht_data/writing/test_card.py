@@ -5,31 +5,27 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from io import StringIO
 from typing import Any
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import LeftOutTask, describe
-from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos, TeammateSuite
+from icrl4aht_data.format.provenance import ExpertLabels, NearestTest, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, HISTORIES, INFO, PROVENANCE, TASKS
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.writing.card import (
     card_texts,
     episode_texts,
-    evaluated_on,
     facts,
     render_card,
     write_card,
 )
-from icrl4aht_data.writing.statistics import print_learning
 
 KINDS_OF = {family: kind for kind, family in HEURISTIC_KINDS.items()}
 LEFT_OUT = LeftOutTask("task", "demo_wide", "H1/t3", "ppo", 2, 128, 1.25, 2.5, "the learners did not learn")
@@ -119,24 +115,6 @@ def test_long_tables_move_to_card_json(write, tmp_path):
     assert len(tables["learning"]) == 4
 
 
-def test_text_of_the_card(write):
-    card = render_card(write())
-    for text in (
-        "6 histories of 4 tasks, 720 transitions; each history has 120 steps.",
-        "Sources: `ppo` (3 histories), `noise` (3 histories).",
-        "Labels: expert actions in every history, oracle actions in 3 histories.",
-        "the script knows the full state",
-        "must infer what the script knew",
-        "No headroom: on coord_simple the ego hardly matters",
-        "Left out: 1 task that were planned or collected; `card.json` has the reasons.",
-        "| demo_wide | `demo_cook_wide` | 11 x 6 | 45 | 5 | 600 | 28.0 | 2 of 2 |",
-        "They earn less than half of the histories' end in 1 task of ppo on coord_simple",
-        'labels="oracle"',
-    ):
-        assert text in card, text
-    assert "No teammates" not in card and "figures/" not in card and "configs" not in card
-
-
 def test_teammates_that_act_like_the_test_are_named(write):
     own = "None acts like a test teammate of its own family"
     card = render_card(write())
@@ -150,33 +128,10 @@ def test_teammates_that_act_like_the_test_are_named(write):
     assert "Its training teammates H1 are heuristics, in place of the learned teammates" in card
 
 
-def test_how_histories_were_made(write):
-    noise = {"histories": 8, "episodes": 60, "start": [0.9, 1.0], "end": [0, 0], "begin": [0, 0.3], "finish": [0.6, 1]}
-    suite = TeammateSuite(algorithms={"demo_wide": ["fcp"]}, members=2, train=3, total_steps=10**6, threshold=20.0)
-    card = render_card(write(change=lambda of: replace(of, noise=noise | {"power": [0.5, 2.0]}, suite=suite)))
-    assert "8 histories of 60 episodes a task. The chance of a random action falls from 0.9-1.0 to 0" in card
-    assert "a population has 2 policies, each trained for 1,000,000 steps. Algorithms: fcp on demo_wide." in card
-    assert "if it earns more than 20 with its own partner" in card
-    assert "Not recorded" in render_card(write(change=lambda of: Provenance()))
-
-
-def test_learning_is_printed(write):
-    output = StringIO()
-    print_learning(write(), Console(file=output, width=80))
-    lines = [line.replace("|", "").split() for line in output.getvalue().splitlines()]
-    assert ["demo_wide", "noise", "train", "2", "0.50", "43.00", "unknown", "1.00"] in lines
-    assert "left out: demo_wide with H1/t3 (ppo): the learners did not learn" in output.getvalue()
-
-
 def test_the_bundled_card_is_short_and_current():
     content = facts(MINI)
     assert (MINI / "README.md").read_text() == render_card(content)
     assert len((MINI / "README.md").read_text().split()) <= 2500
-
-
-def test_layouts_of_the_benchmark():
-    assert evaluated_on(["demo_wide", "asymm_both"]) == ["demo_wide", "asymm_right", "cramped_down"]
-    assert evaluated_on(["cramped_up", "cramped_down"]) == ["cramped_down"]
 
 
 def test_every_field_is_described():

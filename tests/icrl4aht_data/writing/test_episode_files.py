@@ -91,8 +91,6 @@ class TestObservations:
         row = next(iter(stream(built, "train")))
         wrong: list[tuple[type[Exception], str, Any, dict[str, Any]]] = [
             (UnknownNameError, "unknown channels", row, {"channels": "all"}),
-            (UnknownNameError, "unknown obs", row, {"obs": "state"}),
-            (UnknownNameError, "nowhere", row | {"layout": "nowhere"}, {}),
             (OptionError, "found none: give at least one row", [], {}),
             (
                 OptionError,

@@ -112,12 +112,6 @@ for _file in (INFO, SHARD, teammate):
     add("release", _too_large, {f"a terabyte: {_label}": replaced(_file, sparse)})
 
 
-def chain_of_links(path: Path, root: Path) -> None:
-    path.symlink_to("two")
-    (path.parent / "two").symlink_to("three")
-    (path.parent / "three").symlink_to("../../outside/secret.txt")
-
-
 def deep_folder(root: Path) -> None:
     working_directory = Path.cwd()
     os.chdir(root / "meta")
@@ -134,11 +128,8 @@ _folders = ("data", "meta")
 add(
     "release",
     "leads out of the release",
-    {f"folder linked out: {name}": replaced(name, folder_link_out) for name in _folders}
-    | {"chain of links": replaced(TASKS, chain_of_links)},
+    {f"folder linked out: {name}": replaced(name, folder_link_out) for name in _folders},
 )
-_circle = replaced(TASKS, lambda path, root: path.symlink_to(path.name))
-add("release", "cannot be followed", {"circle of links": _circle})
 add("release", "extra: not listed", {"unlisted pipe": replaced("extra", pipe)})
 add("release", "not listed in the manifest", {"folders too deep": deep_folder})
 
@@ -161,8 +152,6 @@ _integers = {"T": 2**62, "seed": 10**4000}
 add_hashed("Expected `int` <=", {f"index: large {name}": entry(**{name: value}) for name, value in _integers.items()})
 add_hashed("the index implies", {"rows: 2**39": entry(T=2**39)})
 add_hashed("histories", {"info: histories 2**62": info(histories=2**62)})
-_steps = json_file(INFO, lambda value: value["environment"].update(kept_steps=2**200))
-add_hashed("environment", {"info: steps 2**200": _steps})
 _size = json_file(INFO, lambda value: value["shards"].update({SHARD: 2**61}))
 add_hashed(r"expected 2,305,843,009,213,693,952 bytes, found \d", {"info: shard of 2**61 bytes": _size})
 add_hashed("shards: expected", {"info: no shards": info(shards={})})
@@ -179,43 +168,15 @@ def nested(levels: int) -> list:
     return value
 
 
-def many_names(values: list[dict[str, Any]]) -> list:
-    """Return lines with many short task ids and one long one; an array of them would take gigabytes."""
-    ids = [f"t{number}" for number in range(20_000)] + ["x" * 200_000]
-    return [values[0] | {"history_id": number, "task_id": name} for number, name in enumerate(ids)]
-
-
-def many_sets_of_shards(root: Path) -> None:
-    """Let each line name another set of 99,999 shards."""
-
-    def change(values: list[dict[str, Any]]) -> list:
-        names = (f"data/teammate/coord_simple/train-{k:05}-of-{99_999 - k:05}.h5" for k in range(500))
-        return [values[0] | {"history_id": number, "shard": name} for number, name in enumerate(names)]
-
-    lines(change)(root)
-    info(histories=500)(root)
-
-
 _deep_theta = lines(lambda values: values[0]["teammate"]["theta"].update(x=nested(400)), TASKS)
 _deep_files = {f"deep: {name}": replaced(name, deep(500)) for name in (INFO, PROVENANCE)}
 add_hashed("levels deep", _deep_files | {"tasks: deep theta": _deep_theta})
 _endless_line = content(b"a" * 2**24)
 for _of, _file in {"index": HISTORIES, "tasks": TASKS}.items():
     add_hashed("expected at most", {f"{_of}: one endless line": replaced(_file, _endless_line)})
-add_hashed("of length <= 512", {"index: wide names": lines(many_names)})
 add_hashed("line 1: ", {"index: a surrogate": entry(task_id="\ud800")})
 add_hashed("line 1: JSON is malformed", {"index: not a number": entry(score=float("nan"))})
 add_hashed("Expected `float` <", {"index: infinite": entry(return_end=1e308)})
-add_hashed("implies this shard", {"index: many sets of shards": many_sets_of_shards})
-_lists = json_file(PROVENANCE, lambda value: value.update({name: [] for name in value}))
-add_hashed(
-    "an object of objects",
-    {"provenance: a list": replaced(PROVENANCE, content("[]")), "provenance: an object of lists": _lists},
-)
-_words = json_file(
-    PROVENANCE, lambda value: {name: note | {"streams_recorded": "many"} for name, note in value.items()}
-)
-add_hashed(r"streams_recorded", {"provenance: text as number": _words})
 
 # Chunk tables and chunks
 
@@ -255,20 +216,6 @@ def inflating(root: Path) -> None:
     np.save(root / TABLE, rows)
 
 
-def inflating_within_bounds(root: Path) -> None:
-    """Replace the first chunk by one of its size that inflates to more than a chunk has."""
-    rows = np.load(root / TABLE)
-    data = zlib.compress(bytes(300 * int(rows["size"][0])), 9)
-    assert len(data) <= rows["size"][0]
-    with (root / SHARD).open("r+b") as stream:
-        stream.seek(int(rows["offset"][0]))
-        stream.write(data.ljust(int(rows["size"][0]), b"\0"))
-        stream.seek(int(rows["offset"][0]))
-        data = stream.read(int(rows["size"][0]))
-    rows["crc32"][0], rows["hash"][0] = zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
-    np.save(root / TABLE, rows)
-
-
 _HEADER = "{{'descr': {}, 'fortran_order': False, 'shape': {}, }}"
 _ROWS = str(CHUNK_DTYPE.descr)
 _TABLES = {
@@ -278,16 +225,12 @@ _TABLES = {
     "calls": npy(_HEADER.format("__import__('os').system('true')", "(4,)")),
     "pickle": pickled,
     "archive": archive,
-    "columns first": lambda path, root: np.save(path, np.asfortranarray(np.zeros((4, 4)))),
 }
 add_hashed("chunk table|expected rows of", {f"table: {name}": replaced(TABLE, make) for name, make in _TABLES.items()})
 add_hashed("covers more than", {"table: huge chunks": table(lambda rows: rows["size"].__setitem__(0, 2**32 - 1))})
 add_hashed("cover|crc32", {"table: one offset": table(lambda rows: rows["offset"].__setitem__(slice(None), 0))})
 add_hashed("cannot be", {"table: no bytes": table(lambda rows: rows["size"].__setitem__(0, 0))})
-_many_rows = table(lambda rows: np.concatenate([rows, np.zeros(10**6, CHUNK_DTYPE)]))
-add_hashed("cover", {"table: many empty rows": _many_rows})
 add_hashed("cannot be|twice", {"chunk that inflates to a gigabyte": inflating})
-add_hashed("does not inflate to", {"chunk that inflates a little": inflating_within_bounds})
 
 # Structures that libhdf5 would follow, load or believe
 
@@ -332,7 +275,6 @@ _SHARED: dict[str, dict[str, ChangeFile]] = {
     "expected numbers": {
         "texts": typed(h5py.string_dtype()),
         "references": typed(h5py.ref_dtype),
-        "lists": typed(h5py.vlen_dtype("i4")),
         "records": typed([("a", "i4"), ("b", "i4")]),
     },
     "groups: expected|lead out of the file": {"group linked out": group_link_out},
@@ -345,7 +287,6 @@ _OF_SHARDS: dict[str, dict[str, ChangeFile]] = {
     r"expected \[.*found \[.*'more'": {"one name more": another_name},
     "attribute": {
         "attribute of texts": lambda file, out: file.attrs.create("layout", ["x"] * 9),
-        "attribute of references": lambda file, out: file.attrs.create("layout", file.ref, dtype=h5py.ref_dtype),
     },
 }
 for _message, _changes in (_SHARED | _OF_SHARDS).items():
@@ -383,15 +324,12 @@ for _message, _make in {"leads out": link_out, "neither a file": pipe, "at most|
 _endless = hdf5(dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
 add("published", "expected numbers of shape", {"endless rows": _endless})
 add("published", "cannot hold them|memory", {"endless history": endless_history})
-_lzf = dataset((120,), data=np.zeros(120, "i4"), dtype="i4", compression="lzf")
-add("published", "filters", {"a built-in filter that needs a library": hdf5(_lzf, _H5)})
 add("published", "not stored as|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published, _H5)})
 add("published", "Expected `int` >= 1", {"rows below zero": entry(_INDEX, T=-5)})
 add("published", "missing", {"group above": entry(_INDEX, h5_group="../0")})
 add("published", "lite", {"circle of groups": hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)})
 add("published", "printable", {"task id of surrogates": entry(_INDEX, task_id="\ud800")})
 add("published", "expected at most", {"one endless line": replaced(_INDEX, _endless_line)})
-add("published", "an object of objects", {"provenance: a list": replaced("provenance.json", content("[]"))})
 
 # Servers
 
