@@ -35,6 +35,13 @@ NAME, VERSION = PROJECT["project"]["name"], __version__
 pytestmark = pytest.mark.slow
 
 PYTHONS = ("3.11", "3.12", "3.13")
+CODE_BYTES, RELEASE_BYTES, MODEL_BYTES = 4_000_000, 16_000_000, 2_000_000
+"""Size limits of the installed packages without what is bundled, of the bundled release, and of a bundled model of one
+track."""
+ENVIRONMENT_BYTES = 250_000_000
+"""Size limit of the package with its dependencies."""
+
+"""The command that installs here, and that messages of an environment made here name."""
 
 UNREACHABLE = ("NewConnectionError", "NameResolutionError", "ConnectTimeoutError", "dns error", "Connection refused")
 
@@ -290,3 +297,21 @@ def test_named_extras_train_evaluate_and_draw(grown, wheel, tmp_path):
     run("icrl4aht-data", "report", "results")
     assert "demo_wide" in (tmp_path / "results" / "report" / "report.md").read_text(encoding="utf-8")
     assert (tmp_path / "results" / "report" / "report.csv").stat().st_size > 500
+
+
+def test_the_installed_size_is_limited(installed, capsys):
+    (site,) = installed.parent.glob("lib/python*/site-packages")
+    files = (path for path in site.rglob("*") if path.is_file())
+    # Python adds bytecode when a test imports the package: which of it is there depends on the tests that ran before.
+    sizes = {path: path.stat().st_size for path in files if path.suffix != ".pyc"}
+    own = sum(size for path, size in sizes.items() if path.relative_to(site).parts[0].startswith(tuple(PACKAGES)))
+    with capsys.disabled():
+        print(f"\n{NAME}: {own:,} bytes installed, {sum(sizes.values()):,} with its dependencies ({site.parent.name})")
+    release, *models = (
+        sum(size for path, size in sizes.items() if path.is_relative_to(folder))
+        for folder in (site / READER / "mini", *sorted((site / "icrl4aht_baselines" / "models").glob("*/*/")))
+    )
+    assert own - release - sum(models) <= CODE_BYTES
+    assert 0 < release <= RELEASE_BYTES
+    assert len(models) == 8 and all(0 < model <= MODEL_BYTES for model in models)
+    assert sum(sizes.values()) <= ENVIRONMENT_BYTES
