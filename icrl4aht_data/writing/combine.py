@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import check_version
-from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.writing.release import NewTask, write_release
 from icrl4aht_data.writing.release_folder import as_path, check_target
@@ -95,5 +96,16 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
                     f"generate it with another seed"
                 )
             made = provenance.get(task.task_id, Provenance())
+            if made.streams_kept is not None and len(histories) < len(dataset.index.query(task_id=task.task_id)):
+                made = _of_part(made, histories)
             tasks.append(stored_task(histories, task, made, dataset.info.kind))
     return tasks
+
+
+def _of_part(made: Provenance, histories: Dataset) -> Provenance:
+    """Return the provenance of a task of which only some histories are kept."""
+    kept = len(histories)
+    if made.filter is None:
+        return replace(made, streams_kept=kept)
+    start, end = (round(float(histories.column(name).mean()), 3) for name in ("return_start", "return_end"))
+    return replace(made, streams_kept=kept, filter=replace(made.filter, after=StreamReturns(kept, start, end)))
