@@ -124,7 +124,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
         job.train(run, done=show_steps(show, "Hybrid-AD", training.steps))
     write(f"losses on training and held-out histories: {run / RUN_CURVES}")
 
-    tasks = settings.tasks or validation_tasks()
+    tasks = settings.tasks or demo_tasks()
     say(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
     agent = find_agent(run, greedy=False)
     runs = [
@@ -145,7 +145,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     return page
 
 
-def validation_tasks() -> tuple[Task, ...]:
+def demo_tasks() -> tuple[Task, ...]:
     """Return the validation tasks of `DEMO_LAYOUT`: new teammates, dishes of training."""
     tasks = read_tasks(manifest_path(PREFERENCE, "validation"))
     return tuple(task for task in tasks if task.layout.name == DEMO_LAYOUT)

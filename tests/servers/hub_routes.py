@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 from tests.servers.faults import Request
 from tests.servers.http import Answer
+from tests.servers.hub_card import card_error
 from tests.servers.hub_repos import LFS_SUFFIXES, File, HubState, Refusal, Repo, is_large
 
 REPO = r"/api/datasets/(?P<id>[^/]+/[^/]+)"
@@ -170,6 +171,9 @@ def _apply(hub: HubState, files: dict[str, File], key: str, value: dict) -> None
     path = value["path"].strip("/")
     if key == "file":
         content = base64.b64decode(value["content"], validate=True)
+        error = card_error(content.decode()) if path == "README.md" else None
+        if error:
+            raise Refusal(400, f"Invalid metadata in README.md: {error}")
         files[path] = hub.blobs.add(content, lfs=False)
     elif key == "lfsFile":
         if not hub.blobs.path(value["oid"]).exists():
@@ -190,7 +194,13 @@ def new_tag(call: Call) -> Answer:
     return answer({})
 
 
+def validate_yaml(call: Call) -> Answer:
+    error = card_error(call.json()["content"])
+    return answer({"errors": [{"message": error}] if error else [], "warnings": []}, 400 if error else 200)
+
+
 ROUTES: list[tuple[str, str, Route]] = [
+    ("POST", "/api/validate-yaml", validate_yaml),
     ("POST", "/api/repos/create", create),
     ("GET", REPO, info),
     ("GET", f"{REPO}/revision{AT}", info),

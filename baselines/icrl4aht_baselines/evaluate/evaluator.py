@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.teammates.registry import build_teammate, check_theta
+from icrl4aht_generation.teammates.registry import build_teammate, check_theta, with_equal_parameters
 
 from icrl4aht_baselines.agents.egos import SCRIPTED
 from icrl4aht_baselines.agents.host import HostPolicy
@@ -268,8 +268,8 @@ def prepare_rollout(
     layouts = list(dict.fromkeys(task.layout for task in tasks))
     several = len(layouts) > 1
     mates = [
-        build_teammate(None if several else task.layout, task.teammate, TEAMMATE, protocol.noise, suite)
-        for task in tasks
+        build_teammate(None if several else task.layout, entry, TEAMMATE, protocol.noise, suite)
+        for task, entry in zip(tasks, with_equal_parameters([task.teammate for task in tasks]), strict=True)
         for _ in seeds
     ]
     numbers = np.array([layouts.index(task.layout) for task in tasks for _ in seeds]) if several else None

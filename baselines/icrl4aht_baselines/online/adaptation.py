@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
-from icrl4aht_generation.teammates.registry import build_teammate
+from icrl4aht_generation.teammates.registry import build_teammate, with_equal_parameters
 from scipy import stats
 
 from icrl4aht_baselines.online.responses import ResponseOptions, TrainingJob
@@ -108,7 +108,8 @@ class HeadroomJob(TrainingJob):
         for kind, own in numbers.items():
             layouts = [self.tasks[number].layout for number in own]
             several = len(set(layouts)) > 1
-            mates = [build_teammate(None if several else layouts[0], self.tasks[number].teammate) for number in own]
+            entries = with_equal_parameters([self.tasks[number].teammate for number in own])
+            mates = [build_teammate(None if several else layouts[0], entry) for entry in entries]
             told = own if self.kind == "informed" else None
             groups.append(TaskGroup(layouts if several else layouts[:1], kind, mates, False, self.title, told))
         return groups, {group.name: own for group, own in zip(groups, numbers.values(), strict=True)}

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts, with_four_recipes
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate
+from icrl4aht_generation.teammates.registry import build_teammate, recover_teammate, with_equal_parameters
 from icrl4aht_generation.teammates.spread import find_measured
 
 from icrl4aht_baselines.methods.options import ModelOptions
@@ -149,19 +149,21 @@ def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
 def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
     """Return the teammates of all tasks of a selection of histories, and of further tasks."""
     found: _Teammates = {}
+    scripted = [(task.layout, task.task_id, task.teammate) for task in tasks]
     if dataset is not None:
         # Histories of one task have one teammate: any of them recovers it.
         history_of = dict(zip(dataset.column("task_id").tolist(), dataset.ids.tolist(), strict=True))
         for task_id, history_id in history_of.items():
-            entry = dataset.index.entry(history_id)
-            teammate = dataset.recover_teammate(history_id)
-            learned = teammate["kind"] == "rl"
-            policy = recover_teammate(dataset, history_id) if learned else build_teammate(None, teammate)
-            mate = _Teammate(teammate, policy)
-            found.setdefault((get_layout(entry.layout), entry.teammate_kind), {})[task_id] = mate
-    for task in tasks:
-        mate = _Teammate(task.teammate, build_teammate(None, task.teammate))
-        found.setdefault((task.layout, task.teammate_kind), {})[task.task_id] = mate
+            layout, teammate = get_layout(dataset.index.entry(history_id).layout), dataset.recover_teammate(history_id)
+            if teammate["kind"] == "rl":
+                mate = _Teammate(teammate, recover_teammate(dataset, history_id))
+                found.setdefault((layout, teammate["family"]), {})[task_id] = mate
+            else:
+                scripted.append((layout, task_id, teammate))
+    entries = with_equal_parameters([teammate for _, _, teammate in scripted])
+    for (layout, task_id, teammate), entry in zip(scripted, entries, strict=True):
+        mates = found.setdefault((layout, teammate["family"]), {})
+        mates[task_id] = _Teammate(teammate, build_teammate(None, entry))
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,15 @@ def build_teammate(
         return learned.build_learned_entry(layout, teammate, suite)
     check_theta(teammate)
     return _family(teammate["family"]).build(layout, teammate["theta"], slot, noise)
+
+
+def with_equal_parameters(teammates: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return entries of which all of one family have `RANDOM_ACTIONS` if any has, so that they play in one program."""
+    mixed = {entry["family"] for entry in teammates if RANDOM_ACTIONS in entry["theta"]}
+    return [
+        entry | {"theta": {RANDOM_ACTIONS: 0.0} | entry["theta"]} if entry["family"] in mixed else entry
+        for entry in teammates
+    ]
 
 
 def recover_teammate(dataset: Dataset, history_id: int, episode: int = 0) -> Policy:

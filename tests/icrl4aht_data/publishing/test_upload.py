@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from huggingface_hub import snapshot_download
+from huggingface_hub import DatasetCard, ModelCard, snapshot_download
 
 from icrl4aht_data import verify_release
 from icrl4aht_data.commands.cli import cli
@@ -18,6 +19,7 @@ from icrl4aht_data.errors import OptionError, ReleaseError, UploadError
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
+from icrl4aht_data.utils.templates import card_file, fill_template
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_release
 from tests.servers.faults import Request, Slow, Status
@@ -223,3 +225,10 @@ def test_a_changed_repository_gets_no_tag(hub, published, tmp_path):
     hub.faults.clear()
     with pytest.raises(UploadError, match=r"belong to no release, such as more\.txt"):
         upload_release(published, ADDRESS)
+
+
+def test_cards_are_valid_to_the_hub(hub, published):
+    DatasetCard.load(published / "README.md", ignore_metadata_errors=False).validate()
+    names = re.findall(r"\$([a-z_]+)", card_file("baseline.md").read_text())
+    ModelCard(fill_template("baseline.md", **dict.fromkeys(names, "name") | {"datasets": ""})).validate()
+    assert [request.path for request in hub.log] == ["/api/validate-yaml"] * 2
