@@ -18,6 +18,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import SOURCES
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.layouts_file import layout_title
 from icrl4aht_data.overcooked.actions import DOWN
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import draw_frame, encode_episode
@@ -158,12 +159,15 @@ def animate_episode(
 def plot_learning_curves(dataset: Iterable[Any], path: Path | None = None) -> Figure:
     """Plot the return over the course of a history on every layout in a selection, see `plot_source_curves`.
 
+    The generated layouts of a family share a panel.
+
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
     """
     curves: SourceCurves = {}
     for history in dataset:
-        add_curve(curves, history.entry.layout, history.entry.source, history.entry.split, history.returns())
+        entry = history.entry
+        add_curve(curves, layout_title(entry.layout), entry.source, entry.split, history.returns())
     return plot_source_curves(curves, path)
 
 

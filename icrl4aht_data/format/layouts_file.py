@@ -29,6 +29,8 @@ PUBLISHED = "published"
 OTHER = "other"
 """Family of layouts that were not generated."""
 
+_GENERATED = re.compile(r"(\w+)-(\d+)-(\d+)", re.ASCII).fullmatch
+
 _NEEDED = {GOAL: "a goal", POT: "a pot", PLATES: "a pile of plates"}
 
 
@@ -111,8 +113,14 @@ def write_layouts(root: Path, layouts: Iterable[Layout]) -> None:
         (root / LAYOUTS_FILE).write_bytes(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
 
 
+def layout_title(name: str) -> str:
+    """Return the name under which tables and figures show a layout: generated ones have that of their family."""
+    generated = _GENERATED(name)
+    return name if generated is None else generated[1]
+
+
 def _line(layout: Layout) -> LayoutLine:
-    generated = re.fullmatch(r"(\w+)-(\d+)-(\d+)", layout.name, re.ASCII)
+    generated = _GENERATED(layout.name)
     own = layout.name, layout.rows, layout.recipes, layout.indicates_delivery
     if generated is None:
         return LayoutLine(*own, OTHER)

@@ -30,6 +30,7 @@ from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headr
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import ReleaseInfo
+from icrl4aht_data.format.layouts_file import layout_title
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import (
     CARD_TABLES,
@@ -154,9 +155,10 @@ def facts(root: Path) -> dict[str, Any]:
         _TaskFacts(own[0], own, by_id.get(name), provenance.get(name, Provenance())) for name, own in members.items()
     ]
     teammates = _teammates(tasks, list(info.layouts))
+    titles = {layout: layout_title(layout) for layout in info.layouts}
     matters = defaultdict[str, list[bool]](list)
     for row in (row for row in teammates if row["matters"] is not None):
-        matters[row["layout"]].append(row["matters"])
+        matters[titles[row["layout"]]].append(row["matters"])
     headroom = {layout: any(found) for layout, found in matters.items()}
     first = min(entries, key=lambda entry: (entry.split != "train", entry.history_id))
     length = min(500, *(entry.T for entry in entries if (entry.split, entry.layout) == (first.split, first.layout)))
@@ -175,11 +177,11 @@ def facts(root: Path) -> dict[str, Any]:
         "views": Counter(entry.label_view for entry in entries if entry.label_view),
         "swapped": sum(entry.teammate_of_episode is not None for entry in entries),
         "example": {"split": first.split, "layout": first.layout, "length": length},
-        "layouts": _layouts(info, matters),
-        "learning": _learning(tasks, "layout", "source", "split"),
+        "layouts": _layouts(info, titles, matters),
+        "learning": _learning(tasks, titles),
         "teammates": teammates,
         **_behaviours(teammates),
-        "weak": Counter((task.first.layout, task.first.source) for task in tasks if task.has_weak_labels),
+        "weak": Counter((titles[task.first.layout], task.first.source) for task in tasks if task.has_weak_labels),
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,
         "test_headroom": headroom_table(read_headroom(HEADROOM_PROTOCOL), tested),
@@ -227,10 +229,13 @@ def _grouped(tasks: Iterable[_TaskFacts], *names: str) -> dict[tuple[str, ...], 
     return {key: groups[key] for key in sorted(groups, key=lambda key: list(map(order.index, key)))}
 
 
-def _learning(tasks: Iterable[_TaskFacts], *names: str) -> list[dict[str, Any]]:
-    """Return rows on the rise of returns, one for each combination of some index fields."""
+def _learning(tasks: Iterable[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return rows on the rise of returns, one for each title of layouts, source and split."""
+    groups, names = defaultdict[tuple[str, ...], list[_TaskFacts]](list), ("layout", "source", "split")
+    for (layout, *rest), own in _grouped(tasks, *names).items():
+        groups[titles[layout], *rest] += own
     rows = []
-    for key, own in _grouped(tasks, *names).items():
+    for key, own in groups.items():
         entries = [entry for task in own for entry in task.histories]
         before = [task.made.filter.before.return_end for task in own if task.made.filter]
         row = dict(zip(names, key, strict=True)) | {
@@ -287,14 +292,32 @@ def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     return {"behaviours": counts, "shared_behaviours": len(shared)}
 
 
-def _layouts(info: ReleaseInfo, matters: Mapping[str, Sequence[bool]]) -> list[list[str]]:
-    """Return the rows of the card's table of layouts; `matters` says of each teammate whether the ego matters."""
+def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str, Sequence[bool]]) -> list[list[str]]:
+    """Return the rows of the card's table of layouts, one for each title.
+
+    Args:
+        info: says what there is on each layout.
+        titles: layout -> its title, see `layout_title`.
+        matters: title -> whether the ego matters, for each teammate.
+    """
     rows = []
-    for name, found in info.layouts.items():
-        layout, known = get_layout(name), matters.get(name)
-        row = [name, f"`{layout.alias}`", f"{layout.width} x {layout.height}", str(layout.obs_shape[-1])]
-        row += [f"{found.histories:,}", f"{found.transitions:,}", f"{found.mean_final_return:z.1f}"]
-        rows.append([*row, f"{sum(known)} of {len(known)}" if known else "unknown"])
+    for title in dict.fromkeys(titles.values()):
+        own = {name: found for name, found in info.layouts.items() if titles[name] == title}
+        layouts, known = [get_layout(name) for name in own], matters.get(title)
+        histories = [found.histories for found in own.values()]
+        final = np.average([found.mean_final_return for found in own.values()], weights=histories)
+        rows.append(
+            [
+                title if title in own else f"{title} ({len(own)} generated layouts)",
+                f"`{layouts[0].alias}`" if title in own else "",
+                f"{_span(one.width for one in layouts)} x {_span(one.height for one in layouts)}",
+                _span(one.obs_shape[-1] for one in layouts),
+                f"{sum(histories):,}",
+                f"{sum(found.transitions for found in own.values()):,}",
+                f"{final:z.1f}",
+                f"{sum(known)} of {len(known)}" if known else "unknown",
+            ]
+        )
     return rows
 
 

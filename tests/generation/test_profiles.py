@@ -73,7 +73,7 @@ def test_shipped_profiles_load(name):
     assert len({work.name for work in works}) == len(works)
     for work in works:
         layouts = PREFERENCE_LAYOUTS if work.source == "search" else TRACKS[work.task.track]
-        assert work.task.layout.name in layouts["train"]
+        assert work.task.layout.name in (*layouts["train"], *profile.generated)
         assert work.task.split == "train" or (work.task.split == "validation" and work.source in SCRIPTED_SOURCES)
         assert (work.task.recipes is not None) == (work.source == "search")
 

@@ -18,6 +18,7 @@ from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
 from icrl4aht_data.format.info import LeftOutTask
+from icrl4aht_data.format.layouts_file import layout_title
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import Kind, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
@@ -93,7 +94,7 @@ def package_release(
         else:
             new.append(_new_task(found, profile, suite, facts[task_id], recorded))
             for returns in found.kept:
-                add_curve(curves, task.layout.name, found.source, task.split, returns)
+                add_curve(curves, layout_title(task.layout.name), found.source, task.split, returns)
         advance(0)
     if not new:
         reasons = "; ".join(one.reason for one in omitted) or "there is no task"
