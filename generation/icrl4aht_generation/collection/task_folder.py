@@ -58,18 +58,20 @@ def checkpoint_path(folder: Path, number: int) -> Path:
 
 
 def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
-    """Return the settings that an artefact depends on; if any of them changes, it is made again."""
-    common = {
+    """Return the settings that an artefact depends on, as JSON has them; if any of them changes, it is made again."""
+    settings: dict[str, Any] = {
         "task": asdict(work.task),
         "source": work.source,
         "learner": work.learner,
         "code_version": version("icrl4aht-data"),
     }
+    layout = work.task.layout.name
     if work.source in SCRIPTED_SOURCES:
-        config = profile.scripted_on(work.task.layout.name, work.source)
-        return common | {"noise": json.loads(json.dumps(asdict(config)))}  # lists, as in the file, not tuples
-    ego = profile.ego_on(work.task.layout.name)
-    return common | {"ego_hash": json_hash(asdict(ego)), "checkpoint_updates": list(checkpoint_updates(ego))}
+        settings["noise"] = asdict(profile.scripted_on(layout, work.source))
+    else:
+        ego = profile.ego_on(layout)
+        settings |= {"ego_hash": json_hash(asdict(ego)), "checkpoint_updates": checkpoint_updates(ego)}
+    return json.loads(json.dumps(settings))  # lists, as in the file, not tuples
 
 
 def hashed_files(work: Work, profile: Profile) -> list[str]:

@@ -203,7 +203,8 @@ def test_a_full_disk(profile, tmp_path, monkeypatch):
 def searched(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict[str, np.ndarray]:
     """Return histories of the searcher in a task with one wanted dish, whose teammate only watches."""
     work = Work(make_task("preference", "train", "asymm_both_plain", WATCHER, 5, [dish]), "search")
-    run_task(work, profile, folder / str(dish))
+    assert run_task(work, profile, folder / str(dish))
+    assert not run_task(work, profile, folder / str(dish)), "a finished task is kept"
     return {path.stem: np.load(path) for path in (folder / str(dish)).glob("*.npy")}
 
 
