@@ -11,6 +11,7 @@ import numpy as np
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import ReleaseError
+from icrl4aht_data.format.layouts_file import layout_title
 from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, Entry, episode_returns
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -41,12 +42,18 @@ class EmbeddedHistory(NamedTuple):
 
 
 def spread_histories(dataset: Dataset, count: int) -> list[int]:
-    """Return the ids of at most `count` histories, ascending, spread over layouts, kinds of teammates and sources."""
-    groups: dict[str, dict[tuple[str, ...], list[int]]] = {}
+    """Return the ids of at most `count` histories, ascending, spread over layouts, kinds of teammates and sources.
+
+    The generated layouts of a family count as one.
+    """
+    groups: dict[str, dict[str, dict[tuple[str, ...], list[int]]]] = {}
     names = ("layout", "source", "teammate_family", "teammate_kind")
-    for number, layout, *group in zip(dataset.ids.tolist(), *(dataset.column(n).tolist() for n in names), strict=True):
-        groups.setdefault(layout, {}).setdefault(tuple(group), []).append(number)
-    return sorted(_alternating(_alternating(of_layout.values()) for of_layout in groups.values())[:count])
+    columns = (dataset.column(name).tolist() for name in names)
+    for number, layout, source, *kind in zip(dataset.ids.tolist(), *columns, strict=True):
+        of_source = groups.setdefault(layout_title(layout), {}).setdefault(source, {})
+        of_source.setdefault(tuple(kind), []).append(number)
+    layouts = (_alternating(_alternating(kinds.values()) for kinds in layout.values()) for layout in groups.values())
+    return sorted(_alternating(layouts)[:count])
 
 
 def _alternating(lists: Iterable[list[int]]) -> list[int]:

@@ -162,7 +162,8 @@ def facts(root: Path) -> dict[str, Any]:
     headroom = {layout: any(found) for layout, found in matters.items()}
     first = min(entries, key=lambda entry: (entry.split != "train", entry.history_id))
     length = min(500, *(entry.T for entry in entries if (entry.split, entry.layout) == (first.split, first.layout)))
-    tested = evaluated_on(info.layouts)
+    tested, learning = evaluated_on(info.layouts), _learning(tasks, titles)
+    sources = Counter(entry.source for entry in entries)
     return {
         "info": info,
         "files": files,
@@ -170,7 +171,7 @@ def facts(root: Path) -> dict[str, Any]:
         "has_states": info.kind in KINDS,
         "tasks": len(tasks),
         "lengths": [entry.T for entry in entries],
-        "sources": Counter(entry.source for entry in entries),
+        "sources": sources,
         "kinds": dict(sorted({(e.teammate_family, e.teammate_kind) for e in entries if e.teammate_family != "rl"})),
         "algorithms": [name for name in ALGORITHMS if name in {entry.teammate_kind for entry in entries}],
         "labelled": {name: sum(e.has(FIELDS[f"{name}_actions"]) for e in entries) for name in ("expert", "oracle")},
@@ -178,7 +179,8 @@ def facts(root: Path) -> dict[str, Any]:
         "swapped": sum(entry.teammate_of_episode is not None for entry in entries),
         "example": {"split": first.split, "layout": first.layout, "length": length},
         "layouts": _layouts(info, titles, matters),
-        "learning": _learning(tasks, titles),
+        "learning": learning,
+        "curves": _curves(learning, sources),
         "teammates": teammates,
         **_behaviours(teammates),
         "weak": Counter((titles[task.first.layout], task.first.source) for task in tasks if task.has_weak_labels),
@@ -249,6 +251,15 @@ def _learning(tasks: Iterable[_TaskFacts], titles: Mapping[str, str]) -> list[di
     return rows
 
 
+def _curves(learning: Iterable[Mapping[str, Any]], sources: Iterable[str]) -> list[list[str]]:
+    """Return the rows of the card's table of learning curves: a row for each layout and split, a column per source."""
+    found = defaultdict[tuple[str, str], dict[str, str]](dict)
+    for row in learning:
+        text = f"{row['first']:z.1f} to {row['last']:z.1f} ({row['histories']})"
+        found[row["layout"], row["split"]][row["source"]] = text
+    return [[*key, *(of_key.get(source, "") for source in sources)] for key, of_key in found.items()]
+
+
 def _learned_last(family: str) -> tuple[bool, tuple[int, str]]:
     return family == "rl", family_order(family)
 
@@ -309,7 +320,6 @@ def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str,
         rows.append(
             [
                 title if title in own else f"{title} ({len(own)} generated layouts)",
-                f"`{layouts[0].alias}`" if title in own else "",
                 f"{_span(one.width for one in layouts)} x {_span(one.height for one in layouts)}",
                 _span(one.obs_shape[-1] for one in layouts),
                 f"{sum(histories):,}",

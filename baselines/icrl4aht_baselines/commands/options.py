@@ -223,12 +223,13 @@ model_options = dataclass_options(ModelOptions, "model", default_text=_BY_SIZE)
 def training_summary(histories: dict[str, Any]) -> str:
     """Return layouts, channels, labels and numbers of histories of a training run, from its histories' settings."""
     shape, sizes, split = " x ".join(map(str, histories["obs_shape"])), histories["sizes"], histories["teammates_split"]
+    held = [f"{sizes['histories']} with the same teammates"] if "histories" in sizes else []
+    held += [f"{sizes['teammates']} with others (split {split})"] if split else []
     parts = [
         f"training on {', '.join(histories['layouts'])}",
         f"{histories['channels']} channels, observations of {shape}",
         f"{sizes['train']} histories",
-        f"held out {sizes['histories']} with the same teammates"
-        + (f" and {sizes['teammates']} with others (split {split})" if split else ""),
+        f"held out {' and '.join(held)}",
     ]
     parts += [f"windows of every {histories['every']}-th episode"] if histories["every"] > 1 else []
     return "; ".join(parts + ([f"{histories['labels']} labels"] if histories["labels"] else []))

@@ -254,21 +254,22 @@ class HistorySplit(NamedTuple):
 
     Attributes:
         train: histories to train on.
-        histories: held-out histories of the training tasks.
+        histories: held-out histories of the training tasks; None if each of these has one history.
         teammates: histories with teammates that are in no other part, of split validation or held out; None if there is
             neither. They may act like a teammate in training, with other parameters.
     """
 
     train: Dataset
-    histories: Dataset
+    histories: Dataset | None
     teammates: Dataset | None
 
 
 def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Dataset | None = None) -> HistorySplit:
     """Hold out a share of the teammates, and a share of the histories with the others; at least one each.
 
-    Every task with a teammate that is not held out keeps at least one history. The choice depends on names and the seed
-    alone, see `splitting`; `Dataset.split` makes the same choice of teammates or of histories.
+    Where each task has one history, only teammates are held out. Every task with a teammate that is not held out keeps
+    at least one history. The choice depends on names and the seed alone, see `splitting`; `Dataset.split` makes the
+    same choice of teammates or of histories.
 
     Args:
         dataset: the histories to divide.
@@ -278,13 +279,15 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
             then, and no teammate of `dataset` is held out.
 
     Raises:
-        OptionError: if the share is not between 0 and 1, or every task has one history only.
+        OptionError: if the share is not between 0 and 1, or there is one task with one history.
     """
     teammates = validation
     if validation is None:
         with_held = choose_teammates(teammate_names(dataset), share, seed)
         if with_held.any():
             dataset, teammates = dataset.select(~with_held), dataset.select(with_held)
+    if teammates is not None and len(dataset) == len(set(dataset.column("task_id").tolist())):
+        return HistorySplit(train=dataset, histories=None, teammates=teammates)
     held = choose_histories(dataset, share, seed)
     return HistorySplit(train=dataset.select(~held), histories=dataset.select(held), teammates=teammates)
 

@@ -276,8 +276,8 @@ class TestPreparing:
 
     def test_teammates_of_tasks_are_added_and_recorded(self):
         tasks = read_tasks(manifest_path("layout", "train", "diverse"))
-        plain, job = self.prepare(PlayOptions()), self.prepare(PlayOptions(), tasks)
-        assert plain.about["trained_on"] == [cell for cell in job.about["trained_on"] if cell["source"] == "noise"]
+        plain, job = (self.prepare(PlayOptions(), of, batch=128) for of in ((), tasks))
+        assert plain.about["trained_on"] == [cell for cell in job.about["trained_on"] if cell["source"] != "tasks"]
         added = {cell["algorithm"]: cell for cell in job.about["trained_on"] if cell["source"] == "tasks"}
         here = [task for task in tasks if task.layout.name == "cramped_up"]  # tasks on asymm_both are left out
         assert sum(cell["tasks"] for cell in added.values()) == len(here)

@@ -310,8 +310,9 @@ class TestHeldOut:
         split = hold_out(dataset[3:8], validation=dataset[:1])  # one history of the first task, four of the second
         assert split.train.ids.tolist()[0] == dataset.ids[3]
         assert (len(split.train), len(split.histories)) == (4, 1)
+        assert hold_out(dataset[3:5]).histories is None
         with pytest.raises(OptionError, match=r"every task of .* has one history: expected a task with two"):
-            hold_out(dataset[3:5])
+            hold_out(dataset[3:4])
 
     def test_labels(self, two_sources):
         def job(method: str, **choice: Any) -> Any:
@@ -340,36 +341,36 @@ class TestHeldOut:
         assert job("dpt", queries=3).data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
 
     def test_one_teammate_cannot_be_held_out(self):
-        dataset = load_icrl4aht(layout="coord_simple")
-        dataset = dataset.filter(task_id=dataset.entries[0].task_id)
+        dataset = load_icrl4aht(layout="asymm_both_plain")
+        dataset = dataset.filter(task_id=dataset.entries[0].task_id)[:5]
         split = hold_out(dataset)
         assert split.teammates is None
         assert [len(split.train), len(split.histories)] == [len(dataset) - 1, 1]
 
     def test_filters_choose_the_histories_and_are_recorded(self):
-        """Filter the teammates of asymm_both, which have several families and algorithms."""
+        """Filter the teammates of demo_simple, which have several families and algorithms."""
 
         def job(**filters: Any) -> dict[str, Any]:
-            return prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), **filters)).about
+            return prepare("ad", MODEL, OPTIONS, HistoryOptions(("demo_simple",), **filters)).about
 
         everything, learned = job()["trained_on"], job(teammate_family=("rl",))
-        assert {cell["family"] for cell in everything} == {"rl", "H1", "H3"}
+        assert {cell["family"] for cell in everything} == {"rl", "H1", "H2", "H3", "H4"}
         assert {cell["family"] for cell in learned["trained_on"]} == {"rl"}
         assert learned["histories"]["teammate_family"] == ("rl",)
-        one = load_icrl4aht(layout="asymm_both", teammate_family="rl").entries[0].teammate_kind
+        one = load_icrl4aht(layout="demo_simple", teammate_family="rl").entries[0].teammate_kind
         (cell,) = job(algorithm=(one,), source=("ppo",))["trained_on"]
-        names = {"layout": "asymm_both", "split": "train", "family": "rl", "algorithm": one, "source": "ppo"}
+        names = {"layout": "demo_simple", "split": "train", "family": "rl", "algorithm": one, "source": "ppo"}
         assert cell.items() >= names.items()
-        assert cell["histories"] < len(load_icrl4aht(layout="asymm_both", teammate_kind=one))  # some are held out
+        assert cell["histories"] < len(load_icrl4aht(layout="demo_simple", teammate_kind=one))  # some are held out
 
     @pytest.mark.parametrize(
         ("filters", "message"),
         [
             (
                 {"algorithm": ("fpc",)},
-                r"algorithm = fpc: none of .*; these have assembly_line, fcp, recipe_aware_button: choose",
+                r"algorithm = fpc: none of .*; these have assembly_line, fcp, .*: choose",
             ),
-            ({"source": ("ppo", "dqn")}, "source = dqn: none of .*; these have noise, ppo: choose"),
+            ({"source": ("ppo", "dqn")}, "source = dqn: none of .*; these have agent, noise, ppo: choose"),
             (
                 {"teammate_family": ("rl",), "algorithm": ("assembly_line",)},
                 "^teammate_family = rl, algorithm = assembly_line: none of .* on asymm_both.* has these together",

@@ -158,8 +158,8 @@ def test_a_release_without_tasks_has_no_environments(converted_release):
 
 def test_episodes_that_do_not_exist_are_errors():
     dataset, history = bundled(layout="demo_wide", source="noise")
-    with pytest.raises(OptionError, match=r"episode = 60: history \d+ has episodes 0\.\.59"):
-        dataset.reset_options(history.entry.history_id, 60)
+    with pytest.raises(OptionError, match=r"episode = 40: history \d+ has episodes 0\.\.39"):
+        dataset.reset_options(history.entry.history_id, 40)
     with pytest.raises(OptionError, match="episode = -1"):
         dataset.reset_options(history.entry.history_id, -1)
 

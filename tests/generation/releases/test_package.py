@@ -118,7 +118,7 @@ def test_streams_of_both_learners_that_rise_are_kept(two_learners, profile, tmp_
         np.testing.assert_array_equal(history.read("oracle_actions"), wanted)
     card = (root / "README.md").read_text()
     assert "2 independent learners a task" in card
-    assert "A task has 16 streams; those with the highest end + improvement are kept, 4 of them" in card
+    assert "A task has 16 streams; the 4 with the highest end + improvement are kept" in card
     assert "![Learning curves](figures/learning_curves.png)" in card
     assert "figures/learning_curves.png" in read_manifest(root)
     assert (root / "figures/learning_curves.png").stat().st_size < 100_000
