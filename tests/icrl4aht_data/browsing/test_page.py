@@ -57,7 +57,8 @@ def assert_embeds(page: bytes, dataset, shown: int | None = None) -> None:
         assert len(decoded) == (len(ends) if shown is None else min(shown, len(ends)))
         assert {0, len(ends) - 1} <= set(decoded)
         names = {"state", "rewards", "actions", "teammate_actions", "expert_actions"}
-        names |= {"oracle_actions"} if history.entry.source != "noise" else set()
+        apart = history.entry.has_oracle_actions and history.entry.source != "noise"  # where both labels are equal
+        names |= {"oracle_actions"} if apart else set()
         arrays = {name: history.read(name) for name in names}
         end_states = history.read("episode_end_state")
         for number, frames in decoded.items():
