@@ -15,7 +15,7 @@ from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.plotting import panel_grid
-from icrl4aht_baselines.report.page import write_page_with_episodes
+from icrl4aht_baselines.report.page import write_page
 from icrl4aht_baselines.report.results import EPISODE_BLOCKS, EvaluationRun, evaluate_agent
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.histories import prepare
@@ -41,11 +41,11 @@ _MODEL = ModelOptions(
     width=128, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05
 )
 _TRAINING = TrainOptions(
-    1500, batch_size=32, context=_EPISODES * KEPT_STEPS, learning_rate=2e-3, validate_every=500, validation_batches=1
+    1000, batch_size=32, context=_EPISODES * KEPT_STEPS, learning_rate=2e-3, validate_every=500, validation_batches=1
 )
 _PROTOCOL = get_protocol("seeded", 10)
 
-_AGENTS = {"stay": "never moves", "search": "the script that the model imitates", "oracle": "is told the dish"}
+_AGENTS = {"stay": "never moves", "search": "the script that it imitates", "oracle": "a script that is told the dish"}
 """Reference egos that the picture shows, and what they do."""
 
 
@@ -139,7 +139,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
 
     say(6, "drawing")
     draw_adaptation(runs, picture)
-    write_page_with_episodes(runs, page)
+    write_page(runs, page)
     write(f"return by episode: {picture}\nreport: {page}")
     write(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(runs[0], cleared)}")
     return page
@@ -208,7 +208,8 @@ def draw_adaptation(runs: Sequence[EvaluationRun], path: Path) -> None:
     )
     for number, run in enumerate(runs):
         returns = np.mean([of_cell.mean(axis=0) for of_cell in run.cells.values()], axis=0)
-        label = f"{run.agent}, which {_AGENTS[run.agent]}" if run.agent in _AGENTS else run.agent
+        own = "the model, memory cleared before each episode" if number else "the model, with its memory"
+        label = f"{run.agent}: {_AGENTS[run.agent]}" if run.agent in _AGENTS else own
         style = (
             {"color": "C0", "linewidth": 2.2, "linestyle": "--" if number else "-"}
             if number < 2

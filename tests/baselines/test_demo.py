@@ -14,7 +14,7 @@ from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.results import Result, write_result
 from icrl4aht_baselines.evaluate.segments import controlled_name
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.report import gifs, results
+from icrl4aht_baselines.report import results
 from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_generation.teammates.registry import sample_teammate
 from rich.console import Console
@@ -70,7 +70,6 @@ def evaluation_of(last: float, last_cleared: float):
 def test_the_demo_runs_every_step(last, last_cleared, verdict, release, tmp_path, monkeypatch):
     """The model is trained; its evaluation is replaced by invented results."""
     monkeypatch.setattr(results, "evaluate", evaluation_of(last, last_cleared))
-    monkeypatch.setattr(gifs, "save_episodes", lambda *arguments, **named: ())
     monkeypatch.setattr(demo, "DEMO_LAYOUT", "demo_wide")
     text = StringIO()
     page = demo.run_demo(tmp_path, Console(file=text, width=300), replace(SETTINGS, root=release))
