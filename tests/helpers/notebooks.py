@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import re
 import sys
@@ -10,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
+
+from icrl4aht_baselines.plotting import shrink_picture
 
 from tests.helpers.paths import ROOT
 
@@ -46,11 +49,20 @@ def store(path: Path) -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         notebook = execute(path, Path(folder))
-    text = nbformat.writes(_without_times(notebook))
+    text = re.sub(r"(?<=data:image/png;base64,)[\w+/=]+", _shrunk, nbformat.writes(_without_times(notebook)))
     for found, shown in ((str(ROOT), "/home/you/icrl4aht-data"), (folder, "/home/you/work")):
         text = text.replace(found, shown)
     path.write_text(text + "\n", encoding="utf-8")
     print(f"wrote {path}: {path.stat().st_size // 1000} kB")
+
+
+def _shrunk(picture: re.Match[str]) -> str:
+    """Return a PNG file in base64 with 64 colours."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        path.write_bytes(base64.b64decode(picture[0]))
+        shrink_picture(path, path)
+        return base64.b64encode(path.read_bytes()).decode()
 
 
 def _without_times(notebook: Any) -> Any:
