@@ -41,7 +41,7 @@ _MODEL = ModelOptions(
     width=128, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05
 )
 _TRAINING = TrainOptions(
-    1000, batch_size=32, context=_EPISODES * KEPT_STEPS, learning_rate=2e-3, validate_every=500, validation_batches=1
+    1250, batch_size=32, context=_EPISODES * KEPT_STEPS, learning_rate=2e-3, validate_every=500, validation_batches=1
 )
 _PROTOCOL = get_protocol("seeded", 10)
 
@@ -65,7 +65,7 @@ class DemoSettings:
     training: TrainOptions = _TRAINING
     tasks: tuple[Task, ...] | None = None
     protocol: Protocol = _PROTOCOL
-    seeds: Sequence[int] = range(16)
+    seeds: Sequence[int] = range(24)
 
 
 def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) -> Path:
