@@ -279,6 +279,7 @@ class TestHeldOut:
         dataset = load_icrl4aht(tmp_path / "r", obs="state")
         monkeypatch.setattr(dataset_module, "teammate_ids", lambda dataset, ids: None)
         split = hold_out(dataset, 0.25)
+        assert split.histories is not None
         assert split.teammates is not None
         parts = (split.train, split.histories, split.teammates)
         assert [len(part) for part in parts] == [12, 4, 4]
@@ -309,6 +310,7 @@ class TestHeldOut:
         dataset = load_icrl4aht(two_sources[0], source="ppo", layout="demo_wide")
         split = hold_out(dataset[3:8], validation=dataset[:1])  # one history of the first task, four of the second
         assert split.train.ids.tolist()[0] == dataset.ids[3]
+        assert split.histories is not None
         assert (len(split.train), len(split.histories)) == (4, 1)
         assert hold_out(dataset[3:5]).histories is None
         with pytest.raises(OptionError, match=r"every task of .* has one history: expected a task with two"):
@@ -345,6 +347,7 @@ class TestHeldOut:
         dataset = dataset.filter(task_id=dataset.entries[0].task_id)[:5]
         split = hold_out(dataset)
         assert split.teammates is None
+        assert split.histories is not None
         assert [len(split.train), len(split.histories)] == [len(dataset) - 1, 1]
 
     def test_filters_choose_the_histories_and_are_recorded(self):
