@@ -379,5 +379,5 @@ def further_layout_names() -> tuple[str, ...]:
 
 
 def all_layout_names() -> list[str]:
-    """Return all names that `get_layout` accepts: short names, registered names and environment names."""
-    return [*LAYOUTS, *further_layout_names(), *_BY_ALIAS]
+    """Return all names that `get_layout` accepts: short names, environment names, and further ones."""
+    return [*LAYOUTS, *_BY_ALIAS, *further_layout_names()]

@@ -112,7 +112,8 @@ def test_an_unknown_layout_lists_the_names_and_the_nearest(wrong, nearest):
     with pytest.raises(UnknownNameError, match=rf"unknown layout '{wrong}'.*\.{re.escape(hint)}$") as error:
         get_layout(wrong)
     listed = str(error.value).split("valid: ")[1].split(".")[0].split(", ")
-    assert set(listed) == {*SPECIFIED, *(alias for alias, *_ in SPECIFIED.values())}
+    # Releases that other tests opened may have made further layouts known.
+    assert set(listed) >= {*SPECIFIED, *(alias for alias, *_ in SPECIFIED.values())}
 
 
 @pytest.mark.parametrize(
