@@ -6,13 +6,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from rich.console import Console
 
 from icrl4aht_baselines.agents.egos import find_agent
-from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
+from icrl4aht_baselines.evaluate.protocols import Protocol, bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.page import write_page
@@ -23,7 +24,7 @@ from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
 from icrl4aht_baselines.training.trainer import show_steps
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE
-from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
+from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.dataset import MINI, Dataset, load_icrl4aht
 from icrl4aht_data.errors import ReleaseError
@@ -48,6 +49,8 @@ _PROTOCOL = get_protocol("seeded", 10)
 _AGENTS = {"stay": "never moves", "search": "the script that it imitates", "oracle": "a script that is told the dish"}
 """Reference egos that the picture shows, and what they do."""
 
+_OWN_STYLE: dict[str, Any] = {"color": "C0", "linewidth": 2.2}
+
 
 @dataclass(frozen=True)
 class DemoSettings:
@@ -55,7 +58,7 @@ class DemoSettings:
 
     Attributes:
         root: folder of the release.
-        model, training: those of Hybrid-AD, whose steps cost least; chosen on validation tasks.
+        model, training: of Hybrid-AD, the model that trains fastest; chosen on validation tasks.
         tasks: tasks to evaluate on; None for the validation tasks of `DEMO_LAYOUT`.
         protocol, seeds: of the evaluation.
     """
@@ -147,8 +150,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
 
 def demo_tasks() -> tuple[Task, ...]:
     """Return the validation tasks of `DEMO_LAYOUT`: new teammates, dishes of training."""
-    tasks = read_tasks(manifest_path(PREFERENCE, "validation"))
-    return tuple(task for task in tasks if task.layout.name == DEMO_LAYOUT)
+    return tuple(task for task in bundled_tasks(PREFERENCE, "validation") if task.layout.name == DEMO_LAYOUT)
 
 
 def block_table(runs: Sequence[EvaluationRun]) -> pd.DataFrame:
@@ -171,13 +173,13 @@ def _blocks(run: EvaluationRun) -> dict[str, list[np.ndarray]]:
 
 
 def find_rise(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
-    """Return how much a run earns more in its last block of episodes than in its first episode.
+    """Return how much more a run earns in its last block of episodes than in its first episode, or than another run.
 
     Differences are paired by task and seed; cells weigh the same.
 
     Args:
         run: the results.
-        other: another agent's, whose last block takes the place of the first episode.
+        other: results of another agent; if given, the difference is to its last block, not to the first episode.
     """
     blocks = _blocks(run)
     last = list(blocks)[-1]
@@ -208,13 +210,12 @@ def draw_adaptation(runs: Sequence[EvaluationRun], path: Path) -> None:
     )
     for number, run in enumerate(runs):
         returns = np.mean([of_cell.mean(axis=0) for of_cell in run.cells.values()], axis=0)
-        own = "the model, memory cleared before each episode" if number else "the model, with its memory"
-        label = f"{run.agent}: {_AGENTS[run.agent]}" if run.agent in _AGENTS else own
-        style = (
-            {"color": "C0", "linewidth": 2.2, "linestyle": "--" if number else "-"}
-            if number < 2
-            else {"color": f"C{number}", "alpha": 0.7}
-        )
+        if run.agent in _AGENTS:
+            label, style = f"{run.agent}: {_AGENTS[run.agent]}", {"color": f"C{number}", "alpha": 0.7}
+        elif number:
+            label, style = "the model, memory cleared before each episode", {"linestyle": "--", **_OWN_STYLE}
+        else:
+            label, style = "the model, with its memory", _OWN_STYLE
         axes.plot(np.arange(1, len(returns) + 1), returns, marker=".", label=label, **style)
     axes.set_ylabel("return of an episode", fontsize=8)
     axes.axhline(0, color="gray", linewidth=0.6)

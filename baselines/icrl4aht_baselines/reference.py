@@ -2,7 +2,7 @@
 
     OUT/noise/lite              release of noise histories, as `icrl4aht-data generate --profile noise` makes it
     OUT/rl2-TRACK               RL^2, trained by playing with the training teammates of that release
-    OUT/agent-TRACK             histories of RL^2 whose noise falls, source `agent`
+    OUT/agent-TRACK             histories of RL^2 with falling noise, source `agent`
     OUT/rising-TRACK            such histories that begin at random, see `RL2_HISTORIES`
     OUT/NAME-TRACK              run folder of a model
     OUT/NAME-TRACK-first        its first training, before it was labelled on histories of its own

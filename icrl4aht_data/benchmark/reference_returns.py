@@ -32,7 +32,7 @@ def stay_returns(protocol: str) -> dict[str, float]:
 
 
 def alike_tasks() -> list[list[str]]:
-    """Return the ids of test tasks whose teammates act alike, a list for each behaviour that several tasks share."""
+    """Return lists of test task ids; the teammates of the tasks in a list act alike."""
     return json.loads(card_file("behaviours.json").read_text(encoding="utf-8"))
 
 

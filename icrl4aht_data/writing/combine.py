@@ -84,9 +84,12 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
     tasks = []
     for dataset in datasets:
         provenance = read_provenance(dataset.origin.file(PROVENANCE))
-        selected = dataset.column("task_id")
+        names, codes = dataset.index.values("task_id"), dataset.column_codes("task_id")
+        code_of = {name: code for code, name in enumerate(names)}
+        is_part = len(dataset) < len(dataset.index.entries)
         for task in release_tasks(dataset):
-            if not (of_task := selected == task.task_id).any():
+            of_task = codes == code_of.get(task.task_id, -1)
+            if not of_task.any():
                 continue
             histories = dataset.select(of_task)
             owner = owners.setdefault(task.task_id, dataset)
@@ -96,7 +99,8 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
                     f"generate it with another seed"
                 )
             made = provenance.get(task.task_id, Provenance())
-            if made.streams_kept is not None and len(histories) < len(dataset.index.query(task_id=task.task_id)):
+            partial = is_part and len(histories) < len(dataset.index.query(task_id=task.task_id))
+            if partial and made.streams_kept is not None:
                 made = _of_part(made, histories)
             tasks.append(stored_task(histories, task, made, dataset.info.kind))
     return tasks

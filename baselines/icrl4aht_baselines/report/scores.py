@@ -88,7 +88,7 @@ def bundled_cells() -> dict[ResultCell, list[str]]:
 
 
 def behaviour_names() -> dict[str, str]:
-    """Return key of a task -> id of the first task whose teammate acts alike, of tasks that are known to share one.
+    """Return key of a task -> the name of its teammate's behaviour, the id of the first task with this behaviour.
 
     Known are the package's test tasks and those with best responses.
     """

@@ -143,7 +143,8 @@ class HistoryOptions:
         tuple[str, ...], Option("Only histories of this source: ppo, noise, agent or search; repeat for several.")
     ] = ()
     label_view: Annotated[
-        tuple[str, ...], Option("Only histories whose expert actions come from this view: ego or state; repeat.")
+        tuple[str, ...],
+        Option("Only histories with expert actions from this view: ego or state; repeat."),
     ] = ()
     order: Annotated[ContextOrder, Option("Order of the transitions in DPT's contexts.")] = "contiguous"
     queries: Annotated[Count, Option("Queries that DPT answers with each context, posed in turn.")] = 1

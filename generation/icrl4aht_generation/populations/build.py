@@ -23,7 +23,7 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR
-from icrl4aht_generation.populations.diversity import actions_on_common_states, family_distances, hamming_distances
+from icrl4aht_generation.populations.diversity import actions_on_common_states, family_distances
 from icrl4aht_generation.populations.select import TeammateSelection, select_teammates, write_manifests
 from icrl4aht_generation.populations.train import (
     PopulationJob,
@@ -33,6 +33,7 @@ from icrl4aht_generation.populations.train import (
     suite_checkpoints,
 )
 from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.teammates.distances import hamming_distances
 from icrl4aht_generation.teammates.instances import published_thetas
 from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.registry import build_teammate

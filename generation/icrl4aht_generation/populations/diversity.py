@@ -39,11 +39,6 @@ def actions_on_common_states(
     return act_along(layout, policies, records, seed).reshape(len(policies), -1)
 
 
-def hamming_distances(actions: np.ndarray) -> np.ndarray:
-    """Return the share of states on which two policies act differently: int (P, N) -> float64 (P, P)."""
-    return (actions[:, None] != actions[None]).mean(axis=-1)
-
-
 def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]]) -> np.ndarray:
     """Return mean distances of families, over all pairs of their policies: (P, P) -> float64 (F, F).
 

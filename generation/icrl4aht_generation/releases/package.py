@@ -180,6 +180,12 @@ def _new_task(
     return _ppo_task(found, learned, profile, suite, files)
 
 
+def _has_oracle_actions(found: TaskHistories, made: Provenance, profile: Profile) -> bool:
+    """Return whether a release has the oracle's actions of a task: if they are worth learning, or are its labels."""
+    worth = found.source == "noise" or made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
+    return profile.oracle_actions and worth
+
+
 def _scripted_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
     """Return a task of a scripted source; its labels are the script's actions before random ones replace them."""
     if found.source == "noise":
@@ -193,17 +199,17 @@ def _scripted_task(found: TaskHistories, made: Provenance, profile: Profile, fil
         episodes=None if earned is None else earned.episodes,
         view="state",  # scripts see a `Situation`
     )
-
-    with_oracle = profile.oracle_actions and made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
+    with_oracle = _has_oracle_actions(found, made, profile)
 
     def load() -> Iterator[NewHistory]:
         for _, stream, arrays in _recorded_histories(found):
             labels = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")[stream]
             wanted = {"expert_actions": labels}
-            if profile.oracle_actions and found.source == "noise":
-                wanted["oracle_actions"] = labels
-            elif with_oracle:
-                wanted["oracle_actions"] = oracle_labels(found.task.layout, arrays["state"], arrays["actions"])
+            if with_oracle:
+                own = found.source == "noise"
+                wanted["oracle_actions"] = (
+                    labels if own else oracle_labels(found.task.layout, arrays["state"], arrays["actions"])
+                )
             yield NewHistory(stream, arrays | wanted)
 
     return NewTask(found.task, replace(made, expert=expert), len(found.kept), load, files)
@@ -223,7 +229,7 @@ def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: P
         last_return_greedy=labeller.last_return_greedy,
         view="ego",  # the network of a learner takes observations
     )
-    with_oracle = profile.oracle_actions and made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
+    with_oracle = _has_oracle_actions(found, made, profile)
     effect = filter_report(found.recorded, found.kept, found.least_improvement)
 
     def load() -> Iterator[NewHistory]:

@@ -9,7 +9,7 @@ are those of the layout that their models are tested on, acting on the training 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -100,18 +100,16 @@ def join_states(records: Array, actions: np.ndarray) -> CommonStates:
     return CommonStates(records, names, np.concatenate(parts))
 
 
-def instance_policies(layout: Layout, extra: Mapping[str, float] | None = None) -> list[Policy]:
-    """Return the test instances of the layout that models of a layout are tested on, by family and number.
+def instance_policies(layout: Layout) -> list[Policy]:
+    """Return the policies of `instance_entries`, which see a `Situation`."""
+    return [build_teammate(None, entry) for entry in instance_entries(layout)]
 
-    Args:
-        layout: the layout.
-        extra: further parameters of all of them.
-    """
+
+def instance_entries(layout: Layout) -> list[dict[str, Any]]:
+    """Return the test instances of the layout that models of a layout are tested on, by family and number."""
     tested = TESTED_ON.get(layout.name, layout.name)
     return [
-        build_teammate(None, {"family": family, "theta": theta | dict(extra or {})})
-        for family in TESTED_FAMILIES
-        for theta in published_thetas(tested, family)
+        {"family": family, "theta": theta} for family in TESTED_FAMILIES for theta in published_thetas(tested, family)
     ]
 
 
@@ -225,6 +223,12 @@ def distances_to_tests(common: CommonStates, actions: np.ndarray) -> np.ndarray:
         ],
         axis=1,
     )
+
+
+def hamming_distances(actions: np.ndarray) -> np.ndarray:
+    """Return the share of states on which two policies act differently: int (P, N) -> float64 (P, P)."""
+    # Row by row: all pairs at once would take gigabytes.
+    return np.array([(actions != own).mean(axis=1) for own in actions]).reshape(len(actions), len(actions))
 
 
 def group_behaviours(actions: np.ndarray) -> list[int]:

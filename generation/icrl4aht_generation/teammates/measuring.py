@@ -18,7 +18,8 @@ from icrl4aht_generation.teammates.distances import (
     common_states,
     distances_to_tests,
     group_behaviours,
-    instance_policies,
+    hamming_distances,
+    instance_entries,
     join_states,
 )
 from icrl4aht_generation.teammates.draws import (
@@ -29,10 +30,14 @@ from icrl4aht_generation.teammates.draws import (
     read_draws_table,
     write_draws_table,
 )
-from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES
 from icrl4aht_generation.teammates.references import reference_returns
-from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, sample_teammate
+from icrl4aht_generation.teammates.registry import (
+    HEURISTIC_FAMILIES,
+    build_teammate,
+    sample_teammate,
+    with_equal_parameters,
+)
 from icrl4aht_generation.teammates.spread import (
     MOST_CHOSEN,
     VALIDATES,
@@ -152,11 +157,10 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: i
         candidates: entries of heuristic teammates.
         most: most teammates to choose.
     """
-    # All as mixtures, most with chance 0, and with the test instances: so there is one compilation for each family.
-    plain = {RANDOM_ACTIONS: 0.0}
-    policies = [build_teammate(None, entry | {"theta": plain | entry["theta"]}) for entry in candidates]
-    tested, records = instance_policies(layout, plain), common_records(layout, _SPREAD_EPISODES)
-    actions = act_along(layout, [*tested, *policies], records)
+    # Together with the test instances, so that there is one compilation for each family.
+    tested, records = instance_entries(layout), common_records(layout, _SPREAD_EPISODES)
+    policies = [build_teammate(None, entry) for entry in with_equal_parameters([*tested, *candidates])]
+    actions, policies = act_along(layout, policies, records), policies[len(tested) :]
     common, actions = join_states(records, actions[: len(tested)]), actions[len(tested) :]
     tests = distances_to_tests(common, actions)
     egos = reference_returns(layout, policies)  # with all of them, so that layouts share one compilation
@@ -164,13 +168,14 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: i
     unlike = tests.min(axis=1) >= DIVERSE_DISTANCE
     headroom = unlike & (np.ptp(returns, axis=1) >= LEAST_HEADROOM)
     usable = np.flatnonzero(headroom if headroom.any() else unlike)
-    order, separations = choose_spread(_pairwise(actions[usable]), DIVERSE_DISTANCE, most)
+    distances = hamming_distances(actions[usable].reshape(len(usable), -1))
+    order, separations = choose_spread(distances, DIVERSE_DISTANCE, most)
     families = np.repeat(TESTED_FAMILIES, INSTANCES)
     chosen = []
     for number, (place, separation) in enumerate(zip(usable[order], separations, strict=True)):
-        entry, distances = candidates[place], tests[place]
+        entry, to_tests = candidates[place], tests[place]
         own = families == entry["family"]
-        near, other = (int(np.where(mask, distances, np.inf).argmin()) for mask in (own, ~own))
+        near, other = (int(np.where(mask, to_tests, np.inf).argmin()) for mask in (own, ~own))
         chosen.append(
             SpreadTeammate(
                 "validation" if number % VALIDATES == VALIDATES - 1 else "train",
@@ -178,18 +183,11 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: i
                 entry["theta_id"],
                 entry["theta"],
                 common.instances[near],
-                round(float(distances[near]), _DIGITS),
+                round(float(to_tests[near]), _DIGITS),
                 common.instances[other],
-                round(float(distances[other]), _DIGITS),
+                round(float(to_tests[other]), _DIGITS),
                 round(separation, _DIGITS),
                 *(round(float(value), _DIGITS) for value in returns[place]),
             )
         )
     return LayoutSpread(layout.name, len(candidates), int(unlike.sum()), int(headroom.sum()), tuple(chosen))
-
-
-def _pairwise(actions: np.ndarray) -> np.ndarray:
-    """Return Hamming distances, int8 (policies, T, N) -> float64 (policies, policies)."""
-    flat = actions.reshape(len(actions), -1)
-    # Row by row: all pairs at once would take gigabytes.
-    return np.array([(flat != own).mean(axis=1) for own in flat]).reshape(len(flat), len(flat))

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.populations import diversity
-from icrl4aht_generation.populations.diversity import actions_on_common_states, family_distances, hamming_distances
+from icrl4aht_generation.populations.diversity import actions_on_common_states, family_distances
+from icrl4aht_generation.teammates.distances import hamming_distances
 
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
