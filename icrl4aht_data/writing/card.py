@@ -26,6 +26,7 @@ from icrl4aht_data.benchmark.facts import (
     family_order,
     track_of,
 )
+from icrl4aht_data.benchmark.proof import proof_table, read_proof
 from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headroom
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
@@ -95,7 +96,7 @@ def render_card(content: Mapping[str, Any]) -> str:
     environment = Environment(
         trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined, keep_trailing_newline=True
     )
-    environment.filters |= {"table": markdown_table, "counted": counted_noun, "span": _span}
+    environment.filters |= {"table": markdown_table, "counted": counted_noun, "span": _span, "proof_table": proof_table}
     return environment.from_string(card_file("dataset.md").read_text(encoding="utf-8")).render(content)
 
 
@@ -186,6 +187,7 @@ def facts(root: Path) -> dict[str, Any]:
         "weak": Counter((titles[task.first.layout], task.first.source) for task in tasks if task.has_weak_labels),
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,
+        "proof": read_proof(root),
         "test_headroom": headroom_table(read_headroom(HEADROOM_PROTOCOL), tested),
         "arrays": [name for name, array in FIELDS.items() if info.kind not in array.absent or name == "obs"],
         **_known_families(tasks),

@@ -35,5 +35,6 @@ VERBS = (
         _CHECKS,
         "Make reference models, with everything that they need.",
     ),
+    Verb("research proof", f"{_LAB}:proof_command", _CHECKS, "Show what a release teaches."),
     Verb("research headroom", f"{_LAB}:headroom_command", _CHECKS, "Measure the reference egos on every test task."),
 )

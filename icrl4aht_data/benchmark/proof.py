@@ -1,0 +1,51 @@
+"""What a release teaches: returns of models that were trained on it alone.
+
+`icrl4aht-data research proof` measures them on validation tasks and stores them in `cards/proof.json`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.schema import HISTORIES
+from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.templates import card_file, markdown_table
+
+PROOF_FILE = "proof.json"
+
+_COLUMNS = {
+    "first": "episode 1",
+    "late": "episodes 6 to 20",
+    "first_cleared": "episode 1, cleared",
+    "late_cleared": "episodes 6 to 20, cleared",
+    "share": "teammate track",
+    "minutes": "minutes",
+}
+
+
+def read_proof(root: Path) -> dict[str, Any] | None:
+    """Return the proof in the package's cards if it is of the release in a folder; otherwise None."""
+    try:
+        content = parse_json(read_text(card_file(PROOF_FILE)))
+    except OptionError:  # not made yet
+        return None
+    return content if content["histories_sha256"] == file_hash(root / HISTORIES) else None
+
+
+def proof_table(proof: Mapping[str, Any]) -> str:
+    """Return a Markdown table of models by the histories that they learned from, with the range of their trainings."""
+    rows = [
+        [one["histories"], one["learner"], str(len(one["seeds"])), *(_spread(one[key], key) for key in _COLUMNS)]
+        for one in proof["models"]
+    ]
+    return markdown_table(["histories", "model", "trainings", *_COLUMNS.values()], rows, right=1 + len(_COLUMNS))
+
+
+def _spread(values: Sequence[float], key: str) -> str:
+    digits = 2 if key == "share" else 1
+    ends = f" ({min(values):z.{digits}f} to {max(values):z.{digits}f})" if len(values) > 1 else ""
+    return f"{sum(values) / len(values):z.{digits}f}{ends}"

@@ -1,0 +1,93 @@
+"""What a release teaches: jobs that train and evaluate, their stored returns, and the table of the card."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from icrl4aht_baselines.evaluate.protocols import bundled_tasks
+from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof
+
+from icrl4aht_data.benchmark import proof
+from icrl4aht_data.benchmark.proof import proof_table, read_proof
+from icrl4aht_data.format.schema import HISTORIES
+from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.writing.card import facts, render_card
+from tests.helpers.random_releases import random_release
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("proof") / "release"
+    random_release(root, layouts=("demo_wide", "cramped_up"), teammates=1, streams=2, episodes=3, length=100)
+    return root
+
+
+def small_options(root: Path) -> ProofOptions:
+    """Return options of tiny trainings on a release, with one task of each set."""
+    tasks = {track: (bundled_tasks(track, "validation")[0],) for track in ("preference", "teammate")}
+    return ProofOptions(str(root), steps=2, batch_size=2, context=20, tasks=tasks)
+
+
+def returns(first: float, late: float, cleared: float, teammate: float) -> dict[str, Any]:
+    blocks = {"preference": {"1": first, "6-20": late}, "preference cleared": {"1": first, "6-20": cleared}}
+    return blocks | {"teammate": {"all": teammate}}
+
+
+def test_the_table_has_the_mean_and_range_of_trainings(release, tmp_path):
+    options = small_options(release)
+    jobs = [ProofJob("all", "ad-expert", seed, options, tmp_path) for seed in (0, 1, 2)]
+    for job, late in zip(jobs[:2], (10.0, 20.0), strict=True):  # the third one is not finished
+        job.folder.mkdir()
+        content = {"settings": job.settings, "minutes": 20.0, "returns": returns(-2.0, late, -1.0, late / 2)}
+        job.result_file.write_text(json.dumps(content))
+    assert [job.is_finished() for job in jobs] == [True, True, False]
+    earned = {
+        name: returns(0.0, 40.0, 0.0, value) for name, value in (("stay", 0), ("search", 30), ("rl2-reference", 20))
+    }
+    path = write_proof(jobs, earned, tmp_path / "proof.json")
+    content = json.loads(path.read_text())
+    assert content["histories_sha256"] == file_hash(release / HISTORIES)
+    assert content["models"][0]["share"] == [0.25, 0.5]  # gains of 5 and 10 over stay, of the reference's 20
+    spreads = ["-2.0 (-2.0 to -2.0)", "15.0 (10.0 to 20.0)", "-2.0 (-2.0 to -2.0)", "-1.0 (-1.0 to -1.0)"]
+    spreads += ["0.38 (0.25 to 0.50)", "20.0 (20.0 to 20.0)"]
+    assert " | ".join(["| all | AD, expert labels | 2", *spreads]) in proof_table(content)
+
+
+def test_a_card_shows_the_proof_of_its_own_release(release, tmp_path, monkeypatch):
+    content = {
+        "histories_sha256": file_hash(release / HISTORIES),
+        "training": {"steps": 800, "batch_size": 16, "context": 500},
+        "tasks": {"preference": 48, "teammate": 20},
+        "references": {"stay": {"6-20": 1.0}, "search": {"1": 2.0, "6-20": 40.0}},
+        "models": [],
+    }
+    stored = tmp_path / "proof.json"
+    monkeypatch.setattr(proof, "card_file", lambda name: stored)
+    stored.write_text(json.dumps(content))
+    assert read_proof(release) == content
+    assert "## What it teaches" in render_card(facts(release))
+    stored.write_text(json.dumps(content | {"histories_sha256": "0"}))
+    assert read_proof(release) is None
+    assert "## What it teaches" not in render_card(facts(release))
+
+
+@pytest.mark.slow
+def test_a_model_is_trained_and_evaluated_with_and_without_memory(release, tmp_path):
+    options = small_options(release)
+    job = ProofJob("all", "dpt-expert", 0, options, tmp_path)
+    steps: list[int] = []
+    job.run(lambda done, speed: steps.append(done))
+    assert steps == [1, 2] and job.is_finished()
+    found = job.result()["returns"]
+    assert {*found} == {"preference", "preference cleared", "teammate", "teammate cleared"}
+    assert {"1", "2-5", "6-20", "all"} <= found["preference"].keys()
+    assert job.finished_text().startswith("first episode ")
+    assert {job.learner} <= {*LEARNERS}
+    before = job.result_file.stat().st_mtime_ns
+    job.run()
+    assert job.result_file.stat().st_mtime_ns == before
+    stay = run_references(options, tmp_path)["stay"]["preference"]
+    assert stay["1"] == stay["6-20"]  # it never moves, and its teammate forgets
