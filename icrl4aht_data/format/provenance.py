@@ -239,9 +239,12 @@ class Provenance:
             return_end: mean return of the last episodes of the task's histories, see `schema.curve_ends`.
 
         Returns:
-            True as well if the oracle's return is unknown, or if teammates change, since it is with the task's own.
+            True as well if the oracle's return is unknown, if teammates change, since it is with the task's own, and
+            for source `noise`, whose expert is the oracle.
         """
-        return self.references is None or self.swaps is not None or self.references.oracle >= return_end
+        if self.references is None or self.swaps is not None or self.source == "noise":
+            return True
+        return self.references.oracle >= return_end
 
     def entry_fields(self, episodes: int) -> dict[str, Any]:
         """Return the fields of an index entry that describe its expert and its teammates.

@@ -28,6 +28,8 @@ def combine_releases(
 ) -> Path:
     """Combine releases, or selections of their histories, into one release, in order and renumbered.
 
+    As in new releases, the oracle's actions are left out of tasks in which it earns less than the histories' end.
+
     Args:
         target: the folder to write.
         roots: releases of the same kind and episode length without common tasks; a `Dataset` for a part of one.
@@ -102,7 +104,9 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
             partial = is_part and len(histories) < len(dataset.index.query(task_id=task.task_id))
             if partial and made.streams_kept is not None:
                 made = _of_part(made, histories)
-            tasks.append(stored_task(histories, task, made, dataset.info.kind))
+            weak = not made.wants_oracle(float(histories.column("return_end").mean()))
+            without = ("oracle_actions",) if weak else ()
+            tasks.append(stored_task(histories, task, made, dataset.info.kind, without=without))
     return tasks
 
 

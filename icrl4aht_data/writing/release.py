@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -68,14 +68,16 @@ class NewHistory:
     learner: int = 0
 
     @classmethod
-    def from_history(cls, history: History, kind: Kind = "lite") -> NewHistory:
+    def from_history(cls, history: History, kind: Kind = "lite", without: Collection[str] = ()) -> NewHistory:
         """Return a history to write from one of any release, with the fields that a kind of release needs.
 
         Args:
             history: the history.
             kind: kind of the release to write; a full one needs no observations, because it renders them.
+            without: fields to leave out.
         """
-        names = [field.name for field in history.entry.stored_fields("lite" if kind in KINDS else kind)]
+        fields = history.entry.stored_fields("lite" if kind in KINDS else kind)
+        names = [field.name for field in fields if field.name not in without]
         return cls(history.entry.env_idx, {name: history.read(name) for name in names}, history.entry.learner)
 
 

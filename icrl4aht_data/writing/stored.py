@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks
@@ -24,7 +24,12 @@ def release_tasks(dataset: Dataset) -> list[Task]:
 
 
 def stored_task(
-    dataset: Dataset, task: Task, provenance: Provenance, kind: Kind, done: Callable[[], None] = lambda: None
+    dataset: Dataset,
+    task: Task,
+    provenance: Provenance,
+    kind: Kind,
+    done: Callable[[], None] = lambda: None,
+    without: Collection[str] = (),
 ) -> NewTask:
     """Return a task to write, with its histories and the checkpoints of its teammate and expert.
 
@@ -34,11 +39,12 @@ def stored_task(
         provenance: how the histories were made.
         kind: kind of the release to write.
         done: called after each history.
+        without: fields of the histories to leave out.
     """
 
     def load() -> Iterator[NewHistory]:
         for history in dataset:
-            yield NewHistory.from_history(history, kind)
+            yield NewHistory.from_history(history, kind, without)
             done()
 
     files: dict[str, Path] = {}

@@ -182,8 +182,7 @@ def _new_task(
 
 def _has_oracle_actions(found: TaskHistories, made: Provenance, profile: Profile) -> bool:
     """Return whether a release has the oracle's actions of a task: if they are worth learning, or are its labels."""
-    worth = found.source == "noise" or made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
-    return profile.oracle_actions and worth
+    return profile.oracle_actions and made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
 
 
 def _scripted_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
