@@ -321,7 +321,7 @@ def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | 
 
 def _parse_manifest(text: bytes, url: str) -> dict[str, str]:
     # What is not UTF-8 becomes unprintable characters, which no line may have.
-    return parse_manifest(text.decode(errors="surrogateescape"), f"{url}/{MANIFEST}")
+    return dict(parse_manifest(text.decode(errors="surrogateescape"), f"{url}/{MANIFEST}"))
 
 
 def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) -> None:

@@ -89,7 +89,7 @@ def verify_release(
 
 
 def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wanted: dict[str, FilterValues]) -> None:
-    listed: dict[str, str] = {}
+    listed: Mapping[str, str] = {}
     try:
         listed = read_manifest(origin.folder)
     except Icrl4ahtError as error:
