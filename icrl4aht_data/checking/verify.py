@@ -12,7 +12,7 @@ from typing import get_args
 import numpy as np
 
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.checking.files import check_files, check_references, check_shard_sizes
+from icrl4aht_data.checking.files import check_files, check_references, check_remote_sizes
 from icrl4aht_data.checking.histories import check_chunks, check_history
 from icrl4aht_data.checking.index import check_index
 from icrl4aht_data.checking.provenance import check_provenance
@@ -127,10 +127,10 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     skipped = len(index.values("shard")) - len(shards)
     if skipped:
         report.notes.append(f"{skipped} of {skipped + len(shards)} shards were not selected")
-    if report.level == "quick":
-        check_shard_sizes(origin, index, shards, report)
-    else:
+    if report.level != "quick":
         _check_shards(index, {task.task_id: task.layout for task in tasks}, shards, report, advance)
+    elif origin.remote is not None:
+        check_remote_sizes(origin.remote, index, shards, report)
 
 
 def _unchecked_values(index: Index, provenance: Mapping[str, Provenance]) -> Iterator[str]:
