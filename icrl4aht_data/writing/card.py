@@ -128,13 +128,9 @@ class _TaskFacts:
         return teammate_name(self.task) if self.task else self.first.teammate_kind
 
     @property
-    def last(self) -> float:
-        """Mean return of the last episodes."""
-        return _mean(entry.return_end for entry in self.histories)
-
-    @property
     def has_weak_labels(self) -> bool:
-        return bool(are_labels_weak(self.first.expert_return, self.last))
+        last = _mean(entry.return_end for entry in self.histories)
+        return bool(are_labels_weak(self.first.expert_return, last))
 
 
 def facts(root: Path) -> dict[str, Any]:
@@ -222,20 +218,13 @@ def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str,
     return configs
 
 
-def _grouped(tasks: Iterable[_TaskFacts], *names: str) -> dict[tuple[str, ...], list[_TaskFacts]]:
-    """Group tasks by the values of some index fields, in the usual order of sources and splits."""
+def _learning(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return rows on the rise of returns, one for each title of layouts, source and split, in their usual order."""
+    names = ("layout", "source", "split")
+    order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # other sources by first appearance
     groups = defaultdict[tuple[str, ...], list[_TaskFacts]](list)
-    for task in tasks:
-        groups[tuple(getattr(task.first, name) for name in names)].append(task)
-    order = [*SOURCES, *SPLITS, *(value for key in groups for value in key)]  # others by first appearance
-    return {key: groups[key] for key in sorted(groups, key=lambda key: list(map(order.index, key)))}
-
-
-def _learning(tasks: Iterable[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return rows on the rise of returns, one for each title of layouts, source and split."""
-    groups, names = defaultdict[tuple[str, ...], list[_TaskFacts]](list), ("layout", "source", "split")
-    for (layout, *rest), own in _grouped(tasks, *names).items():
-        groups[titles[layout], *rest] += own
+    for task in sorted(tasks, key=lambda task: [order.index(getattr(task.first, name)) for name in names]):
+        groups[titles[task.first.layout], task.first.source, task.first.split].append(task)
     rows = []
     for key, own in groups.items():
         entries = [entry for task in own for entry in task.histories]

@@ -68,27 +68,15 @@ def _policy(task: Task) -> str:
 
 
 def print_learning(content: Mapping[str, Any], console: Console) -> None:
-    """Print how much returns rise by layout and source, and the tasks that were left out.
+    """Print the card's table of learning curves, and the tasks that were left out.
 
     Args:
         content: result of `card.facts`.
         console: console to print to.
     """
-    learning: list[dict[str, Any]] = content["learning"]
-    _print("Learning, by layout and source:", console)
-    _print(markdown_table(list(learning[0]), [list(map(_cell, row.values())) for row in learning]), console)
+    lines = ["Mean returns of the first and the last tenth of the episodes, and numbers of histories:"]
+    lines.append(markdown_table(["layout", "split", *content["sources"]], content["curves"]))
     for task in content["left_out"]:
         source = f" ({task['source']})" if task["source"] else ""
-        _print(f"left out: {task['layout']} with {task['teammate']}{source}: {task['reason']}", console)
-
-
-def _print(text: str, console: Console) -> None:
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:z.2f}"
-    if isinstance(value, list | tuple):
-        return " ".join(map(_cell, value))
-    return "unknown" if value is None else f"{value:,}" if isinstance(value, int) else value
+        lines.append(f"left out: {task['layout']} with {task['teammate']}{source}: {task['reason']}")
+    console.print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)
