@@ -163,37 +163,24 @@ def write_release(
         for name, source in chain(files.items(), *(one.files.items() for one in new)):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, root / name)
-        _write_meta(root, kind, new, writer.entries, data_version, kept_steps, left_out)
+        with (root / HISTORIES).open("w", encoding="utf-8") as stream:
+            stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in writer.entries)
+        write_layouts(root, [get_layout(one.task.layout_name) for one in new])  # not with the recipes of a task
+        known = [] if named else [one.task for one in new]
+        write_tasks(root / TASKS, known)
+        provenance = {one.task.task_id: one.provenance for one in new}
+        write_json(root / PROVENANCE, {task_id: of_task.to_json() for task_id, of_task in provenance.items()})
+        sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in writer.entries)}
+        statistics = layout_statistics(writer.entries, known, provenance, kept_steps, sizes)
+        info = describe(kind, data_version, kept_steps, writer.entries)
+        info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
+        write_json(root / INFO, info.to_json())
         if card is None:
             write_card(root)
         else:
             (root / RELEASE_CARD).write_text(card, encoding="utf-8")
         write_manifest(root)
     return target
-
-
-def _write_meta(
-    root: Path,
-    kind: Kind,
-    new: list[NewTask],
-    entries: list[Entry],
-    data_version: str,
-    kept_steps: int,
-    left_out: Sequence[LeftOutTask],
-) -> None:
-    """Write the files of meta/: index, tasks, provenance and info."""
-    with (root / HISTORIES).open("w", encoding="utf-8") as stream:
-        stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
-    write_layouts(root, [get_layout(one.task.layout_name) for one in new])  # not with the recipes of a task
-    tasks = [one.task for one in new if not isinstance(one.task, NamedTask)]
-    write_tasks(root / TASKS, tasks)
-    provenance = {one.task.task_id: one.provenance for one in new}
-    write_json(root / PROVENANCE, {task_id: of_task.to_json() for task_id, of_task in provenance.items()})
-    sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in entries)}
-    statistics = layout_statistics(entries, tasks, provenance, kept_steps, sizes)
-    info = describe(kind, data_version, kept_steps, entries)
-    info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
-    write_json(root / INFO, info.to_json())
 
 
 @dataclass
