@@ -22,7 +22,7 @@ from icrl4aht_data.errors import (
     RootNotFoundError,
 )
 from icrl4aht_data.format.layouts_file import read_layouts
-from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind, check_name
+from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, FiniteNumber, Kind, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
@@ -39,8 +39,7 @@ _VERSION_LENGTH = 100  # characters
 
 _Steps = Annotated[int, Meta(gt=0, lt=2**31)]
 _Bytes = Annotated[int, Meta(ge=0, lt=2**62)]
-_Number = Annotated[int, Meta(ge=0, lt=2**31)]
-_Return = Annotated[float, Meta(gt=-1e15, lt=1e15)]
+StreamCount = Annotated[int, Meta(ge=0, lt=2**31)]
 
 
 class EpisodeLengths(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -130,10 +129,10 @@ class LeftOutTask:
     layout: str
     teammate: str
     source: str
-    learners: _Number
-    streams: _Number
-    return_start: _Return | None
-    return_end: _Return | None
+    learners: StreamCount
+    streams: StreamCount
+    return_start: FiniteNumber | None
+    return_end: FiniteNumber | None
     reason: str
 
 

@@ -198,10 +198,10 @@ def _mean(values: Iterable[float]) -> float:
     return float(np.mean(list(values)))
 
 
-def _span(values: Iterable[float], digits: int = 0) -> str:
+def _span(values: Iterable[float]) -> str:
     """Return the range of some values as text, such as "3" or "3 to 5"; empty without values."""
     found = list(values)
-    ends = [f"{end:z,.{digits}f}" for end in (min(found), max(found))] if found else []
+    ends = [f"{end:z,.0f}" for end in (min(found), max(found))] if found else []
     return " to ".join(dict.fromkeys(ends))
 
 

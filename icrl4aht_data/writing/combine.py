@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import check_version
@@ -24,7 +23,6 @@ def combine_releases(
     data_version: str | None = None,
     *,
     overwrite: bool = False,
-    done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
     """Combine releases, or selections of their histories, into one release, in order and renumbered.
 
@@ -33,7 +31,6 @@ def combine_releases(
         roots: releases of the same kind and episode length without common tasks; a `Dataset` for a part of one.
         data_version: version of the combination; by default the common version of the releases.
         overwrite: replace a release at `target`.
-        done: called when the histories of a task are written.
 
     Raises:
         OptionError: if the releases differ in kind or environment, or share a task; if `data_version` is not SemVer; if
@@ -64,7 +61,6 @@ def combine_releases(
         left_out=[task for task in left_out if task.task_id not in written],
         overwrite=overwrite,
         sources=[dataset.root for dataset in datasets],
-        done=done,
     )
 
 
