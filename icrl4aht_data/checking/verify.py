@@ -20,9 +20,8 @@ from icrl4aht_data.checking.report import Level, NamedProgress, Report
 from icrl4aht_data.checking.structure import check_structure
 from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.download import chosen_files
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, check_choice
-from icrl4aht_data.fetch import ReleaseLocation, open_root
+from icrl4aht_data.fetch import ReleaseLocation, chosen_files, open_root
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
