@@ -12,11 +12,10 @@ from icrl4aht_data.benchmark.facts import kind_family
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
-from icrl4aht_data.format.info import ReleaseInfo, describe
+from icrl4aht_data.format.info import ReleaseInfo, describe, layout_statistics
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, TASKS, Entry
 from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
-from icrl4aht_data.writing.statistics import layout_statistics
 
 _NAMED = 100  # maximum number of missing shards to report per set
 _OF_A_TASK = (

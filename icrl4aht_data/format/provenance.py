@@ -12,8 +12,7 @@ from msgspec import Meta
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task, check_teammate, teammate_id
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
-from icrl4aht_data.format.info import StreamCount
-from icrl4aht_data.format.schema import Count, FiniteNumber, check_name
+from icrl4aht_data.format.schema import Count, FiniteNumber, StreamCount, check_name
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.options import Share
 from icrl4aht_data.utils.text import counted_noun

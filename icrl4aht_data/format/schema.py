@@ -152,6 +152,7 @@ _FINITE = 1e15  # sums of numbers below this stay finite
 
 _Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+StreamCount = Annotated[int, Meta(ge=0, lt=2**31)]
 _Name = Annotated[str, Meta(max_length=_NAME_LENGTH)]
 _Spans = Annotated[tuple[tuple[Count, _Name], ...], Meta(min_length=1)]
 FiniteNumber = Annotated[float, Meta(gt=-_FINITE, lt=_FINITE)]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
@@ -366,3 +367,18 @@ def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
         "has_policies": any(task.made.expert and task.made.expert.policy_sha256 for task in tasks),
         "versions": "; ".join(f"{label} {values}" for label, values in versions.items() if values),
     }
+
+
+def print_learning(content: Mapping[str, Any], console: Console) -> None:
+    """Print the card's table of learning curves, and the tasks that were left out.
+
+    Args:
+        content: result of `card.facts`.
+        console: console to print to.
+    """
+    lines = ["Mean returns of the first and the last tenth of the episodes, and numbers of histories:"]
+    lines.append(markdown_table(["layout", "split", *content["sources"]], content["curves"]))
+    for task in content["left_out"]:
+        source = f" ({task['source']})" if task["source"] else ""
+        lines.append(f"left out: {task['layout']} with {task['teammate']}{source}: {task['reason']}")
+    console.print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)

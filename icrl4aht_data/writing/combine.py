@@ -12,9 +12,9 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE
+from icrl4aht_data.writing.convert import release_tasks, stored_task
 from icrl4aht_data.writing.release import NewTask, write_release
 from icrl4aht_data.writing.release_folder import as_path, check_target
-from icrl4aht_data.writing.stored import release_tasks, stored_task
 
 
 def combine_releases(

@@ -33,8 +33,8 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.install_hints import import_optional
+from icrl4aht_data.writing.convert import HistoryProgress
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
-from icrl4aht_data.writing.stored import HistoryProgress
 
 _NAME = re.compile(r"[\w.-]+-v\d+")
 _INFOS = {name: name.removesuffix("s") for name in ACTION_FIELDS if name != "actions"}

@@ -17,7 +17,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
 from icrl4aht_data.errors import OptionError, check_choice
-from icrl4aht_data.format.info import LeftOutTask, check_version, describe
+from icrl4aht_data.format.info import LeftOutTask, check_version, describe, layout_statistics
 from icrl4aht_data.format.layouts_file import write_layouts
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
@@ -46,7 +46,6 @@ from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.writing.card import write_card
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 from icrl4aht_data.writing.shard_writer import EncodedChunk, encode_history, write_shard
-from icrl4aht_data.writing.statistics import layout_statistics
 
 SHARD_BYTES = 256 * 2**20
 """Intended size of a shard in bytes."""
