@@ -13,7 +13,6 @@ import click
 from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
-from icrl4aht_data.browsing.embedding import spread_histories
 from icrl4aht_data.browsing.page import (
     PAGE_HISTORIES,
     PAGE_MEGABYTES,
@@ -21,6 +20,7 @@ from icrl4aht_data.browsing.page import (
     check_drawable,
     make_browser_page,
     save_browser_page,
+    spread_histories,
 )
 from icrl4aht_data.checking.report import verdict_in_words
 from icrl4aht_data.checking.verify import verify_release
