@@ -9,12 +9,10 @@ from pathlib import Path
 
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.info import check_version
 from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.writing.convert import release_tasks, stored_task
 from icrl4aht_data.writing.release import NewTask, write_release
-from icrl4aht_data.writing.release_folder import as_path, check_target
 
 
 def combine_releases(
@@ -37,18 +35,13 @@ def combine_releases(
             `target` may not be written, see `release_folder.check_target`.
         ReleaseError: if a release cannot be read.
     """
-    if data_version is not None:
-        check_version(data_version)
-    target = as_path(target)
     if not roots or isinstance(roots, (str, Path, Dataset)):
         raise OptionError(f"expected a list of at least one release to combine, found {roots!r}")
-    check_target(target, overwrite, [root.root if isinstance(root, Dataset) else root for root in roots])
     datasets = [root if isinstance(root, Dataset) else load_icrl4aht(root) for root in roots]
     _check_compatible(datasets)
     versions = {dataset.info.data_version for dataset in datasets}
     if data_version is None and len(versions) > 1:
         raise OptionError(f"data versions {', '.join(sorted(versions))}: say which one the combination has")
-    data_version = data_version or versions.pop()
     first, tasks = datasets[0].info, _tasks(datasets)
     written = {new.task.task_id for new in tasks}
     left_out = dict.fromkeys(task for dataset in datasets for task in dataset.info.left_out)
@@ -56,7 +49,7 @@ def combine_releases(
         target,
         first.kind,
         tasks,
-        data_version=data_version,
+        data_version=versions.pop() if data_version is None else data_version,
         kept_steps=first.environment.kept_steps,
         left_out=[task for task in left_out if task.task_id not in written],
         overwrite=overwrite,

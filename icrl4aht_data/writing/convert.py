@@ -12,7 +12,6 @@ from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files, exp
 from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, PROVENANCE, TASKS, TEAMMATES, Kind
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.release_folder import as_path, check_target
 
 HistoryProgress = Callable[[int, int], None]
 """Callback that receives the number of histories done and their total."""
@@ -74,13 +73,11 @@ def to_release(
         OptionError: if `target` may not be written, see `release_folder.check_target`, or if `kind` needs states and
             the dataset has none.
     """
-    target = as_path(target)
     if kind in KINDS and not dataset.has_states:
         raise OptionError(
             f"{dataset.root}: has observations only, and a {kind} release is made of state records, which observations "
             f"do not determine; convert to {OBSERVATIONS}, published or parquet"
         )
-    check_target(target, overwrite, [dataset.root])
     tasks = {task.task_id: task for task in release_tasks(dataset)}
     provenance = read_provenance(dataset.origin.file(PROVENANCE))
     by_task: dict[str, list[int]] = {}
