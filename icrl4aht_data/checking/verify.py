@@ -66,10 +66,11 @@ def verify_release(
         OptionError: if the user name or password in an address has characters that are not percent-encoded.
     """
     check_choice("level", level, get_args(Level))
+    root = MINI if root is None else root
     check_credentials(str(root))
-    report = Report(without_credentials(str(MINI if root is None else root)), level)
+    report = Report(without_credentials(str(root)), level)
     try:
-        origin = open_root(MINI if root is None else root)
+        origin = open_root(root)
     except Icrl4ahtError as error:
         report.add(".", str(error))
         return report

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 from rich import filesize
 from rich.console import Console
@@ -34,7 +34,6 @@ def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -
         *((DownloadColumn(), TransferSpeedColumn()) if of_bytes else ()),
         console=console,
         transient=True,
-        disable=quiet,
         # Lines show the mean speed, since updates may be minutes apart; rich leaves out what the first update had done.
         speed_estimate_period=30 if console.is_terminal else math.inf,
     )
@@ -45,7 +44,8 @@ def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -
             numbers[name] = bars.add_task(name, total=total, note="")
         bars.update(numbers[name], completed=done, total=total, note=note and f": {note}")
 
-    with bars if quiet or console.is_terminal else _printed_lines(bars, unit, of_bytes):
+    shown = bars if console.is_terminal else _printed_lines(bars, unit, of_bytes)
+    with nullcontext() if quiet else shown:
         yield show
 
 
