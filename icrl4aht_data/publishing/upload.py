@@ -72,7 +72,7 @@ def upload_release(
     dry_run: bool = False,
     advance: NamedProgress = lambda what, done, total: None,
 ) -> Upload:
-    """Upload a release, compare the repository with the manifest, and tag the commit.
+    """Upload a release, compare the names of the repository's files and its manifest, and tag the commit.
 
     Files that are already in the repository are not sent again, so repeating the call resumes an interrupted upload.
 
