@@ -411,8 +411,8 @@ def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool
 
     FOLDER is a release, as `release build` makes it; ADDRESS is hf://datasets/<org>/<repo>. The release is verified
     first; a missing repository is created. The same command resumes an interrupted upload. Afterwards the repository's
-    files and manifest are compared with the release's, and only then tagged with the data version. A tag never moves: other data
-    need another version. `hf auth login` stores the token.
+    files and manifest are compared with the release's, and only then tagged with the data version. A tag never moves:
+    other data need another version. `hf auth login` stores the token.
     """
     if quiet or not sys.stderr.isatty():
         import_module("huggingface_hub.utils").disable_progress_bars()
