@@ -1,30 +1,214 @@
-"""Reading and querying the index of a release: meta/info.json and meta/histories.jsonl."""
+"""Reading and querying the index of a release: meta/info.json and meta/histories.jsonl.
+
+The lines of histories are decoded and checked block by block, as columns. Those of a large file are kept in the cache
+folder.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count, islice
+from operator import attrgetter
 from pathlib import Path
+from typing import Any, overload
 
+import msgspec
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import ALL_TRACKS, LABEL_VIEWS, SOURCES, SPLITS, all_families
+from icrl4aht_data.benchmark.facts import (
+    ALL_TRACKS,
+    LABEL_VIEWS,
+    SOURCES,
+    SPLITS,
+    all_families,
+    check_family,
+    check_membership,
+)
 from icrl4aht_data.errors import (
+    CacheError,
     EmptySelectionError,
+    Icrl4ahtError,
     IndexFormatError,
     OptionError,
     UnknownNameError,
     check_choice,
     unknown,
 )
-from icrl4aht_data.format.columns import QUERY_FIELDS, Columns, read_columns
+from icrl4aht_data.format.cached_arrays import cached_arrays
 from icrl4aht_data.format.info import ReleaseInfo, read_info
 from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_layouts_known, read_layouts
-from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, Entry
+from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, check_name, encode
+from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import resolve_inside
+from icrl4aht_data.utils.files import LARGEST, plain_size, read_lines, resolve_inside, wrap_read_errors
+from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_histories, listed_names
+
+QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source", "label_view")
+"""Entry fields that histories can be filtered by."""
+
+_VERSION = 5  # of the cached columns
+_UNCACHED = 2**20  # bytes; decoding a smaller index is as fast as opening cached columns
+_BLOCK = 2**12  # entries in memory at a time
+
+_DERIVED = ("history_id", "obs_shape")  # checked but not stored, since the row number and the layout determine them
+_DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64, float | None: np.float64}
+_NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name not in _DERIVED}
+_ABSENT = {name: -1 for name, hint in ENTRY_HINTS.items() if hint == int | None}  # what a column has for None
+_ABSENT |= {name: np.nan for name, hint in ENTRY_HINTS.items() if hint == float | None}
+_STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint in TEXTS or name in ENCODED)
+_ABSENT |= {name: "" for name in _STRINGS if ENTRY_HINTS[name] is not str}
+_names = attrgetter(*_STRINGS)
+
+
+class Columns(Sequence[Entry]):
+    """Index of a release as columns with one row per history; a sequence of `Entry`, each made on access.
+
+    A string column has int32 codes of its distinct values. None is stored as -1 in integer columns, as NaN in float
+    columns and as "" in string columns. Fields in `schema.ENCODED` are string columns of JSON text.
+
+    Args:
+        arrays: every column by name, and the distinct values of each string column as `<name>.values`.
+    """
+
+    def __init__(self, arrays: dict[str, np.ndarray]) -> None:
+        self._arrays = arrays
+
+    def __len__(self) -> int:
+        return len(self._arrays["T"])
+
+    def column(self, name: str) -> np.ndarray:
+        """Return a column (H,): the values of a number column, the codes of a string column."""
+        return self._arrays[name]
+
+    def values(self, name: str) -> list[str]:
+        """Return the distinct values of a string column, in the order of their codes."""
+        return [value.decode() for value in self._arrays[f"{name}.values"].tolist()]
+
+    def matches(self, name: str, wanted: Collection[str]) -> np.ndarray:
+        """Return bool (H,), True for histories with one of the wanted values in a string column."""
+        return np.isin(self._arrays[name], [code for code, value in enumerate(self.values(name)) if value in wanted])
+
+    @overload
+    def __getitem__(self, row: int) -> Entry: ...
+
+    @overload
+    def __getitem__(self, row: slice) -> list[Entry]: ...
+
+    def __getitem__(self, row: int | slice) -> Entry | list[Entry]:
+        if isinstance(row, slice):
+            return [self[i] for i in range(len(self))[row]]
+        row = range(len(self))[row]
+        values: dict[str, Any] = {name: self._arrays[name][row].item() for name in _NUMBERS}
+        for name in _STRINGS:
+            values[name] = self._arrays[f"{name}.values"][self._arrays[name][row]].item().decode()
+        for name, absent in _ABSENT.items():
+            if values[name] == absent or values[name] != values[name]:  # NaN differs from itself
+                values[name] = None
+            elif name in ENCODED:
+                values[name] = msgspec.json.decode(values[name], type=ENTRY_HINTS[name])
+        return Entry(history_id=row, obs_shape=get_layout(values["layout"]).obs_shape, **values)
+
+
+def read_columns(path: Path) -> Columns:
+    """Return the columns of an index file; those of a large file are cached on disk.
+
+    Raises:
+        IndexFormatError: if a line is malformed; with the file and the line number.
+    """
+    with wrap_read_errors(path):
+        size = plain_size(path, LARGEST)
+        if size < _UNCACHED:
+            return Columns(_parse(path))
+        key = f"index-{_VERSION}-{file_hash(path)}"  # as in the manifest
+    parsed: dict[str, np.ndarray] = {}
+
+    def build(folder: Path) -> None:
+        parsed.update(_parse(path))
+        for name, array in parsed.items():
+            np.save(folder / f"{name}.npy", array, allow_pickle=False)
+
+    try:
+        return Columns(cached_arrays(key, size, build))
+    except (CacheError, OptionError):  # the cache folder is missing or too small
+        return Columns(parsed or _parse(path))
+
+
+def _parse(path: Path) -> dict[str, np.ndarray]:
+    """Read an index file and return the arrays of `Columns` by name."""
+    # A new value gets the next code when it is looked up.
+    codes = {name: defaultdict[str, int](count().__next__) for name in _STRINGS}
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
+    entries = _entries(path)
+    while block := list(islice(entries, _BLOCK)):
+        columns = zip(*map(msgspec.structs.astuple, block), strict=True)
+        values: dict[str, Sequence[Any]] = dict(zip(ENTRY_HINTS, columns, strict=True))
+        for name in ENCODED:
+            values[name] = [encode(value) for value in values[name]]
+        for name, absent in _ABSENT.items():
+            values[name] = [absent if value is None else value for value in values[name]]
+        for name, dtype in _NUMBERS.items():
+            parts[name].append(np.array(values[name], dtype))
+        for name, known in codes.items():
+            parts[name].append(np.fromiter(map(known.__getitem__, values[name]), np.int32, len(block)))
+    arrays: dict[str, np.ndarray] = {
+        name: np.concatenate([np.zeros(0, _NUMBERS.get(name, np.int32)), *blocks]) for name, blocks in parts.items()
+    }
+    for name, known in codes.items():
+        arrays[f"{name}.values"] = np.array([value.encode() for value in known] or [b""], np.bytes_)[: len(known)]
+    return arrays
+
+
+def _entries(path: Path) -> Iterator[Entry]:
+    """Yield the entries of an index file, each checked."""
+    decoder, checked = msgspec.json.Decoder(Entry), set[tuple[Any, ...]]()
+    for number, line in enumerate(read_lines(path)):
+        try:
+            entry = decoder.decode(line)
+            _check(entry, number, checked)
+        except (msgspec.MsgspecError, Icrl4ahtError) as error:
+            raise IndexFormatError(f"{path}, line {number + 1}: {error}") from error
+        yield entry
+
+
+def _check(entry: Entry, number: int, checked: set[tuple[Any, ...]]) -> None:
+    """Check that the fields of an entry agree and that its names are printable.
+
+    Args:
+        entry: an entry with valid types and bounds.
+        number: the number of its line, counted from 0.
+        checked: combinations of names and shapes that were found valid, to which this one is added; the histories of a
+            task agree in them.
+
+    Raises:
+        IndexFormatError, UnknownNameError: without file and line, which the caller adds.
+    """
+    if entry.history_id != number:
+        raise IndexFormatError(f"history_id {entry.history_id}: ids count up from 0, expected {number}")
+    if entry.action_dim != len(ACTIONS):
+        raise IndexFormatError(f"expected action_dim {len(ACTIONS)}, found {entry.action_dim}")
+    if entry.episodes > entry.T:
+        raise IndexFormatError(f"{entry.episodes} episodes in {entry.T} steps")
+    key = *_names(entry), entry.obs_shape
+    if key in checked:
+        return
+    checked.add(key)
+    for value in _names(entry):
+        for name in [value] if isinstance(value, str) else [name for _, name in value or ()]:
+            check_name(name)
+    check_membership(entry.track, entry.split, entry.layout)
+    check_family(entry.teammate_family)
+    expected = get_layout(entry.layout).obs_shape
+    if entry.obs_shape != expected:
+        raise IndexFormatError(f"obs_shape {list(entry.obs_shape)}, expected {list(expected)} for {entry.layout}")
+    folder = f"data/{entry.track}/{entry.layout}/{entry.split}"
+    if not re.fullmatch(rf"{folder}-[0-9]{{5}}-of-[0-9]{{5}}\.h5", entry.shard):
+        raise IndexFormatError(f"shard {entry.shard!r}: expected {folder}-NNNNN-of-NNNNN.h5")
+
 
 ALIASES = {"algorithm": "teammate_kind"}
 """Other names of filters: the kind of a learned teammate is its training algorithm."""

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.info import check_version
 from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE
+from icrl4aht_data.writing.convert import release_tasks, stored_task
 from icrl4aht_data.writing.release import NewTask, write_release
-from icrl4aht_data.writing.release_folder import as_path, check_target
-from icrl4aht_data.writing.stored import release_tasks, stored_task
 
 
 def combine_releases(
@@ -24,7 +21,6 @@ def combine_releases(
     data_version: str | None = None,
     *,
     overwrite: bool = False,
-    done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
     """Combine releases, or selections of their histories, into one release, in order and renumbered.
 
@@ -35,25 +31,19 @@ def combine_releases(
         roots: releases of the same kind and episode length without common tasks; a `Dataset` for a part of one.
         data_version: version of the combination; by default the common version of the releases.
         overwrite: replace a release at `target`.
-        done: called when the histories of a task are written.
 
     Raises:
         OptionError: if the releases differ in kind or environment, or share a task; if `data_version` is not SemVer; if
             `target` may not be written, see `release_folder.check_target`.
         ReleaseError: if a release cannot be read.
     """
-    if data_version is not None:
-        check_version(data_version)
-    target = as_path(target)
     if not roots or isinstance(roots, (str, Path, Dataset)):
         raise OptionError(f"expected a list of at least one release to combine, found {roots!r}")
-    check_target(target, overwrite, [root.root if isinstance(root, Dataset) else root for root in roots])
     datasets = [root if isinstance(root, Dataset) else load_icrl4aht(root) for root in roots]
     _check_compatible(datasets)
     versions = {dataset.info.data_version for dataset in datasets}
     if data_version is None and len(versions) > 1:
         raise OptionError(f"data versions {', '.join(sorted(versions))}: say which one the combination has")
-    data_version = data_version or versions.pop()
     first, tasks = datasets[0].info, _tasks(datasets)
     written = {new.task.task_id for new in tasks}
     left_out = dict.fromkeys(task for dataset in datasets for task in dataset.info.left_out)
@@ -61,12 +51,11 @@ def combine_releases(
         target,
         first.kind,
         tasks,
-        data_version=data_version,
+        data_version=versions.pop() if data_version is None else data_version,
         kept_steps=first.environment.kept_steps,
         left_out=[task for task in left_out if task.task_id not in written],
         overwrite=overwrite,
         sources=[dataset.root for dataset in datasets],
-        done=done,
     )
 
 

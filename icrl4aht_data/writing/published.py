@@ -43,11 +43,11 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import add_filename, resolve_inside, write_json
 from icrl4aht_data.utils.options import check_int
+from icrl4aht_data.writing.convert import HistoryProgress
 from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
 from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, as_path, atomic_folder, check_target
-from icrl4aht_data.writing.stored import HistoryProgress
+from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, as_path, atomic_folder
 
 PUBLISHED_CHUNK = 4096
 """Steps per chunk in the published files."""
@@ -184,8 +184,7 @@ def from_published(
         PublishedFormatError: if a file is missing or malformed, if a group lacks an array that the kind of release
             needs, or if two histories have the same group or stream; with file and group.
     """
-    kept_steps, source, target = check_int("kept_steps", kept_steps, 1), as_path(source), as_path(target)
-    check_target(target, overwrite, [source])
+    kept_steps, source = check_int("kept_steps", kept_steps, 1), as_path(source)
     lines = read_published_index(resolve_inside(source, HISTORIES_INDEX))
     provenance_path = resolve_inside(source, "provenance.json")
     provenance = read_provenance(provenance_path) if provenance_path.is_file() else {}

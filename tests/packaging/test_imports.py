@@ -14,7 +14,7 @@ from tests.helpers.paths import PACKAGES, ROOT
 
 ORDER = {
     "": "icrl4aht_data icrl4aht_generation icrl4aht_baselines benchmarks tests",
-    "icrl4aht_data": "errors utils overcooked benchmark format plotting clients fetch download reading sampling "
+    "icrl4aht_data": "errors utils overcooked benchmark format plotting clients fetch reading sampling "
     "environments dataset interop writing checking publishing browsing commands",
     "icrl4aht_generation": "policy env paths learners jobs experts layouts teammates profiles collection "
     "adapters populations releases planning verbs commands",

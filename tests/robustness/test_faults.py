@@ -22,9 +22,9 @@ import pytest
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError
-from icrl4aht_data.format import columns
+from icrl4aht_data.fetch import fetch_planned, plan_download
+from icrl4aht_data.format import index
 from icrl4aht_data.format.manifest import parse_manifest, read_manifest, write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, held_fields
 from icrl4aht_data.reading.sources import CacheMode
@@ -74,7 +74,7 @@ def caches(tmp_path, monkeypatch) -> Path:
     """An empty cache folder, in which columns of every size are cached."""
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
-    monkeypatch.setattr(columns, "_UNCACHED", 0)
+    monkeypatch.setattr(index, "_UNCACHED", 0)
     return tmp_path / "cache"
 
 
@@ -176,7 +176,7 @@ def other_value(data: bytes, rng: np.random.Generator, by_line: bool) -> bytes:
 
 def manifest_of(root: Path) -> dict[str, str] | None:
     with suppress(Icrl4ahtError):
-        return read_manifest(root)
+        return dict(read_manifest(root))
     return None
 
 
@@ -259,10 +259,10 @@ def start(code: str, *arguments: object) -> subprocess.Popen[str]:
 import sys
 from pathlib import Path
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.download import fetch_planned, plan_download
+from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.fetch import open_root
-from icrl4aht_data.format import columns
-columns._UNCACHED = 0
+from icrl4aht_data.format import index
+index._UNCACHED = 0
 print(flush=True)
 sys.stdin.readline()
 """
