@@ -19,7 +19,7 @@ from icrl4aht_data.fetch import ReleaseLocation, open_root
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
 from icrl4aht_data.format.provenance import Provenance, TeammateSwaps
-from icrl4aht_data.format.schema import ENTRY_HINTS, INFO, TASKS, TEAMMATES
+from icrl4aht_data.format.schema import ENTRY_HINTS, INFO, TASKS, TEAMMATES, Entry
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import columns
@@ -308,9 +308,7 @@ class Dataset(Selection):
             OptionError: for an episode that the history does not have.
         """
         history = self.history(history_id)
-        if check_int("episode", episode, 0) >= history.entry.episodes:
-            raise OptionError(f"episode = {episode}: history {history_id} has episodes 0..{history.entry.episodes - 1}")
-        recorded = history.episodes[episode]
+        recorded = history.episodes[_check_episode(history.entry, episode)]
         after = np.concatenate([recorded.state[1:], recorded.episode_end_state[None]])
         return {
             "state": recorded.state[0],
@@ -350,9 +348,7 @@ class Dataset(Selection):
             NotStoredError: if the release was made without its tasks.
             OptionError: for an episode that the history does not have.
         """
-        task, count = self.history_task(history_id), self.index.entry(history_id).episodes
-        if check_int("episode", episode, 0) >= count:
-            raise OptionError(f"episode = {episode}: history {history_id} has episodes 0..{count - 1}")
+        task, episode = self.history_task(history_id), _check_episode(self.index.entry(history_id), episode)
         provenance, swaps = self.provenance.get(task.task_id, Provenance()), self._swaps(task)
         return (swaps.teammate(episode) if swaps else task.teammate) | (provenance.teammate or {})
 
@@ -422,6 +418,12 @@ class Dataset(Selection):
         return DPTSampler(
             self, batch_size=batch_size, context=context, order=order, labels=labels, queries=queries, **options
         )
+
+
+def _check_episode(entry: Entry, episode: int) -> int:
+    if check_int("episode", episode, 0) >= entry.episodes:
+        raise OptionError(f"episode = {episode}: history {entry.history_id} has episodes 0..{entry.episodes - 1}")
+    return int(episode)
 
 
 def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | None:

@@ -22,6 +22,7 @@ Rows of episodes have state records, also rows from `datasets.load_dataset(relea
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -95,12 +96,11 @@ def torch_loader(
         _ = sampler.dataset.storage  # decode once in this process; workers map the files or inherit the arrays
     processes = {"multiprocessing_context": context, "persistent_workers": True} if workers else {}
     return loader(
-        _TorchBatches(sampler),
+        sampler,
         batch_size=None,
         sampler=_Passes(numbers, per_pass if stop is None else len(numbers)),
         num_workers=check_int("workers", workers, 0),
-        **processes,
-        **options,
+        **{"collate_fn": _to_tensors, **processes, **options},
     )
 
 
@@ -137,17 +137,9 @@ class _Passes:
         yield from numbers
 
 
-class _TorchBatches:
-    """Dataset of a sampler's batches in PyTorch's dtypes; DataLoader converts the arrays to tensors."""
-
-    def __init__(self, sampler: Sampler) -> None:
-        self._sampler = sampler
-
-    def __len__(self) -> int:
-        return len(self._sampler)
-
-    def __getitem__(self, i: int) -> Any:
-        return _for_losses(self._sampler[i])
+def _to_tensors(batch: Any) -> Any:
+    """Return a batch as tensors in PyTorch's dtypes."""
+    return import_module("torch.utils.data").default_convert(_for_losses(batch))
 
 
 def _for_losses(batch: Any) -> Any:

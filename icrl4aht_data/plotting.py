@@ -1,7 +1,4 @@
-"""Figures of datasets, histories and layouts, and animated episodes. They need the extra `plot`.
-
-Every function that draws a figure returns it, and writes it to a file if a path is given.
-"""
+"""Figures of datasets, histories and layouts, and pictures that notebooks show. They need the extra `plot`."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -82,7 +79,6 @@ class Picture:
         """
         target = Path(path)
         if not isinstance(self._content, bytes):
-            _check_suffix(target, PICTURES)
             save_figure(self._content, target)
             return
         _check_suffix(target, (".gif",))
@@ -122,7 +118,7 @@ def plot_history(returns: np.ndarray, title: str, expert_return: float | None = 
     Raises:
         OptionError: if matplotlib is not installed.
     """
-    figure, (axes,) = _panels(None, 1, (5.6, 3.3))
+    figure, (axes,) = _panels(1, (5.6, 3.3), 1)
     episodes, window = np.arange(1, len(returns) + 1), max(1, len(returns) // 20)
     axes.plot(episodes, returns, color="C0", alpha=0.3, linewidth=0.8, label="each episode")
     axes.plot(episodes, running_mean(returns, window), color="C0", label=f"running mean over {window}")
@@ -159,7 +155,7 @@ def animate_episode(
 def plot_learning_curves(dataset: Iterable[Any], path: Path | None = None) -> Figure:
     """Plot the return over the course of a history on every layout in a selection, see `plot_source_curves`.
 
-    The generated layouts of a family share a panel.
+    The generated layouts of a family share a panel. The figure is written to a file if a path is given.
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
@@ -168,7 +164,10 @@ def plot_learning_curves(dataset: Iterable[Any], path: Path | None = None) -> Fi
     for history in dataset:
         entry = history.entry
         add_curve(curves, layout_title(entry.layout), entry.source, entry.split, history.returns())
-    return plot_source_curves(curves, path)
+    figure = plot_source_curves(curves)
+    if path is not None:
+        save_figure(figure, path, dpi=80)
+    return figure
 
 
 def _curve_order(label: str) -> tuple[int, str]:
@@ -185,88 +184,56 @@ def add_curve(curves: SourceCurves, layout: str, source: str, split: str, return
     curves.setdefault(layout, {}).setdefault(source if split == "train" else f"{source}, {split}", []).append(returns)
 
 
-def plot_source_curves(curves: SourceCurves, path: Path | None = None) -> Figure:
+def plot_source_curves(curves: SourceCurves) -> Figure:
     """Plot mean returns over the course of a history, one panel per layout, with bands from 10th to 90th percentile.
 
-    Each history is divided into at most 25 equal parts, and returns are averaged in each part.
+    Each history is divided into at most 25 equal parts, and returns are averaged in each part. Panels have equal
+    limits, and a label has one colour in all of them.
 
     Raises:
-        OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
+        OptionError: if matplotlib is not installed.
     """
-    panels: list[_Panel] = []
-    for layout, of_layout in curves.items():
-        bands = {}
+    size = (2.6, 1.9) if len(curves) > 2 else (4.2, 2.8)
+    figure, grid = _panels(len(curves), size, columns=min(4, len(curves)))
+    labels = sorted({label for of_layout in curves.values() for label in of_layout}, key=_curve_order)
+    ends: list[float] = []
+    for axes, (layout, of_layout) in zip(grid, curves.items(), strict=True):
         for label in sorted(of_layout, key=_curve_order):
             parts = min(_CURVE_PARTS, *map(len, of_layout[label]))
             means = np.stack([[part.mean() for part in np.array_split(own, parts)] for own in of_layout[label]])
-            bands[label] = _Band((np.arange(parts) + 0.5) / parts, means.mean(axis=0), means)
-        panels.append((layout, bands))
-    labels = sorted({label for of_layout in curves.values() for label in of_layout}, key=_curve_order)
-    what = "Return of the kept steps over the course of a history, 0 to 1 (band: 10th to 90th percentile of histories)"
-    size = (2.6, 1.9) if len(curves) > 2 else (4.2, 2.8)
-    return _plot_bands(path, panels, labels, what, size, columns=min(4, len(curves)))
-
-
-class _Band(NamedTuple):
-    """A line with a band around it.
-
-    Attributes:
-        x: (N,), horizontal positions.
-        line: (N,), heights of the line.
-        samples: (M, N), whose 10th and 90th percentiles are the band.
-    """
-
-    x: np.ndarray
-    line: np.ndarray
-    samples: np.ndarray
-
-
-_Panel = tuple[str, dict[str, _Band]]
-"""Title, and label -> band."""
-
-
-def _plot_bands(
-    path: Path | None,
-    panels: Sequence[_Panel],
-    labels: Sequence[str],
-    caption: str,
-    size: tuple[float, float],
-    columns: int | None = None,
-) -> Figure:
-    """Plot panels of bands with equal limits and one legend; a label has one colour in all panels."""
-    figure, grid = _panels(path, len(panels), size, columns)
-    ends: list[float] = []
-    for axes, (title, bands) in zip(grid, panels, strict=True):
-        for label, (x, line, samples) in bands.items():
-            color, (low, high) = f"C{labels.index(label)}", np.percentile(samples, (10, 90), axis=0)
+            low, high = np.percentile(means, (10, 90), axis=0)
             ends += [float(low.min()), float(high.max())]
-            axes.plot(x, line, label=label, color=color, linewidth=1.3)
+            x, color = (np.arange(parts) + 0.5) / parts, f"C{labels.index(label)}"
+            axes.plot(x, means.mean(axis=0), label=label, color=color, linewidth=1.3)
             axes.fill_between(x, low, high, alpha=0.2, linewidth=0, color=color)
-        axes.set_title(title, fontsize=8)
+        axes.set_title(layout, fontsize=8)
         axes.tick_params(labelsize=7)
         axes.margins(x=0.02)
         axes.grid(alpha=0.3)
     for axes in grid:
         axes.set_ylim(*return_limits(ends))
+    caption = (
+        "Return of the kept steps over the course of a history, 0 to 1 (band: 10th to 90th percentile of histories)"
+    )
     figure.suptitle(fill(caption, int(15 * figure.get_figwidth())), fontsize=8)
     legend_below(figure)
-    return _saved(figure, path, dpi=120 if columns is None else 80)
+    return figure
 
 
-def plot_layouts(layouts: Sequence[Layout], path: Path | None = None) -> Figure:
+def plot_layouts(layouts: Sequence[Layout]) -> Figure:
     """Draw the layouts at the start of an episode: agents on their cells in the map, ego blue, teammate red.
 
     Raises:
-        OptionError: if matplotlib or Pillow is not installed, or the path does not end in .png, .svg or .pdf.
+        OptionError: if matplotlib or Pillow is not installed.
     """
-    figure, grid = _panels(path, len(layouts), (4.6, 3.3))
+    figure, grid = _panels(len(layouts), (4.6, 3.3), columns=2 if len(layouts) == 4 else min(3, len(layouts)))
     for axes, layout in zip(grid, layouts, strict=True):
         positions = np.array([layout.agent_cells], np.uint8)
         (record,) = start(layout, positions, np.full((1, 2), DOWN, np.uint8), layout.recipe_items[:1])
         axes.imshow(draw_frame(layout, record, view=False))
         axes.set_title(f"{layout.name} ({layout.alias})", fontsize=9)
         axes.set_axis_off()
-    return _saved(figure, path, dpi=120)
+    return figure
 
 
 def _check_suffix(path: Path, suffixes: Collection[str]) -> None:
@@ -274,13 +241,8 @@ def _check_suffix(path: Path, suffixes: Collection[str]) -> None:
         raise OptionError(f"{path}: expected a name that ends in {', '.join(suffixes)}")
 
 
-def _panels(
-    path: Path | None, count: int, size: tuple[float, float], columns: int | None = None
-) -> tuple[Figure, list[Any]]:
-    """Return a figure and its `count` axes, each `size` inches (width, height); checks the suffix of `path`."""
-    if path is not None:
-        _check_suffix(path, PICTURES)
-    columns = columns or (2 if count == 4 else min(3, count))
+def _panels(count: int, size: tuple[float, float], columns: int) -> tuple[Figure, list[Any]]:
+    """Return a figure and its `count` axes, each `size` inches (width, height)."""
     rows = -(-count // columns)
     figure = new_figure(size[0] * columns, size[1] * rows)
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
@@ -326,15 +288,12 @@ def legend_below(figure: Figure) -> None:
         legend.remove()
 
 
-def _saved(figure: Figure, path: Path | None, dpi: int) -> Figure:
-    """Write the figure if a path is given, and return it."""
-    if path is not None:
-        save_figure(figure, path, dpi)
-    return figure
-
-
 def save_figure(figure: Figure, path: Path, dpi: int = 110) -> None:
-    """Write a figure atomically, in the format of the path's suffix."""
-    kind = path.suffix.removeprefix(".")
+    """Write a figure atomically, in the format of the path's suffix.
+
+    Raises:
+        OptionError: if the path does not end in .png, .svg or .pdf.
+    """
+    _check_suffix(path, PICTURES)
     with atomic_write(path) as partial:
-        figure.savefig(partial, dpi=dpi, format=kind)
+        figure.savefig(partial, dpi=dpi, format=path.suffix.removeprefix("."))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -147,33 +147,25 @@ def make_task(
     """
     known = get_layout(layout)
     check_membership(track, split, known.name)
-    given = None if recipes is None else tuple(recipes)
-    task = Task(
-        task_id(track, split, known.alias, teammate, seed, given), track, split, known.alias, seed, teammate, given
-    )
+    task = Task("", track, split, known.alias, seed, teammate, None if recipes is None else tuple(recipes))
+    task = replace(task, task_id=task_id(task))
     _check_recipes(task)
     return task
 
 
-def task_id(
-    track: str,
-    split: str,
-    layout_name: str,
-    teammate: dict[str, Any],
-    seed: int,
-    recipes: Sequence[Dish] | None = None,
-) -> str:
+def task_id(task: Task) -> str:
     """`{track}_{split}_{layout}_{family}_t{theta_id}_s{seed}_{hash8}`, as in the published manifests.
 
     hash8 is the first 8 hexadecimal digits of SHA-256 of `track:split:layout:<repr of the teammate>:seed`, followed by
     `:` and the recipes, such as `000,001`, if the task has its own.
     """
+    teammate, where = task.teammate, (task.track, task.split, task.layout_name)
     spec = {name: teammate[name] for name in _HASHED if name in teammate}
-    text = f"{track}:{split}:{layout_name}:{spec!r}:{seed}"
-    if recipes is not None:
-        text += ":" + ",".join("".join(map(str, recipe)) for recipe in recipes)
+    text = f"{':'.join(where)}:{spec!r}:{task.seed}"
+    if task.recipes is not None:
+        text += ":" + ",".join("".join(map(str, recipe)) for recipe in task.recipes)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    return f"{track}_{split}_{layout_name}_{teammate['family']}_t{teammate.get('theta_id', 0)}_s{seed}_{digest}"
+    return f"{'_'.join(where)}_{teammate['family']}_t{teammate.get('theta_id', 0)}_s{task.seed}_{digest}"
 
 
 def manifest_path(track: str, split: str, teammates: Literal["", "diverse"] = "") -> Path:
@@ -260,8 +252,7 @@ def parse_task(fields: Any) -> Task:
     _check_recipes(task)
     check_membership(task.track, task.split, task.layout.name)
     check_teammate(task.teammate)
-    expected = task_id(task.track, task.split, task.layout_name, task.teammate, task.seed, task.recipes)
-    if task.task_id != expected:
+    if task.task_id != (expected := task_id(task)):
         raise TaskFormatError(f"task_id {task.task_id!r} does not match the task's content, expected {expected!r}")
     return task
 

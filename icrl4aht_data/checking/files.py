@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.checking.report import Finding, NamedProgress, Report
+from icrl4aht_data.checking.report import NamedProgress, Report
 from icrl4aht_data.errors import Icrl4ahtError
-from icrl4aht_data.fetch import ReleaseLocation
+from icrl4aht_data.fetch import ReleaseLocation, Remote
 from icrl4aht_data.format.chunks import chunk_table_name, read_table
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
@@ -48,7 +48,7 @@ def check_files(
     for name in sorted(present - listed.keys() - {MANIFEST}):
         if not name.startswith(_HUB_FILES):
             report.add(name, "not listed in the manifest")
-    both, sizes = sorted(expected & present), {} if quick else _recorded_sizes(root, listed)
+    both, sizes = sorted(expected & present), _recorded_sizes(root, listed)
     for number, name in enumerate(both, start=1):
         try:
             path = resolve_inside(root, name)
@@ -122,17 +122,14 @@ def check_references(
         report.notes.append(f"{len(without)} tasks have learned teammates whose checkpoints this release does not have")
 
 
-def check_shard_sizes(origin: ReleaseLocation, index: Index, shards: list[str], report: Report) -> None:
-    """Check that local and remote shards have the sizes that meta/info.json records."""
-    known = set(report.findings)  # `check_files` has the sizes of very large shards
-    sizes = {name: path.stat().st_size for name in shards if (path := resolve_inside(index.root, name)).exists()}
-    if origin.remote is not None:
-        try:
-            sizes |= origin.remote.sizes(name for name in shards if name not in sizes)
-        except Icrl4ahtError as error:
-            report.add("data", str(error))
+def check_remote_sizes(remote: Remote, index: Index, shards: list[str], report: Report) -> None:
+    """Check that shards that are not on this machine have the sizes that meta/info.json records."""
+    try:
+        sizes = remote.sizes(name for name in shards if not remote.path(name).exists())
+    except Icrl4ahtError as error:
+        report.add("data", str(error))
+        return
     for name, found in sizes.items():
         expected = index.info.shards.get(name, found)  # `check_index` compares the names
-        problem = f"expected {expected:,} bytes, found {found:,}"
-        if found != expected and Finding(name, problem) not in known:
-            report.add(name, problem)
+        if found != expected:
+            report.add(name, f"expected {expected:,} bytes, found {found:,}")

@@ -1,4 +1,4 @@
-"""Checks of the arrays of histories: checksums, ranges, episodes, and the values that the index derives from them."""
+"""Checks of the arrays of histories: checksums, ranges, episodes, values of the index, and the rules of the game."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icrl4aht_data.checking.physics import observation_faults, replay_faults
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.format.info import ReleaseInfo
@@ -21,12 +20,15 @@ from icrl4aht_data.format.schema import (
     record_field,
     stream_score,
 )
-from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.state import faults
+from icrl4aht_data.overcooked.observe import fixed_channels, observe
+from icrl4aht_data.overcooked.rules import step
+from icrl4aht_data.overcooked.state import columns, faults, start
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.system import free_memory
+from icrl4aht_data.writing.published_views import empty_views
 
 _COPIES = 4  # memory of checking a history, in multiples of the size of its arrays
 
@@ -98,8 +100,8 @@ def _history_faults(history: History, layout: Layout, kept_steps: int, deep: boo
             possible = False
             yield f"{name} has {fault}"
     returns = episode_returns(rewards, dones)[None]
-    start, end = curve_ends(returns)
-    derived = {"return_start": start[0], "return_end": end[0], "return_mean": returns.mean()}
+    first, last = curve_ends(returns)
+    derived = {"return_start": first[0], "return_end": last[0], "return_mean": returns.mean()}
     derived["score"] = stream_score(returns)[0]
     for name, value in derived.items():
         if not np.isclose(value, getattr(entry, name), rtol=0, atol=1e-9):
@@ -108,3 +110,51 @@ def _history_faults(history: History, layout: Layout, kept_steps: int, deep: boo
         yield from observation_faults(layout, history)
     elif deep and possible:  # the rules accept only possible states
         yield from replay_faults(layout, history, dones, rewards)
+
+
+def observation_faults(layout: Layout, history: History) -> Iterator[str]:
+    """Yield a problem if an observation does not match the layout's fixed cells; needs no state records."""
+    fixed = fixed_channels(layout)
+    views = {view.tobytes() for view in empty_views(layout)[..., fixed]}
+    wrong = [t for t, seen in enumerate(history.read("obs")[..., fixed]) if seen.tobytes() not in views]
+    if wrong:
+        yield f"obs: {len(wrong)} steps do not show {layout.name} from any cell of the ego's, first step {wrong[0]}"
+
+
+def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: np.ndarray) -> Iterator[str]:
+    """Replay every step of a history with state records, and yield contradictions to the rules.
+
+    Args:
+        layout: the history's layout.
+        history: the history, with possible states only.
+        dones: bool (T,), last steps of episodes.
+        rewards: (T,), the recorded rewards.
+    """
+    states, ends = history.read("state"), history.read("episode_end_state")
+    if history.kind == "full":
+        wrong = np.flatnonzero((history.read("obs") != observe(layout, states, EGO)).any(axis=(1, 2, 3)))
+        if len(wrong):
+            yield f"obs: {len(wrong)} steps differ from what their state shows, first step {wrong[0]}"
+    following = np.concatenate([states[1:], states[:1]])
+    following[dones] = ends
+    recipe = columns(layout).recipe
+    actions = np.stack([history.read("actions"), history.read("teammate_actions")], axis=-1)
+    # New recipes are random, so the replay takes the recorded ones.
+    played = step(layout, states, np.clip(actions, 0, len(ACTIONS) - 1), following[:, recipe])
+    wrong = np.flatnonzero((played.state != following).any(axis=-1))
+    if len(wrong):
+        yield f"replay: {len(wrong)} steps do not lead to the recorded next state, first step {wrong[0]}"
+    wrong = np.flatnonzero(played.reward != rewards)
+    if len(wrong):
+        t = int(wrong[0])
+        yield f"replay: {len(wrong)} rewards differ, first at step {t}: rules {played.reward[t]}, found {rewards[t]}"
+    if not np.isin([*states[:, recipe], *ends[:, recipe]], layout.recipe_items).all():
+        yield "a recipe is not one of the layout's"
+    starts = states[np.concatenate([[0], np.flatnonzero(dones)[:-1] + 1])]
+    positions = starts[:, columns(layout).positions]
+    fresh = start(layout, positions, starts[:, columns(layout).facings], starts[:, recipe])
+    differs = (fresh != starts).any(axis=-1)
+    for agent in (0, 1):
+        differs |= ~np.isin(positions[:, agent], layout.rooms[agent])
+    if differs.any():
+        yield f"{differs.sum()} episodes do not start as the environment starts, first episode {differs.argmax()}"

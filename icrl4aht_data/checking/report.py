@@ -60,12 +60,9 @@ class Report:
     transitions: int = 0
 
     def __repr__(self) -> str:
-        number = len(self.findings)
-        state = "ok" if self.ok else counted_noun(number, "problem")
-        checked = f"{counted_noun(self.files, 'file')}, {counted_histories(self.histories)}"
-        lines = [f"Report({self.root}, level {self.level}: {state}; {checked}"]
+        lines = [f"Report({self.root}, level {self.level}: {verdict_in_words(self)}"]
         lines += [f"    {finding.file}: {finding.problem:.200}" for finding in islice(self.findings, _SHOWN)]
-        lines += ["    ..."] * (number > _SHOWN)
+        lines += ["    ..."] * (len(self.findings) > _SHOWN)
         return "\n".join(lines) + ")"
 
     @property
@@ -98,8 +95,7 @@ def _printable(text: str) -> str:
 
 def verdict_in_words(report: Report) -> str:
     """Return one line with the verdict and the amounts of what was checked."""
-    number = len(report.findings)
-    verdict = "valid" if report.ok else counted_noun(number, "problem")
+    verdict = "valid" if report.ok else counted_noun(len(report.findings), "problem")
     if report.level == "quick":
         return f"{verdict}; checked names, sizes and the index of {counted_noun(report.files, 'file')}, no contents"
     physics = " and their physics" if report.replayed else ""

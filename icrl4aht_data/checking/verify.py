@@ -12,17 +12,15 @@ from typing import get_args
 import numpy as np
 
 from icrl4aht_data.benchmark.tasks import read_tasks
-from icrl4aht_data.checking.files import check_files, check_references, check_shard_sizes
+from icrl4aht_data.checking.files import check_files, check_references, check_remote_sizes
 from icrl4aht_data.checking.histories import check_chunks, check_history
-from icrl4aht_data.checking.index import check_index
-from icrl4aht_data.checking.provenance import check_provenance
+from icrl4aht_data.checking.index import check_index, check_provenance
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
 from icrl4aht_data.checking.structure import check_structure
 from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.download import chosen_files
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, check_choice
-from icrl4aht_data.fetch import ReleaseLocation, open_root
+from icrl4aht_data.fetch import ReleaseLocation, chosen_files, open_root
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
@@ -89,7 +87,7 @@ def verify_release(
 
 
 def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wanted: dict[str, FilterValues]) -> None:
-    listed: dict[str, str] = {}
+    listed: Mapping[str, str] = {}
     try:
         listed = read_manifest(origin.folder)
     except Icrl4ahtError as error:
@@ -127,10 +125,10 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     skipped = len(index.values("shard")) - len(shards)
     if skipped:
         report.notes.append(f"{skipped} of {skipped + len(shards)} shards were not selected")
-    if report.level == "quick":
-        check_shard_sizes(origin, index, shards, report)
-    else:
+    if report.level != "quick":
         _check_shards(index, {task.task_id: task.layout for task in tasks}, shards, report, advance)
+    elif origin.remote is not None:
+        check_remote_sizes(origin.remote, index, shards, report)
 
 
 def _unchecked_values(index: Index, provenance: Mapping[str, Provenance]) -> Iterator[str]:

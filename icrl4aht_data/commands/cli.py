@@ -18,7 +18,7 @@ import click
 
 from icrl4aht_data.commands.verbs import SECTIONS, VERB_GROUP, VERBS, Verb
 from icrl4aht_data.errors import Icrl4ahtError, UnknownNameError, unknown
-from icrl4aht_data.utils.files import FULL, describe_disk
+from icrl4aht_data.utils.files import FULL, describe_disk, final_name
 from icrl4aht_data.utils.install_hints import missing_library
 from icrl4aht_data.utils.plugins import Plugins
 
@@ -171,9 +171,7 @@ def _in_words(error: OSError) -> str:
     """Return the message for an OSError, with the user's file name instead of that of a temporary file or lock."""
     if error.errno is None or error.filename is None:
         return str(error)
-    path = Path(os.fsdecode(error.filename))
-    if path.name.startswith(".") and path.suffix in (".partial", ".lock"):
-        path = path.with_name(path.stem.removeprefix("."))
+    path = Path(final_name(os.fsdecode(error.filename)))
     remedy = _REMEDIES.get(error.errno)
     if error.errno in FULL:
         remedy = f"{remedy}: {describe_disk(path)}"

@@ -21,7 +21,6 @@ from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.clients import check_credentials, offline_switches, without_credentials
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.download import default_remote
 from icrl4aht_data.errors import OptionError, PluginError
 from icrl4aht_data.fetch import is_address
 from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, get_layout
@@ -159,7 +158,7 @@ def _folders(problems: Problems) -> dict[str, Any]:
 
 
 def _network(problems: Problems) -> dict[str, Any]:
-    remote = default_remote()
+    remote = os.environ.get("ICRL4AHT_REMOTE") or None
     if remote is not None and not is_address(remote):
         step = "set it to one such as hf://datasets/<org>/<repo>, https://... or s3://..., or unset it"
         problems[f"ICRL4AHT_REMOTE={remote!r}: expected an address"] = step

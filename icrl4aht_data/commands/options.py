@@ -12,9 +12,9 @@ import click
 from click.shell_completion import CompletionItem
 
 from icrl4aht_data.benchmark.facts import ALL_TRACKS, SPLITS, all_families
-from icrl4aht_data.errors import UnknownNameError, unknown
+from icrl4aht_data.errors import UnknownNameError, check_choice
 from icrl4aht_data.fetch import is_address
-from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, all_layout_names, get_layout
+from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, get_layout
 
 
 class Names(click.ParamType):
@@ -22,47 +22,38 @@ class Names(click.ParamType):
 
     Args:
         name: singular noun for the names, such as "layout".
-        valid: returns the valid names.
-        offered: returns the names that completion offers; all by default.
+        valid: returns the names, which completion offers.
+        check: raises `UnknownNameError` for a wrong name; by default for one that `valid` does not return.
     """
 
     def __init__(
-        self, name: str, valid: Callable[[], Iterable[str]], offered: Callable[[], Iterable[str]] | None = None
+        self, name: str, valid: Callable[[], Iterable[str]], check: Callable[[str], object] | None = None
     ) -> None:
-        self.name, self.valid, self.offered = name, valid, offered or valid
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        names = list(self.valid())
-        if value not in names:
-            self.fail(str(unknown(self.name, value, names)), param, ctx)
-        return value
-
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return [CompletionItem(name) for name in self.offered() if name.startswith(incomplete)]
-
-
-class LayoutName(Names):
-    """Type of the name of a layout that this package knows."""
+        self.name, self.valid = name, valid
+        self._check = check or (lambda value: check_choice(name, value, valid()))
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         try:
-            get_layout(value)
+            self._check(value)
         except UnknownNameError as error:
             self.fail(str(error), param, ctx)
         return value
 
-
-class ReleaseLayoutName(Names):
-    """Type of the name of a layout of a release, which may carry its own: reading it tells which there are."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        return value
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        return [CompletionItem(name) for name in self.valid() if name.startswith(incomplete)]
 
 
-LAYOUT, RELEASE_LAYOUT = (
-    kind("layout", all_layout_names, offered=lambda: [*LAYOUTS, *LAYOUT_PLUGINS.names])
-    for kind in (LayoutName, ReleaseLayoutName)
-)
+def checked_later(value: str) -> str:
+    """Return the value: the check of names that depend on other arguments, such as layouts of a release."""
+    return value
+
+
+def _short_layout_names() -> list[str]:
+    return [*LAYOUTS, *LAYOUT_PLUGINS.names]
+
+
+LAYOUT = Names("layout", _short_layout_names, get_layout)
+RELEASE_LAYOUT = Names("layout", _short_layout_names, checked_later)
 TRACK, SPLIT = Names("track", lambda: ALL_TRACKS), Names("split", lambda: SPLITS)
 FAMILY = Names("family", all_families)
 

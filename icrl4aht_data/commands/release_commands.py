@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -12,6 +13,15 @@ import click
 from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.browsing.page import (
+    PAGE_HISTORIES,
+    PAGE_MEGABYTES,
+    PAGE_START,
+    check_drawable,
+    make_browser_page,
+    save_browser_page,
+    spread_histories,
+)
 from icrl4aht_data.checking.report import verdict_in_words
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.doctor import diagnose, in_words
@@ -38,7 +48,7 @@ from icrl4aht_data.commands.summaries import (
     task_table,
 )
 from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.download import fetch_planned, plan_download
+from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import ALL_KINDS, OBSERVATIONS
 from icrl4aht_data.plotting import PICTURES, plot_learning_curves
@@ -46,7 +56,7 @@ from icrl4aht_data.publishing.build import build_release
 from icrl4aht_data.publishing.upload import upload_release
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import counted, progress_bars
-from icrl4aht_data.utils.text import counted_noun
+from icrl4aht_data.utils.text import counted_histories, counted_noun
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.minari import to_minari
@@ -133,6 +143,71 @@ def show(
     else:
         console.print(repr(dataset[0]), "", sep="\n")
     console.print(*fact_lines(facts), sep="\n")
+
+
+@click.command(
+    epilog=examples(
+        "icrl4aht-data browse --layout demo_wide --source ppo --out demo_wide.html",
+        "icrl4aht-data browse path/to/release --history 0 --history 7",
+    )
+)
+@_root
+@filter_options
+@click.option(
+    "--history",
+    "wanted",
+    type=COUNT_OR_NONE,
+    multiple=True,
+    metavar="ID",
+    help="Only this history; repeat for more.",
+)
+@click.option("--histories", type=COUNT, default=PAGE_HISTORIES, help="Maximum number of histories on the page.")
+@click.option("--megabytes", type=COUNT, default=PAGE_MEGABYTES, help="Maximum size of the page in MB.")
+@click.option(
+    "--out",
+    type=NewFile(".html", ".htm"),
+    metavar="FILE",
+    default="browse.html",
+    help="File to write.",
+)
+@overwrite_option
+@quiet_option
+@json_option
+def browse(
+    root: str | Path | None,
+    wanted: tuple[int, ...],
+    histories: int,
+    megabytes: int,
+    out: Path,
+    overwrite: bool,
+    quiet: bool,
+    as_json: bool,
+    **filters: Any,
+) -> None:
+    """Write an HTML page on which to look at histories.
+
+    One file that needs no other and no network: choose a layout, a teammate and a history, see its learning curve, and
+    watch its episodes step by step, with the ego's window and the expert's action next to the ego's. Where not all
+    episodes fit, some of each history can be watched, the first and the last among them; the page says which. A release
+    of observations has no states to draw.
+    """
+    with suppress(OSError), out.open("rb") as stream:  # a page written by this command may be replaced
+        overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
+    check_output(out, overwrite)
+    matching = load_icrl4aht(root, **filters)
+    check_drawable(matching)
+    chosen = matching.select(list(dict.fromkeys(wanted)) or spread_histories(matching, histories))
+    with progress_bars(quiet) as show:
+        page = make_browser_page(
+            chosen, megabytes=megabytes, advance=lambda done, total: show("histories", done, total)
+        )
+    save_browser_page(page, out)
+    facts: dict[str, Any] = {"page": str(out), "histories": page.histories}
+    facts |= {"episodes": page.episodes, "shown_episodes": page.shown_episodes, "bytes": len(page.html)}
+    shown = "all" if page.shown_episodes == page.episodes else f"{page.shown_episodes:,} of"
+    text = f"{out}: {page.histories} of {counted_histories(len(matching))}, {shown} "
+    text += f"{counted_noun(page.episodes, 'episode')} to watch, {len(page.html):,} bytes"
+    print_result(facts, text, as_json, quiet)
 
 
 @click.command(

@@ -38,7 +38,7 @@ _CLI = "icrl4aht_data.commands.release_commands"
 VERBS = (
     Verb("list", f"{_CLI}:list_", "Look", "List the tasks of a release."),
     Verb("show", f"{_CLI}:show", "Look", "Show a release, a part of it or one history."),
-    Verb("browse", "icrl4aht_data.commands.browse:browse", "Look", "Write an HTML page on which to look at histories."),
+    Verb("browse", f"{_CLI}:browse", "Look", "Write an HTML page on which to look at histories."),
     Verb("verify", f"{_CLI}:verify", "Look", "Verify a release: every byte, count and range."),
     Verb("doctor", f"{_CLI}:doctor", "Look", "Examine this installation, and report problems."),
     Verb("download", f"{_CLI}:download", "Fetch and convert", "Download a release, or a part of it."),

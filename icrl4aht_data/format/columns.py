@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
-from itertools import islice
+from itertools import count, islice
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, overload
@@ -113,7 +114,8 @@ def read_columns(path: Path) -> Columns:
 
 def _parse(path: Path) -> dict[str, np.ndarray]:
     """Read an index file and return the arrays of `Columns` by name."""
-    codes = {name: _Codes() for name in _STRINGS}
+    # A new value gets the next code when it is looked up.
+    codes = {name: defaultdict[str, int](count().__next__) for name in _STRINGS}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
     entries = _entries(path)
     while block := list(islice(entries, _BLOCK)):
@@ -145,14 +147,6 @@ def _entries(path: Path) -> Iterator[Entry]:
         except (msgspec.MsgspecError, Icrl4ahtError) as error:
             raise IndexFormatError(f"{path}, line {number + 1}: {error}") from error
         yield entry
-
-
-class _Codes(dict[str, int]):
-    """Mapping of values to codes, in which a new value gets the next code when it is looked up."""
-
-    def __missing__(self, value: str) -> int:
-        code = self[value] = len(self)
-        return code
 
 
 def _check(entry: Entry, number: int, checked: set[tuple[Any, ...]]) -> None:

@@ -1,10 +1,12 @@
-"""Content of meta/info.json: kind, versions, layouts, totals and shard sizes of a release."""
+"""Content of meta/info.json: kind, versions, layouts, totals, shard sizes and statistics of a release."""
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import mul
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +15,7 @@ import numpy as np
 from msgspec import Meta
 
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
+from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import (
     FormatTooNewError,
     FormatTooOldError,
@@ -22,7 +25,17 @@ from icrl4aht_data.errors import (
     RootNotFoundError,
 )
 from icrl4aht_data.format.layouts_file import read_layouts
-from icrl4aht_data.format.schema import FORMAT_VERSION, INFO, READABLE_VERSIONS, Entry, Kind, check_name
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import (
+    FORMAT_VERSION,
+    INFO,
+    READABLE_VERSIONS,
+    Entry,
+    FiniteNumber,
+    Kind,
+    StreamCount,
+    check_name,
+)
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
@@ -39,8 +52,6 @@ _VERSION_LENGTH = 100  # characters
 
 _Steps = Annotated[int, Meta(gt=0, lt=2**31)]
 _Bytes = Annotated[int, Meta(ge=0, lt=2**62)]
-_Number = Annotated[int, Meta(ge=0, lt=2**31)]
-_Return = Annotated[float, Meta(gt=-1e15, lt=1e15)]
 
 
 class EpisodeLengths(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -130,10 +141,10 @@ class LeftOutTask:
     layout: str
     teammate: str
     source: str
-    learners: _Number
-    streams: _Number
-    return_start: _Return | None
-    return_end: _Return | None
+    learners: StreamCount
+    streams: StreamCount
+    return_start: FiniteNumber | None
+    return_end: FiniteNumber | None
     reason: str
 
 
@@ -269,3 +280,52 @@ def describe(
         layouts=layouts,
         shards={},
     )
+
+
+def layout_statistics(
+    entries: Sequence[Entry],
+    tasks: Sequence[Task],
+    provenance: Mapping[str, Provenance],
+    kept_steps: int,
+    sizes: Mapping[str, int],
+) -> dict[str, LayoutStatistics]:
+    """Return the statistics of every layout, in order of first appearance.
+
+    Args:
+        entries: the index.
+        tasks: the release's tasks.
+        provenance: task id -> how its histories were made.
+        kept_steps: steps of every episode.
+        sizes: shard -> size in bytes.
+    """
+    statistics = {}
+    for layout in dict.fromkeys(entry.layout for entry in entries):
+        members = [entry for entry in entries if entry.layout == layout]
+        lengths = {entry.task_id: entry.T for entry in members}
+        recorded = [provenance.get(task_id, Provenance()).streams_recorded for task_id in lengths]
+        streams = [number for number in recorded if number is not None]
+        original = sum(map(mul, streams, lengths.values())) if len(streams) == len(recorded) else None
+        own = [task for task in tasks if task.task_id in lengths]
+        teammates = {json.dumps(task.teammate, sort_keys=True) for task in own}
+        steps = [entry.T for entry in members]
+        statistics[layout] = LayoutStatistics(
+            original_transitions=original,
+            filtered_transitions=sum(steps),
+            history_length=(min(steps), max(steps)),
+            teammates=len(teammates) or None,
+            steps_per_episode=kept_steps,
+            obs_shape=members[0].obs_shape,
+            actions=len(ACTIONS),
+            mean_final_return=round(float(np.mean([entry.return_end for entry in members])), 3),
+            independent_teammates=len(set(map(_policy, own))) or None,
+            disk_bytes=sum(sizes[shard] for shard in {entry.shard for entry in members}),
+        )
+    return statistics
+
+
+def _policy(task: Task) -> str:
+    """Return a key that is equal only for checkpoints of the same policy."""
+    checkpoint = task.teammate.get("theta", {}).get("checkpoint")
+    if task.teammate_family != "rl" or checkpoint is None:
+        return json.dumps(task.teammate, sort_keys=True)
+    return f"{checkpoint.rpartition('/')[0]} {task.teammate.get('base_seed')}"

@@ -12,15 +12,14 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
-from msgspec import Meta
 
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, UnknownNameError
 from icrl4aht_data.format.schema import LAYOUTS_FILE, check_name
 from icrl4aht_data.overcooked.cells import GOAL, PLATES, POT
-from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, add_layouts, get_layout
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, LayoutLine, add_layouts, get_layout
 from icrl4aht_data.utils.files import read_lines, resolve_inside
 
 PUBLISHED = "published"
@@ -32,28 +31,6 @@ OTHER = "other"
 _GENERATED = re.compile(r"(\w+)-(\d+)-(\d+)", re.ASCII).fullmatch
 
 _NEEDED = {GOAL: "a goal", POT: "a pot", PLATES: "a pile of plates"}
-
-
-class LayoutLine(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """One line of the file.
-
-    Args:
-        name: the layout's name, which is also its environment name.
-        map: its rows.
-        recipes: triples of ingredient ids.
-        indicates_delivery: whether observations have the delivery channel.
-        family: family of generated layouts, or `OTHER`.
-        seed: seed of the family's sequence; None for a layout that was not generated.
-        number: number in that sequence.
-    """
-
-    name: str
-    map: tuple[str, ...]
-    recipes: Annotated[tuple[tuple[int, int, int], ...], Meta(min_length=1)]
-    indicates_delivery: bool
-    family: str
-    seed: int | None = None
-    number: int | None = None
 
 
 @dataclass(frozen=True)
@@ -96,7 +73,7 @@ def read_layouts(root: Path) -> ReleaseLayouts:
             if fields.name in families:
                 raise IndexFormatError(f"layout {fields.name!r} is listed twice")
             families[fields.name] = fields.family
-            layout = Layout(fields.name, fields.name, fields.map, fields.recipes, fields.indicates_delivery)
+            layout = fields.layout()
             missing = [what for kind, what in _NEEDED.items() if kind not in layout.kinds]
             if missing:
                 raise IndexFormatError(f"layout {fields.name!r}: its map has not {' and '.join(missing)}")

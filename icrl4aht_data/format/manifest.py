@@ -61,8 +61,9 @@ def is_known_file(name: str) -> bool:
     return _KNOWN.fullmatch(name) is not None
 
 
-def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
-    """Parse a manifest: path in the release -> SHA-256.
+@lru_cache(maxsize=16)
+def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
+    """Parse a manifest, once for the same text: path in the release -> SHA-256.
 
     Args:
         text: content of the manifest.
@@ -98,24 +99,13 @@ def parse_manifest(text: str, path: Path | str) -> dict[str, str]:
         if twin != name:
             raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are one file on some systems")
         listed[name] = digest
-    return listed
+    return MappingProxyType(listed)
 
 
-def read_manifest(folder: Path) -> dict[str, str]:
+def read_manifest(folder: Path) -> Mapping[str, str]:
     """Read the manifest of a release folder, see `parse_manifest`."""
     path = resolve_inside(folder, MANIFEST)
     return parse_manifest(read_text(path), path)
-
-
-def _listed(root: Path) -> Mapping[str, str]:
-    """Return the manifest of a release folder, parsed again only after a change."""
-    path = resolve_inside(root, MANIFEST)
-    return _parsed_once(read_text(path), path)
-
-
-@lru_cache(maxsize=16)
-def _parsed_once(text: str, path: Path) -> Mapping[str, str]:
-    return MappingProxyType(parse_manifest(text, path))
 
 
 def check_against_manifest(root: Path, names: Iterable[str]) -> None:
@@ -129,7 +119,7 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
         IndexFormatError, ChunkTableError: if a file is missing, not listed or differs, or if the manifest is missing or
             invalid; with the expected and the found hash.
     """
-    manifest, listed = root / MANIFEST, _listed(root)
+    manifest, listed = root / MANIFEST, read_manifest(root)
     for name in names:
         path = resolve_inside(root, name)
         kind = ChunkTableError if name.startswith("meta/chunks/") else IndexFormatError
@@ -153,7 +143,7 @@ def check_meta(root: Path) -> None:
 
     meta/source_card.md, which earlier versions of this package wrote, may be missing, since no code reads it.
     """
-    listed = [name for name in _listed(root) if re.fullmatch(r"meta/[^/]+", name)]
+    listed = [name for name in read_manifest(root) if re.fullmatch(r"meta/[^/]+", name)]
     read = {
         name for name in (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE) if name in listed or (root / name).exists()
     }
@@ -162,7 +152,7 @@ def check_meta(root: Path) -> None:
 
 def check_folder(root: Path, folder: str) -> None:
     """Check the existing files of a subfolder of a release; see `check_against_manifest`."""
-    check_against_manifest(root, [n for n in _listed(root) if n.startswith(f"{folder}/") and (root / n).exists()])
+    check_against_manifest(root, [n for n in read_manifest(root) if n.startswith(f"{folder}/") and (root / n).exists()])
 
 
 def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:

@@ -12,15 +12,12 @@ from msgspec import Meta
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task, check_teammate, teammate_id
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
-from icrl4aht_data.format.schema import check_name
+from icrl4aht_data.format.schema import Count, FiniteNumber, StreamCount, check_name
 from icrl4aht_data.utils.files import parse_json, read_text
+from icrl4aht_data.utils.options import Share
 from icrl4aht_data.utils.text import counted_noun
 
-_Streams = Annotated[int, Meta(ge=0, lt=2**31)]
-_Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _Positive = Annotated[int, Meta(ge=1, le=2**63 - 1)]
-_Return = Annotated[float, Meta(gt=-1e15, lt=1e15)]
-_Share = Annotated[float, Meta(ge=0, le=1)]
 _Exponent = Annotated[float, Meta(gt=0, lt=1e15)]
 
 LabelView = Literal["ego", "state"]
@@ -37,7 +34,7 @@ class StreamReturns:
         return_end: mean over the last episodes.
     """
 
-    streams: _Streams
+    streams: StreamCount
     return_start: float
     return_end: float
 
@@ -54,7 +51,7 @@ class StreamFilter:
 
     before: StreamReturns
     after: StreamReturns
-    least_improvement: _Return | None = None
+    least_improvement: FiniteNumber | None = None
 
 
 @dataclass(frozen=True)
@@ -74,11 +71,11 @@ class ExpertLabels:
 
     policy_sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")] | None
     action: str
-    step: _Count | None = None
-    return_greedy: _Return | None = None
-    return_sampled: _Return | None = None
-    episodes: _Count | None = None
-    last_return_greedy: _Return | None = None
+    step: Count | None = None
+    return_greedy: FiniteNumber | None = None
+    return_sampled: FiniteNumber | None = None
+    episodes: Count | None = None
+    last_return_greedy: FiniteNumber | None = None
     view: LabelView | None = None
 
 
@@ -138,11 +135,11 @@ class ReferenceEgos:
             None for heuristics or if not measured.
     """
 
-    stay: _Return
-    random: _Return
-    oracle: _Return
+    stay: FiniteNumber
+    random: FiniteNumber
+    oracle: FiniteNumber
     episodes: _Positive
-    self_play: _Return | None = None
+    self_play: FiniteNumber | None = None
 
     @property
     def returns(self) -> dict[str, float]:
@@ -172,8 +169,8 @@ class NearestTest:
     """
 
     teammate: str
-    distance: _Share
-    behaviour: _Count | None = None
+    distance: Share
+    behaviour: Count | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,8 +217,8 @@ class Provenance:
     references: ReferenceEgos | None = None
     nearest_test: NearestTest | None = None
     teammate: dict[str, Any] | None = None
-    streams_recorded: _Streams | None = None
-    streams_kept: _Streams | None = None
+    streams_recorded: StreamCount | None = None
+    streams_kept: StreamCount | None = None
     filter: StreamFilter | None = None
     expert: ExpertLabels | None = None
     suite: TeammateSuite | None = None
@@ -315,10 +312,10 @@ class _NoiseSetting(msgspec.Struct):
 
     histories: _Positive | None = None
     episodes: _Positive | None = None
-    start: tuple[_Share, _Share] | None = None
-    end: tuple[_Share, _Share] | None = None
-    begin: tuple[_Share, _Share] | None = None
-    finish: tuple[_Share, _Share] | None = None
+    start: tuple[Share, Share] | None = None
+    end: tuple[Share, Share] | None = None
+    begin: tuple[Share, Share] | None = None
+    finish: tuple[Share, Share] | None = None
     power: tuple[_Exponent, _Exponent] | None = None
 
 

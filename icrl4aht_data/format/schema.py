@@ -151,10 +151,11 @@ _NAME_LENGTH = 512  # characters; limited because a name column is as wide as it
 _FINITE = 1e15  # sums of numbers below this stay finite
 
 _Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-_Row = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+StreamCount = Annotated[int, Meta(ge=0, lt=2**31)]
 _Name = Annotated[str, Meta(max_length=_NAME_LENGTH)]
-_Spans = Annotated[tuple[tuple[_Row, _Name], ...], Meta(min_length=1)]
-_Number = Annotated[float, Meta(gt=-_FINITE, lt=_FINITE)]
+_Spans = Annotated[tuple[tuple[Count, _Name], ...], Meta(min_length=1)]
+FiniteNumber = Annotated[float, Meta(gt=-_FINITE, lt=_FINITE)]
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
@@ -197,7 +198,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
 
     history_id: _Int
     task_id: _Name
-    env_idx: _Row
+    env_idx: Count
     T: Annotated[int, Meta(gt=0, lt=LONGEST)]
     obs_shape: tuple[int, int, int]
     action_dim: _Int
@@ -209,19 +210,19 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     h5_group: _Name
     has_teammate_actions: bool
     has_expert_actions: bool
-    h5_row: _Row | None
+    h5_row: Count | None
     shard: _Name
     seed: _Int
     episodes: Annotated[int, Meta(gt=0, lt=LONGEST)]
-    score: _Number
-    return_start: _Number
-    return_end: _Number
-    return_mean: _Number
+    score: FiniteNumber
+    return_start: FiniteNumber
+    return_end: FiniteNumber
+    return_mean: FiniteNumber
     source: _Name = "ppo"
-    expert_return: _Number | None = None
-    expert_return_sampled: _Number | None = None
-    expert_step: _Row | None = None
-    learner: _Row = 0
+    expert_return: FiniteNumber | None = None
+    expert_return_sampled: FiniteNumber | None = None
+    expert_step: Count | None = None
+    learner: Count = 0
     has_oracle_actions: bool = False
     label_view: _Name | None = None
     teammate_of_episode: _Spans | None = None

@@ -7,14 +7,16 @@ a digit = ingredient pile, a space = floor. Source: paper, App. A.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from string import digits
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.actions import ACTIONS
@@ -319,21 +321,38 @@ def get_layout(name: str) -> Layout:
     return layout
 
 
+class LayoutLine(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """One line of a file of layouts, see `format.layouts_file`.
+
+    Args:
+        name: the layout's name, which is also its environment name.
+        map: its rows.
+        recipes: triples of ingredient ids.
+        indicates_delivery: whether observations have the delivery channel.
+        family: family of generated layouts, or `layouts_file.OTHER`.
+        seed: seed of the family's sequence; None for a layout that was not generated.
+        number: number in that sequence.
+    """
+
+    name: str
+    map: tuple[str, ...]
+    recipes: Annotated[tuple[tuple[int, int, int], ...], Meta(min_length=1)]
+    indicates_delivery: bool
+    family: str
+    seed: int | None = None
+    number: int | None = None
+
+    def layout(self) -> Layout:
+        """Return the layout; see `Layout` for the errors."""
+        return Layout(self.name, self.name, self.map, self.recipes, self.indicates_delivery)
+
+
 @cache
 def _of_manifests() -> dict[str, Layout]:
     """Return the layouts of this package's own tasks that are not published: name -> layout."""
     path = Path(__file__).parent.parent / "manifests" / "layouts.jsonl"
-    lines = map(json.loads, path.read_text(encoding="utf-8").splitlines())
-    return {
-        line["name"]: Layout(
-            line["name"],
-            line["name"],
-            tuple(line["map"]),
-            tuple(map(tuple, line["recipes"])),  # type: ignore[arg-type]
-            line["indicates_delivery"],
-        )
-        for line in lines
-    }
+    lines = msgspec.json.Decoder(LayoutLine).decode_lines(path.read_bytes())
+    return {line.name: line.layout() for line in lines}
 
 
 @lru_cache(maxsize=1024)

@@ -21,7 +21,7 @@ from icrl4aht_data.overcooked.drawing import FOOTER, INK, PAPER, VIEW, Canvas, C
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import faults, record_size
 from icrl4aht_data.utils.files import atomic_write
-from icrl4aht_data.utils.install_hints import install_command
+from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.options import check_int
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def encode_episode(
         caption = f"step {step}" if math.isnan(reward) else f"step {step}   return {earned:g}"
         frames.append(_picture(layout, record, cell, caption, True))
         earned += reward
-    colours, dither = _shared_palette(frames), _pillow()[0].Dither.NONE
+    colours, dither = _shared_palette(frames), _pillow("Image").Dither.NONE
     first, *rest = (frame.quantize(palette=colours, dither=dither) for frame in frames)
     other = {"duration": round(1000 / fps), "loop": 0}
     palette = bytes(colours.getpalette() or [])  # an explicit palette is written once, not once per frame
@@ -107,12 +107,8 @@ def encode_episode(
     return content.getvalue()
 
 
-def _pillow():
-    try:
-        from PIL import Image, ImageDraw, ImageFont
-    except ImportError as error:
-        raise OptionError(f"drawing needs Pillow: {install_command('plot')}") from error
-    return Image, ImageDraw, ImageFont
+def _pillow(module: str) -> Any:
+    return import_optional(f"PIL.{module}", "drawing")
 
 
 def _require(fulfilled: bool, expected: str, found: object) -> None:
@@ -137,24 +133,24 @@ def _shared_palette(frames: list[Image.Image]) -> Image.Image:
     most = Counter()
     for frame in frames:
         most |= Counter({colour: count for count, colour in frame.getcolors(frame.width * frame.height) or []})
-    palette = _pillow()[0].new("P", (1, 1))
+    palette = _pillow("Image").new("P", (1, 1))
     palette.putpalette([value for colour, _ in most.most_common(_GIF_COLOURS) for value in colour])
     return palette
 
 
 @lru_cache(maxsize=32)
 def _font(pixels: int) -> Any:
-    return _pillow()[2].load_default(pixels)
+    return _pillow("ImageFont").load_default(pixels)
 
 
 class _Picture(Canvas):
     """Canvas that draws an enlarged Pillow image."""
 
     def __init__(self, width: float, height: float, cell: int) -> None:
-        image, draw, _ = _pillow()
         self.unit = cell * _ENLARGE
-        self.image = image.new("RGB", (round(width * cell) * _ENLARGE, round(height * cell) * _ENLARGE), PAPER)
-        self.pen = draw.Draw(self.image)
+        size = round(width * cell) * _ENLARGE, round(height * cell) * _ENLARGE
+        self.image = _pillow("Image").new("RGB", size, PAPER)
+        self.pen = _pillow("ImageDraw").Draw(self.image)
 
     def box(self, x: float, y: float, width: float, height: float, fill: tuple, radius: float = 0) -> None:
         left, top, wide, high = (self.unit * v for v in (x - width / 2, y - height / 2, width, height))

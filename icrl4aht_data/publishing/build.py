@@ -22,7 +22,7 @@ from icrl4aht_data.format.schema import (
     PARQUET_INDEX,
     RELEASE_CARD,
 )
-from icrl4aht_data.plotting import plot_layouts, plot_learning_curves
+from icrl4aht_data.plotting import plot_layouts, plot_learning_curves, save_figure
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
 from icrl4aht_data.utils.files import files_below, write_json
 from icrl4aht_data.utils.hashes import file_hash
@@ -73,7 +73,7 @@ def build_release(
         dataset = load_icrl4aht(source)
         (root / CURVES_FIGURE).parent.mkdir()
         plot_learning_curves(dataset, root / CURVES_FIGURE)
-        plot_layouts(dataset.layouts, root / LAYOUTS_FIGURE)
+        save_figure(plot_layouts(dataset.layouts), root / LAYOUTS_FIGURE, dpi=120)
         _add_parquet(dataset, root, advance)
         for name in _COPIED_TEXTS:
             shutil.copyfile(card_file(name), root / name)

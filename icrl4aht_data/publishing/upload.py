@@ -15,11 +15,9 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.publishing.build import check_valid, first_of
-from icrl4aht_data.utils.hashes import file_hash, git_hash
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
-    from huggingface_hub.hf_api import RepoFile
 
 _HUB_FILE = ".gitattributes"  # the Hub adds it to every repository
 _NOTHING_SENT = "nothing was sent: run the same command again"
@@ -97,19 +95,18 @@ def upload_release(
     if found is None:
         raise OptionError(f"{address!r}: expected hf://datasets/ORG/REPO; the revision is the data version's tag")
     check_valid(folder, advance)
-    hashes = read_manifest(folder) | {MANIFEST: file_hash(folder / MANIFEST)}
     api, repo, version = HfApi(), found[1], read_info(folder).data_version
-    sizes = {name: (folder / name).stat().st_size for name in sorted(hashes)}
+    sizes = {name: (folder / name).stat().st_size for name in sorted([*read_manifest(folder), MANIFEST])}
     plan = Upload(repo, f"v{version}", f"{api.endpoint}/datasets/{repo}", sizes)
     with _wrap_hub_errors(plan, api, _NOTHING_SENT):
-        plan = _plan(api, plan, folder, hashes, private)
+        plan = _plan(api, plan, folder, private)
     if dry_run or plan.done == "already there":
         return plan
     with _wrap_hub_errors(plan, api, _KEPT):
-        return _send(api, plan, folder, hashes)
+        return _send(api, plan, folder)
 
 
-def _plan(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str], private: bool) -> Upload:
+def _plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upload:
     """Complete the plan with the repository's state, without changing the repository."""
     from huggingface_hub.errors import RepositoryNotFoundError
 
@@ -119,7 +116,7 @@ def _plan(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str], pri
         return replace(plan, creates=True, private=private)
     commit = next((reference.target_commit for reference in refs.tags if reference.name == plan.tag), None)
     if commit is not None:
-        if differences := _differences(_tree(api, plan.repo, commit), folder, hashes):
+        if differences := _differences(api, plan, commit, folder):
             raise UploadError(
                 f"{plan.repo}: tag {plan.tag} has other content: {first_of(differences)}; tags do not move: give the "
                 "data another data version"
@@ -127,11 +124,11 @@ def _plan(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str], pri
         return replace(plan, done="already there", commit=commit)
     if private and not api.repo_info(plan.repo, repo_type="dataset").private:
         raise UploadError(f"{plan.repo}: is public; make it private in its settings, or give another repository")
-    present = _tree(api, plan.repo, "main").keys()
-    foreign = sorted(present - hashes.keys())
+    present = _present(api, plan.repo, "main")
+    foreign = sorted(present - plan.files.keys())
     listed: Mapping[str, str] = {}
     if foreign and MANIFEST in present:
-        listed = read_manifest(Path(api.hf_hub_download(plan.repo, MANIFEST, repo_type="dataset")).parent)
+        listed = read_manifest(_manifest(api, plan.repo, "main").parent)
     if unknown := [name for name in foreign if name not in listed]:
         raise UploadError(
             f"{plan.repo}: has {len(unknown)} files that belong to no release, such as {unknown[0]}: expected an empty "
@@ -140,7 +137,7 @@ def _plan(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str], pri
     return replace(plan, private=private, deletes=foreign)
 
 
-def _send(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str]) -> Upload:
+def _send(api: HfApi, plan: Upload, folder: Path) -> Upload:
     """Upload the files of a plan, compare the repository with the release, and tag the commit."""
     repo = plan.repo
     if plan.creates:
@@ -149,7 +146,7 @@ def _send(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str]) -> 
     options = {"folder_path": folder, "commit_message": message, "delete_patterns": plan.deletes or None}
     api.upload_folder(repo_id=repo, repo_type="dataset", **options)
     commit = api.repo_info(repo, repo_type="dataset").sha or "main"
-    if differences := _differences(_tree(api, repo, commit), folder, hashes):
+    if differences := _differences(api, plan, commit, folder):
         raise UploadError(
             f"{repo}: after the upload, commit {commit} is not the release: {first_of(differences)}; it was not "
             "tagged; run the same command again"
@@ -158,30 +155,24 @@ def _send(api: HfApi, plan: Upload, folder: Path, hashes: Mapping[str, str]) -> 
     return replace(plan, done="uploaded", commit=commit)
 
 
-def _tree(api: HfApi, repo: str, revision: str) -> dict[str, RepoFile]:
-    """Return path -> size and hashes of the file on the Hub."""
-    from huggingface_hub.hf_api import RepoFile
-
-    listed = api.list_repo_tree(repo, recursive=True, revision=revision, repo_type="dataset")
-    return {entry.path: entry for entry in listed if isinstance(entry, RepoFile) and entry.path != _HUB_FILE}
-
-
-def _differences(tree: Mapping[str, RepoFile], folder: Path, hashes: Mapping[str, str]) -> list[str]:
-    """Return the differences between a tree of the repository and the release.
-
-    The Hub knows large files by SHA-256, and others by Git's hash.
-    """
-    differences = [f"{name}: not in the release" for name in sorted(tree.keys() - hashes.keys())]
-    differences += [f"{name}: missing" for name in hashes if name not in tree]
-    for name in hashes.keys() & tree.keys():
-        large, expected, found = tree[name].lfs, hashes[name], tree[name].blob_id
-        if large is None:
-            expected = git_hash((folder / name).read_bytes())
-        else:
-            found = large.sha256
-        if found != expected:
-            differences.append(f"{name}: expected hash {expected}, found {found}")
+def _differences(api: HfApi, plan: Upload, revision: str, folder: Path) -> list[str]:
+    """Return the differences between a revision of the repository and the release, by names and by the manifest."""
+    present = _present(api, plan.repo, revision)
+    differences = [f"{name}: not in the release" for name in sorted(present - plan.files.keys())]
+    differences += [f"{name}: missing" for name in plan.files if name not in present]
+    if MANIFEST in present and _manifest(api, plan.repo, revision).read_bytes() != (folder / MANIFEST).read_bytes():
+        differences.append(f"{MANIFEST}: has other hashes")
     return differences
+
+
+def _present(api: HfApi, repo: str, revision: str) -> set[str]:
+    """Return the paths of the repository's files."""
+    return {name for name in api.list_repo_files(repo, revision=revision, repo_type="dataset") if name != _HUB_FILE}
+
+
+def _manifest(api: HfApi, repo: str, revision: str) -> Path:
+    """Return the path of the repository's manifest, fetched into the Hub's cache."""
+    return Path(api.hf_hub_download(repo, MANIFEST, revision=revision, repo_type="dataset"))
 
 
 @contextmanager

@@ -22,7 +22,6 @@ from icrl4aht_data.format.schema import FIELDS, Entry, Kind, held_fields
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.reading.shard import Shard, Shards
 from icrl4aht_data.utils.system import free_memory, gigabytes, in_slices
-from icrl4aht_data.utils.text import counted_histories, counted_noun
 
 CacheMode = Literal["auto", "ram", "mmap", "stream"]
 CACHE_MODES: tuple[CacheMode, ...] = ("auto", "ram", "mmap", "stream")
@@ -184,10 +183,6 @@ class FlatSource:
         self._first = {axis: np.zeros(len(entries), np.intp) for axis in ("T", "E")}
         self._rows = {"T": np.array([e.T for e in entries]), "E": np.array([e.episodes for e in entries])}
 
-    def __repr__(self) -> str:
-        size = gigabytes(sum(array.nbytes for of_layout in self._arrays for array in of_layout.values()))
-        return f"{type(self).__name__}({counted_histories(len(self._ids))}, {size} decoded)"
-
     def add(self, members: Sequence[Entry], arrays: dict[str, np.ndarray]) -> None:
         """Add the arrays of one layout's histories, sorted by id."""
         ids = np.array([entry.history_id for entry in members])
@@ -260,10 +255,6 @@ class StreamedSource:
 
     def __init__(self, entries: Sequence[Entry], shards: Shards, threads: int) -> None:
         self._entries, self._shards, self._threads = entries, shards, threads
-
-    def __repr__(self) -> str:
-        shards = counted_noun(len({entry.shard for entry in self._entries}), "shard")
-        return f"{type(self).__name__}({counted_histories(len(self._entries))} in {shards})"
 
     def read(self, requests: Sequence[ReadRequest]) -> None:
         positions = {position for request in requests for position in request.histories.tolist()}

@@ -11,9 +11,15 @@ from icrl4aht_data.benchmark.facts import all_families
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.selection import Selection
 from icrl4aht_data.reading.sources import ReadRequest
-from icrl4aht_data.sampling.base import Sampler, SamplerOptions, batch_repr, describe_batch
+from icrl4aht_data.sampling.base import (
+    Sampler,
+    SamplerOptions,
+    batch_repr,
+    check_labels,
+    describe_batch,
+    warn_of_weak_labels,
+)
 from icrl4aht_data.sampling.draws import scale_to_range, weighted_choice
-from icrl4aht_data.sampling.labels import check_labels, warn_of_weak_labels
 from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.options import check_int
 

@@ -157,8 +157,8 @@ def sync(path: Path) -> None:
 
 
 def final_name(name: str) -> str:
-    """Return the final path of a temporary file of `atomic_write`; other paths are unchanged."""
-    return re.sub(r"(^|/)\.([^/]+)\.partial$", r"\1\2", name)
+    """Return the final path of a temporary file of `atomic_write` or of a lock; other paths are unchanged."""
+    return re.sub(r"(^|/)\.([^/]+)\.(partial|lock)$", r"\1\2", name)
 
 
 @contextmanager

@@ -18,11 +18,6 @@ def short_hash(data: bytes, digits: int = 16) -> str:
     return hashlib.sha256(data).hexdigest()[:digits]
 
 
-def git_hash(content: bytes) -> str:
-    """Return Git's blob hash of a file, hexadecimal, by which the Hub identifies small files."""
-    return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
-
-
 def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
     """Return whether all files of a folder (path -> SHA-256) have the given hashes.
 

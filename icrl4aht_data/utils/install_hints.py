@@ -12,7 +12,7 @@ PACKAGE = "icrl4aht-data"
 
 EXTRAS = {
     **dict.fromkeys(("jax", "flax", "optax", "jaxtyping", "safetensors"), "baselines"),
-    **dict.fromkeys(("matplotlib", "pillow"), "plot"),
+    **dict.fromkeys(("matplotlib", "pillow", "pil"), "plot"),
     **dict.fromkeys(("datasets", "pyarrow", "mlcroissant"), "hf"),
     **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari")},
     "tensorboardx": "tensorboard",
@@ -45,11 +45,11 @@ def import_optional(module: str, purpose: str) -> Any:
         return import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
-        raise OptionError(f"{purpose} needs {package}: {install_command(EXTRAS[package])}") from error
+        raise OptionError(f"{purpose} needs {package}: {install_command(EXTRAS[package.lower()])}") from error
 
 
 def missing_library(module: str) -> str | None:
     """Return a message that says how to install a missing module; None if no extra installs it."""
     top = module.partition(".")[0]
-    extra = EXTRAS.get({"PIL": "pillow"}.get(top, top.lower()))
+    extra = EXTRAS.get(top.lower())
     return f"this needs {top}, which is not installed: {install_command(extra)}" if extra else None

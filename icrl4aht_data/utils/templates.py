@@ -12,7 +12,7 @@ from icrl4aht_data.utils.install_hints import RESTORE
 _PACKAGE = Path(__file__).parent.parent
 
 
-def card_file(name: str, package: Path = _PACKAGE) -> Path:
+def card_file(name: str) -> Path:
     """Return the path of a template, table, licence or citation.
 
     An installed package contains the folder `cards`. In a checkout, `cards` is next to the package, and LICENSE and
@@ -20,15 +20,14 @@ def card_file(name: str, package: Path = _PACKAGE) -> Path:
 
     Args:
         name: file name.
-        package: folder of the package.
 
     Raises:
         OptionError: if the file is missing.
     """
-    for folder in (package / "cards", package.parent / "cards", package.parent):
+    for folder in (_PACKAGE / "cards", _PACKAGE.parent / "cards", _PACKAGE.parent):
         if (folder / name).is_file():
             return folder / name
-    raise OptionError(f"{package / 'cards' / name}: missing; restore it: `{RESTORE}`")
+    raise OptionError(f"{_PACKAGE / 'cards' / name}: missing; restore it: `{RESTORE}`")
 
 
 def fill_template(template: str, **values: str) -> str:

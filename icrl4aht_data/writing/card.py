@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
@@ -129,13 +130,9 @@ class _TaskFacts:
         return teammate_name(self.task) if self.task else self.first.teammate_kind
 
     @property
-    def last(self) -> float:
-        """Mean return of the last episodes."""
-        return _mean(entry.return_end for entry in self.histories)
-
-    @property
     def has_weak_labels(self) -> bool:
-        return bool(are_labels_weak(self.first.expert_return, self.last))
+        last = _mean(entry.return_end for entry in self.histories)
+        return bool(are_labels_weak(self.first.expert_return, last))
 
 
 def facts(root: Path) -> dict[str, Any]:
@@ -204,10 +201,10 @@ def _mean(values: Iterable[float]) -> float:
     return float(np.mean(list(values)))
 
 
-def _span(values: Iterable[float], digits: int = 0) -> str:
+def _span(values: Iterable[float]) -> str:
     """Return the range of some values as text, such as "3" or "3 to 5"; empty without values."""
     found = list(values)
-    ends = [f"{end:z,.{digits}f}" for end in (min(found), max(found))] if found else []
+    ends = [f"{end:z,.0f}" for end in (min(found), max(found))] if found else []
     return " to ".join(dict.fromkeys(ends))
 
 
@@ -224,20 +221,13 @@ def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str,
     return configs
 
 
-def _grouped(tasks: Iterable[_TaskFacts], *names: str) -> dict[tuple[str, ...], list[_TaskFacts]]:
-    """Group tasks by the values of some index fields, in the usual order of sources and splits."""
+def _learning(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return rows on the rise of returns, one for each title of layouts, source and split, in their usual order."""
+    names = ("layout", "source", "split")
+    order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # other sources by first appearance
     groups = defaultdict[tuple[str, ...], list[_TaskFacts]](list)
-    for task in tasks:
-        groups[tuple(getattr(task.first, name) for name in names)].append(task)
-    order = [*SOURCES, *SPLITS, *(value for key in groups for value in key)]  # others by first appearance
-    return {key: groups[key] for key in sorted(groups, key=lambda key: list(map(order.index, key)))}
-
-
-def _learning(tasks: Iterable[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return rows on the rise of returns, one for each title of layouts, source and split."""
-    groups, names = defaultdict[tuple[str, ...], list[_TaskFacts]](list), ("layout", "source", "split")
-    for (layout, *rest), own in _grouped(tasks, *names).items():
-        groups[titles[layout], *rest] += own
+    for task in sorted(tasks, key=lambda task: [order.index(getattr(task.first, name)) for name in names]):
+        groups[titles[task.first.layout], task.first.source, task.first.split].append(task)
     rows = []
     for key, own in groups.items():
         entries = [entry for task in own for entry in task.histories]
@@ -379,3 +369,18 @@ def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
         "has_policies": any(task.made.expert and task.made.expert.policy_sha256 for task in tasks),
         "versions": "; ".join(f"{label} {values}" for label, values in versions.items() if values),
     }
+
+
+def print_learning(content: Mapping[str, Any], console: Console) -> None:
+    """Print the card's table of learning curves, and the tasks that were left out.
+
+    Args:
+        content: result of `card.facts`.
+        console: console to print to.
+    """
+    lines = ["Mean returns of the first and the last tenth of the episodes, and numbers of histories:"]
+    lines.append(markdown_table(["layout", "split", *content["sources"]], content["curves"]))
+    for task in content["left_out"]:
+        source = f" ({task['source']})" if task["source"] else ""
+        lines.append(f"left out: {task['layout']} with {task['teammate']}{source}: {task['reason']}")
+    console.print(*lines, sep="\n", markup=False, highlight=False, soft_wrap=True)

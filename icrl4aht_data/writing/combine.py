@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE
+from icrl4aht_data.writing.convert import release_tasks, stored_task
 from icrl4aht_data.writing.release import NewTask, write_release
 from icrl4aht_data.writing.release_folder import as_path, check_target
-from icrl4aht_data.writing.stored import release_tasks, stored_task
 
 
 def combine_releases(
@@ -24,7 +23,6 @@ def combine_releases(
     data_version: str | None = None,
     *,
     overwrite: bool = False,
-    done: Callable[[Task], None] = lambda task: None,
 ) -> Path:
     """Combine releases, or selections of their histories, into one release, in order and renumbered.
 
@@ -35,7 +33,6 @@ def combine_releases(
         roots: releases of the same kind and episode length without common tasks; a `Dataset` for a part of one.
         data_version: version of the combination; by default the common version of the releases.
         overwrite: replace a release at `target`.
-        done: called when the histories of a task are written.
 
     Raises:
         OptionError: if the releases differ in kind or environment, or share a task; if `data_version` is not SemVer; if
@@ -66,7 +63,6 @@ def combine_releases(
         left_out=[task for task in left_out if task.task_id not in written],
         overwrite=overwrite,
         sources=[dataset.root for dataset in datasets],
-        done=done,
     )
 
 

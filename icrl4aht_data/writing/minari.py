@@ -32,9 +32,9 @@ from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.utils.install_hints import install_command
+from icrl4aht_data.utils.install_hints import import_optional
+from icrl4aht_data.writing.convert import HistoryProgress
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
-from icrl4aht_data.writing.stored import HistoryProgress
 
 _NAME = re.compile(r"[\w.-]+-v\d+")
 _INFOS = {name: name.removesuffix("s") for name in ACTION_FIELDS if name != "actions"}
@@ -63,12 +63,8 @@ def to_minari(
             see `release_folder.check_target`.
         NotStoredError: if the release has no state records, and so no observations after the last steps.
     """
-    try:
-        import minari
-        from gymnasium import spaces
-        from minari.dataset.minari_storage import MinariStorage
-    except ImportError as error:
-        raise OptionError(f"Minari is needed: {install_command('minari')}") from error
+    minari, spaces = import_optional("minari", "Minari"), import_optional("gymnasium.spaces", "Minari")
+    storage_module = import_optional("minari.dataset.minari_storage", "Minari")
     target = as_path(target)
     if not dataset.has_states:
         raise NotStoredError(
@@ -81,7 +77,7 @@ def to_minari(
     about = _describe(dataset)
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
         (folder / "data").mkdir()
-        storage = MinariStorage.new(
+        storage = storage_module.MinariStorage.new(
             folder / "data",
             spaces.Box(0, 255, observation_shape(dataset.layouts[0], canonical), np.uint8),
             spaces.Discrete(len(ACTIONS)),

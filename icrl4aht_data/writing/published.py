@@ -43,11 +43,11 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import add_filename, resolve_inside, write_json
 from icrl4aht_data.utils.options import check_int
+from icrl4aht_data.writing.convert import HistoryProgress
 from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
 from icrl4aht_data.writing.published_views import PADDING, complete_views, is_short
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, as_path, atomic_folder, check_target
-from icrl4aht_data.writing.stored import HistoryProgress
 
 PUBLISHED_CHUNK = 4096
 """Steps per chunk in the published files."""

@@ -17,7 +17,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
 from icrl4aht_data.errors import OptionError, check_choice
-from icrl4aht_data.format.info import LeftOutTask, check_version, describe
+from icrl4aht_data.format.info import LeftOutTask, check_version, describe, layout_statistics
 from icrl4aht_data.format.layouts_file import write_layouts
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
@@ -46,7 +46,6 @@ from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.writing.card import write_card
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 from icrl4aht_data.writing.shard_writer import EncodedChunk, encode_history, write_shard
-from icrl4aht_data.writing.statistics import layout_statistics
 
 SHARD_BYTES = 256 * 2**20
 """Intended size of a shard in bytes."""
@@ -165,37 +164,24 @@ def write_release(
         for name, source in chain(files.items(), *(one.files.items() for one in new)):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, root / name)
-        _write_meta(root, kind, new, writer.entries, data_version, kept_steps, left_out)
+        with (root / HISTORIES).open("w", encoding="utf-8") as stream:
+            stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in writer.entries)
+        write_layouts(root, [get_layout(one.task.layout_name) for one in new])  # not with the recipes of a task
+        known = [] if named else [one.task for one in new]
+        write_tasks(root / TASKS, known)
+        provenance = {one.task.task_id: one.provenance for one in new}
+        write_json(root / PROVENANCE, {task_id: of_task.to_json() for task_id, of_task in provenance.items()})
+        sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in writer.entries)}
+        statistics = layout_statistics(writer.entries, known, provenance, kept_steps, sizes)
+        info = describe(kind, data_version, kept_steps, writer.entries)
+        info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
+        write_json(root / INFO, info.to_json())
         if card is None:
             write_card(root)
         else:
             (root / RELEASE_CARD).write_text(card, encoding="utf-8")
         write_manifest(root)
     return target
-
-
-def _write_meta(
-    root: Path,
-    kind: Kind,
-    new: list[NewTask],
-    entries: list[Entry],
-    data_version: str,
-    kept_steps: int,
-    left_out: Sequence[LeftOutTask],
-) -> None:
-    """Write the files of meta/: index, tasks, provenance and info."""
-    with (root / HISTORIES).open("w", encoding="utf-8") as stream:
-        stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in entries)
-    write_layouts(root, [get_layout(one.task.layout_name) for one in new])  # not with the recipes of a task
-    tasks = [one.task for one in new if not isinstance(one.task, NamedTask)]
-    write_tasks(root / TASKS, tasks)
-    provenance = {one.task.task_id: one.provenance for one in new}
-    write_json(root / PROVENANCE, {task_id: of_task.to_json() for task_id, of_task in provenance.items()})
-    sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in entries)}
-    statistics = layout_statistics(entries, tasks, provenance, kept_steps, sizes)
-    info = describe(kind, data_version, kept_steps, entries)
-    info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
-    write_json(root / INFO, info.to_json())
 
 
 @dataclass

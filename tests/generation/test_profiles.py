@@ -18,7 +18,7 @@ from icrl4aht_generation.teammates.registry import heuristic_teammate
 from icrl4aht_generation.teammates.spread import LayoutSpread, SpreadTeammate, spread_teammates
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, PREFERENCE_LAYOUTS, SCRIPTED_SOURCES, TRACKS
-from icrl4aht_data.benchmark.tasks import make_task, read_tasks, task_fields, task_id, write_tasks
+from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, task_fields, task_id, write_tasks
 from icrl4aht_data.errors import OptionError, TaskFormatError, UnknownNameError
 
 VALID = """
@@ -329,7 +329,8 @@ def test_unknown_profile_name():
 
 def test_an_id_depends_on_every_part_of_its_task():
     def hashed(track="teammate", split="train", layout="demo_cook_wide", preset="default", theta_id=0, seed=0) -> str:
-        return task_id(track, split, layout, heuristic_teammate("utility_greedy", preset, theta_id), seed)[-8:]
+        teammate = heuristic_teammate("utility_greedy", preset, theta_id)
+        return task_id(Task("", track, split, layout, seed, teammate))[-8:]
 
     others = [hashed("layout"), hashed(split="test"), hashed(layout="demo_cook_simple"), hashed(preset="high_inertia")]
     others += [hashed(theta_id=1), hashed(seed=1)]

@@ -27,7 +27,6 @@ from huggingface_hub.utils import _http
 from icrl4aht_data import clients, load_icrl4aht, verify_release
 from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.commands.cli import cli
-from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.errors import (
     Icrl4ahtError,
     IndexFormatError,
@@ -37,6 +36,7 @@ from icrl4aht_data.errors import (
     RootNotFoundError,
     UnknownNameError,
 )
+from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from tests.helpers.batches import assert_equal
@@ -216,7 +216,7 @@ def test_folders_with_other_content_are_refused(lite, full, tmp_path):
 KILLED = """
 import sys
 from pathlib import Path
-from icrl4aht_data.download import fetch_planned, plan_download
+from icrl4aht_data.fetch import fetch_planned, plan_download
 fetch_planned(plan_download(sys.argv[1], to=Path(sys.argv[2]) if len(sys.argv) > 2 else None))
 """
 

@@ -22,8 +22,8 @@ import pytest
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError
+from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format import columns
 from icrl4aht_data.format.manifest import parse_manifest, read_manifest, write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, held_fields
@@ -259,7 +259,7 @@ def start(code: str, *arguments: object) -> subprocess.Popen[str]:
 import sys
 from pathlib import Path
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.download import fetch_planned, plan_download
+from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.fetch import open_root
 from icrl4aht_data.format import columns
 columns._UNCACHED = 0

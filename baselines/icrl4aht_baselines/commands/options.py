@@ -31,8 +31,8 @@ from icrl4aht_data.commands.options import (
     TRACK,
     Folder,
     Names,
-    ReleaseLayoutName,
     Root,
+    checked_later,
 )
 from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -42,13 +42,6 @@ from icrl4aht_data.utils.options import Positive
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
     """Return a function that imports a module and returns one of its attributes, since importing JAX takes seconds."""
     return lambda: getattr(import_module(module), name)
-
-
-class EgoName(Names):
-    """Name of a reference ego, or folder of a run; checked by `find_ego`."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        return value
 
 
 def find_ego(option: str, value: str, **mode: Any) -> Any:
@@ -82,10 +75,9 @@ class HostPort(click.ParamType):
         return value
 
 
-EGO_NAME = EgoName("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names())
-TRAINING_LAYOUT = ReleaseLayoutName(
-    "layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], lambda: [ALL_LAYOUTS, *LAYOUT.offered()]
-)
+EGO_NAME = Names("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names(), checked_later)
+"""Name of a reference ego, or folder of a run; checked by `find_ego`."""
+TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], checked_later)
 METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())
 _HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
 _playing = lazy_attribute("icrl4aht_baselines.methods.registry", "PLAYING")

@@ -16,8 +16,7 @@ from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import check_own_folder, process_lock
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.writing.card import facts as release_facts
-from icrl4aht_data.writing.card import teammate_name
-from icrl4aht_data.writing.statistics import print_learning
+from icrl4aht_data.writing.card import print_learning, teammate_name
 from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.jobs.job import FAILED, FailedJobsError
 from icrl4aht_generation.jobs.options import QueueOptions

@@ -22,7 +22,7 @@ from icrl4aht_data.format.layouts_file import layout_title
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
 from icrl4aht_data.format.schema import Kind, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
-from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
+from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves, save_figure
 from icrl4aht_data.writing.card import CURVES_FIGURE
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
@@ -103,7 +103,7 @@ def package_release(
         omitted += unhosted_families(profile.layouts)
     with TemporaryDirectory() as folder:
         files = {CURVES_FIGURE: Path(folder) / "curves.png"}
-        plot_source_curves(curves, files[CURVES_FIGURE])
+        save_figure(plot_source_curves(curves), files[CURVES_FIGURE], dpi=80)
         version, done = profile.data_version, lambda task: advance(1)
         return write_release(
             target, kind, new, data_version=version, left_out=omitted, files=files, overwrite=True, done=done

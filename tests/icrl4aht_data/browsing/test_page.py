@@ -15,8 +15,14 @@ from hypothesis import strategies as st
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
 from icrl4aht_data.browsing.drawings import ShapeRecorder, layout_drawings
-from icrl4aht_data.browsing.embedding import NO_ACTION, embed_history, spread_episodes, spread_histories
-from icrl4aht_data.browsing.page import PAGE_START, make_browser_page
+from icrl4aht_data.browsing.page import (
+    NO_ACTION,
+    PAGE_START,
+    embed_history,
+    make_browser_page,
+    spread_episodes,
+    spread_histories,
+)
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError, UnknownNameError
 from icrl4aht_data.format.layouts_file import layout_title

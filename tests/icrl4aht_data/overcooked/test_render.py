@@ -153,6 +153,6 @@ def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):
 
 
 def test_without_pillow_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "PIL", None)
+    monkeypatch.setitem(sys.modules, "PIL.Image", None)
     with pytest.raises(OptionError, match=re.escape(install_command("plot"))):
         draw_frame(COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up"))[0])

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import io
+import math
 import threading
 import time
 
 import pytest
-from rich.console import Console
+from rich.progress import Progress
 
 from icrl4aht_data.utils import progress
-from icrl4aht_data.utils.progress import PlainLines, counted, progress_bars
+from icrl4aht_data.utils.progress import counted, progress_bars, progress_line
 
 
 class Clock:
@@ -33,34 +33,32 @@ class Clock:
     ],
 )
 def test_a_line_has_count_speed_and_time_left(seconds, expected):
-    clock, output = Clock(), io.StringIO()
-    lines = PlainLines(Console(file=output, width=20), "steps", clock=clock)
-    for number in range(10):
-        lines.show("x", number, 1000, "loss 1.5")
-        clock.wait(seconds if number < 9 else 0)
-    lines.print_lines()
-    assert output.getvalue() == f"x: {expected}\n"
+    clock = Clock()
+    bars = Progress(get_time=clock, speed_estimate_period=math.inf)
+    number = bars.add_task("x", total=1000, note="")
+    for done in range(10):
+        bars.update(number, completed=done, note=": loss 1.5")
+        clock.wait(seconds if done < 9 else 0)
+    assert progress_line(bars.tasks[0], "steps", False) == f"x: {expected}"
 
 
 def test_resumed_work_does_not_count_as_speed():
-    clock, output = Clock(), io.StringIO()
-    lines = PlainLines(Console(file=output), clock=clock)
-    lines.show("x", 900, 1000)
-    lines.print_lines()
+    clock = Clock()
+    bars = Progress(get_time=clock, speed_estimate_period=math.inf)
+    number = bars.add_task("x", total=1000, note="")
+    bars.update(number, completed=900)
+    assert progress_line(bars.tasks[0], "", False) == "x: 900 of 1,000 (90 %) after 0 s"
     clock.wait(10)
-    lines.show("x", 910, 1000)
-    lines.show("finished", 4, 4)
-    lines.show("of unknown size", 4, None)
-    lines.print_lines()
-    assert output.getvalue().splitlines() == [
-        "x: 900 of 1,000 (90 %) after 0 s",
-        "x: 910 of 1,000 (91 %) after 10 s, 1.0 per second, 2 min left",
-    ]
+    bars.update(number, completed=910)
+    expected = "x: 910 of 1,000 (91 %) after 10 s, 1.0 per second, 2 min left"
+    assert progress_line(bars.tasks[0], "", False) == expected
 
 
 def test_a_thread_prints_lines_on_stderr_while_a_step_takes_long(monkeypatch, capsys):
     monkeypatch.setattr(progress, "FIRST_LINE_SECONDS", 0.02)
     with progress_bars(of_bytes=True) as show:
+        show("finished", 4, 4)
+        show("of unknown size", 4, None)
         show("download", 3_000_000, 10_000_000)
         printed = ""
         for _ in range(500):

@@ -17,8 +17,8 @@ import numpy as np
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
-from icrl4aht_data.download import fetch_planned, plan_download
 from icrl4aht_data.errors import Icrl4ahtError
+from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, TEAMMATES
 from icrl4aht_data.utils.files import files_below

@@ -130,7 +130,8 @@ def theta(**changes: Any) -> Spoil:
         tasks = [Task(**json.loads(line)) for line in (root / TASKS).read_text().splitlines()]
         old = next(task for task in tasks if task.teammate["kind"] == "rl")
         mate = old.teammate | {"theta": old.teammate["theta"] | changes}
-        new = replace(old, teammate=mate, task_id=task_id(old.track, old.split, old.layout_name, mate, old.seed))
+        new = replace(old, teammate=mate)
+        new = replace(new, task_id=task_id(new))
         changed = [new if task is old else task for task in tasks]
         (root / TASKS).write_text("".join(json.dumps(asdict(task)) + "\n" for task in changed))
         for name in (HISTORIES, PROVENANCE):
