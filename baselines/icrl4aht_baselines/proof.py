@@ -74,12 +74,12 @@ class ProofOptions:
 
     Attributes:
         root: folder or address of a release; None for the bundled one.
-        steps, batch_size, context: see `TrainOptions`. With the defaults a training takes about 20 minutes on a core.
+        steps, batch_size, context: see `TrainOptions`. With the defaults a training takes about 10 minutes on a core.
         tasks: set of tasks -> its tasks; by default the validation tasks of a track in which the ego matters.
     """
 
     root: str | None = None
-    steps: int = 1500
+    steps: int = 1000
     batch_size: int = 16
     context: int = 500
     tasks: dict[str, tuple[Task, ...]] | None = None
