@@ -14,14 +14,13 @@ from click.core import ParameterSource
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_OPTIONS, ModelOptions
 from icrl4aht_baselines.training.options import (
     ALL_LAYOUTS,
-    SAVE_MINUTES,
     HistoryOptions,
     PlayOptions,
     TrainOptions,
 )
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options, topic
+from icrl4aht_data.commands.dataclass_options import dataclass_options, topic
 from icrl4aht_data.commands.options import (
     COUNT,
     COUNT_OR_NONE,
@@ -36,7 +35,6 @@ from icrl4aht_data.commands.options import (
 )
 from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.options import Positive
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
@@ -117,18 +115,33 @@ greedy_option = click.option(
     show_default="greedy; a bundled model's own, see `models`",
 )
 EVALUATION_SPLIT = Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS"))
-track_option = click.option(
-    "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
-)
 only_layouts_option = click.option(
     "--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several."
 )
-manifest_option = click.option(
-    "--manifest",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
-    help="Tasks of this file instead of the tracks' tasks.",
+_MANIFEST: Any = {"type": click.Path(path_type=Path, exists=True, dir_okay=False), "metavar": "FILE"}
+tasks_options = (
+    click.option(
+        "--track",
+        type=TRACK,
+        multiple=True,
+        default=tuple(TRACKS),
+        help="Only of this track; repeat for several.",
+    ),
+    click.option(
+        "--split",
+        type=EVALUATION_SPLIT,
+        multiple=True,
+        default=("test",),
+        help="Which tasks: test, or validation and diverse, by which models are chosen; repeat for several.",
+    ),
+    only_layouts_option,
+    click.option(
+        "--family", "families", type=FAMILY, multiple=True, help="Only with teammates of this family; repeat."
+    ),
+    click.option("--manifest", **_MANIFEST, help="Tasks of this file instead of the tracks' tasks."),
 )
+"""Options that choose tasks; `chosen_tasks` takes their values."""
+
 evaluation_split_option = click.option(
     "--split",
     type=EVALUATION_SPLIT,
@@ -149,12 +162,6 @@ suite_option = click.option(
 tensorboard_option = click.option(
     "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
 )
-save_minutes_option = click.option(
-    "--save-minutes",
-    type=OptionValue(Positive),
-    default=SAVE_MINUTES,
-    help="Most minutes between checkpoints, which are also written every --save-every steps.",
-)
 gifs_option = click.option(
     "--gifs/--no-gifs", default=True, help="The first and last episode with each family on the page."
 )
@@ -164,26 +171,29 @@ root_option = click.option(
 
 
 def chosen_tasks(
-    track: Iterable[str],
-    splits: Iterable[str],
-    layouts: Iterable[str],
+    track: Sequence[str],
+    split: Sequence[str],
+    layouts: Sequence[str],
+    families: Sequence[str],
     manifest: Path | None,
-    families: Iterable[str] = (),
 ) -> list[Task]:
-    """Return the tasks that options choose: those of a manifest, or of tracks and splits in the package.
+    """Return the tasks that `tasks_options` choose: those of a manifest, or of tracks and splits in the package.
 
     Raises:
         EmptySelectionError: if there is none on these layouts with these families.
+        click.UsageError: for a manifest, whose tasks have splits of their own, together with a split.
     """
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 
-    bundled = ((name, split) for split in splits for name in track)
+    if manifest:
+        check_alone("--manifest", "split")
+    bundled = ((name, of_split) for of_split in split for name in track)
     given = read_tasks(manifest) if manifest else [task for each in bundled for task in bundled_tasks(*each)]
     names = {get_layout(name).name for name in layouts}
     chosen = [task for task in given if not names or task.layout.name in names]
     chosen = [task for task in chosen if not families or task.teammate_family in families]
     if not chosen:
-        found = manifest or f"the tasks of split {' and '.join(splits)}"
+        found = manifest or f"the tasks of split {' and '.join(split)}"
         wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in (("on", names), ("with", families)) if of)
         raise EmptySelectionError(f"no task{wanted} in {found}: choose another --layout or --family, or none")
     return chosen
@@ -201,8 +211,7 @@ history_filters = dataclass_options(HistoryOptions, "filters", exclude=_NO_FILTE
 manifests_option = click.option(
     "--manifest",
     "manifests",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
+    **_MANIFEST,
     multiple=True,
     help="Also play with the teammates of this file's tasks, heuristics; repeat for several.",
 )

@@ -36,13 +36,12 @@ MEASURED_EPISODES = 100
 _MEASURE_SEED = 1_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HeadroomJob(TrainingJob):
-    """The training of an informed or episodic ego on a set of tasks.
+    """The training of an informed or episodic ego on a set of tasks, at most as many as are played at once.
 
     Attributes:
         title: name of the set of tasks.
-        tasks: the tasks, at most as many as are played at once.
         kind: "informed" or "episodic".
 
     Raises:
@@ -50,12 +49,7 @@ class HeadroomJob(TrainingJob):
     """
 
     title: str
-    tasks: tuple[Task, ...]
     kind: EgoKind
-    seed: int
-    options: ResponseOptions
-    out: Path
-    xla_threads: int | None = 1
 
     def __post_init__(self) -> None:
         if len(self.tasks) > self.options.tasks:
@@ -120,7 +114,7 @@ def headroom_jobs(
 ) -> list[HeadroomJob]:
     """Return the jobs that measure sets of tasks, by name, with all kinds of egos; first those of the first seed."""
     return [
-        HeadroomJob(title, tuple(tasks), kind, seed, options, out)
+        HeadroomJob(tuple(tasks), seed, options, out, title=title, kind=kind)
         for seed in range(seeds)
         for title, tasks in sets.items()
         for kind in EGO_KINDS

@@ -178,7 +178,7 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
 def find_alike_tasks() -> list[list[str]]:
     """Return lists of test task ids; the teammates of the tasks in a list act alike."""
     tasks = [task for track in TRACKS for task in bundled_tasks(track, "test")]
-    return [[task.task_id for task in one.tasks] for one in find_behaviours(tasks) if len(one.tasks) > 1]
+    return [[task.task_id for task in alike] for alike in find_behaviours(tasks) if len(alike) > 1]
 
 
 def write_headroom_cards(runs: Sequence[EvaluationRun], alike: Sequence[Sequence[str]], folder: Path) -> list[Path]:

@@ -79,11 +79,7 @@ class PlayOptions:
 
 @dataclass(frozen=True)
 class ResponseOptions:
-    """Settings of the training of a best response.
-
-    Attributes:
-        init: name of a bundled model of method rl2 to start from; by default random parameters.
-    """
+    """Settings of the training of a best response."""
 
     steps: Annotated[Count, Option("Environment steps of a training.")] = 3_000_000
     tasks: Annotated[Count, Option("Episodes that are played at once.")] = 128
@@ -91,7 +87,6 @@ class ResponseOptions:
     width: Annotated[
         Count, Option("Width of features and of the recurrent state; with 64 a core learns 1.6 times as fast.")
     ] = 128
-    init: str | None = None
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -108,7 +103,7 @@ class ResponseOptions:
 
 
 SAVE_MINUTES = 5.0
-"""Most minutes between checkpoints of a training run. Results do not depend on it, so it is no setting of a run."""
+"""Most minutes between checkpoints of a training run, which are also written every `save_every` steps."""
 
 FILTERS = {name: name for name in ("teammate_family", "source", "label_view")} | {"algorithm": "teammate_kind"}
 """Field of `HistoryOptions` -> the field of a release's index that it filters by."""

@@ -233,7 +233,6 @@ def train(
     trainer: Any = None,
     params: Any = None,
     tensorboard: bool = False,
-    save_minutes: float = SAVE_MINUTES,
     done: StepProgress = lambda step, loss: None,
 ) -> Any:
     """Train to the end, from the start or from the last checkpoint in the folder.
@@ -250,7 +249,6 @@ def train(
         trainer: what computes the steps, with the interface of `Trainer`, which is the default.
         params: initial parameters, such as those of another run; drawn by the seed by default.
         tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
-        save_minutes: most minutes between checkpoints, which are also written every `options.save_every` steps.
         done: called after every step, see `StepProgress`.
 
     Returns:
@@ -288,7 +286,7 @@ def train(
         batches = stack.enter_context(trainer.batches(data.train, first, options.steps))
         stop = stack.enter_context(StopSignals())  # entered last: what came before ends by a signal as usual
         before = first, time.perf_counter(), 0.0
-        save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * save_minutes)
+        save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * SAVE_MINUTES)
         loss: float | None = None
         for step, batch in enumerate(batches, start=first + 1):
             state, numbers = trainer.step(state, batch)

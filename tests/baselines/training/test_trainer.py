@@ -169,9 +169,10 @@ def terminate_at_4(step: int, loss: float | None) -> None:
 
 
 class TestStopping:
-    def test_checkpoints_are_saved_by_time(self, tmp_path):
+    def test_checkpoints_are_saved_by_time(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("icrl4aht_baselines.training.trainer.SAVE_MINUTES", 1e-9)
         with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path, die_at=5, save_minutes=1e-9)
+            trained(tmp_path, die_at=5)
         assert Checkpoints(tmp_path / CHECKPOINTS).steps == [4, 5]  # without, step 3 alone
 
     def test_a_signal_saves_and_the_run_resumes_to_the_same_bits(self, through, tmp_path):
