@@ -198,14 +198,6 @@ def reference_command(
         click.echo(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}")
 
 
-def _print_schema(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
-    from icrl4aht_baselines.report import submission
-
-    if wanted:
-        click.echo(submission.submission_schema())
-        context.exit()
-
-
 @click.command(
     "submit",
     epilog=examples(
@@ -221,14 +213,6 @@ def _print_schema(context: click.Context, parameter: click.Parameter, wanted: bo
 @click.option("--link", default="", help="Address of a paper or repository.")
 @click.option("--name", default="", help="Name of the agent in tables.", show_default="that in the results")
 @click.option("--update", is_flag=True, help="These are new results of an agent on the page, which they replace.")
-@click.option(
-    "--schema",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_schema,
-    help="Only print the JSON schema of the file.",
-)
 @click.option("--out", type=NewFile(".json"), metavar="FILE", required=True, help="Write this file.")
 @overwrite_option
 def submit_command(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_OPTIONS, ModelOptions
+from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_BY_RL2, ModelOptions
 from icrl4aht_baselines.training.options import (
     ALL_LAYOUTS,
     HistoryOptions,
@@ -66,18 +67,6 @@ def find_ego(option: str, value: str, **mode: Any) -> Any:
         return find_agent(value, **mode)
     except UnknownNameError as error:
         raise click.UsageError(f"{option}: {error}") from error
-
-
-class HostPort(click.ParamType):
-    """Address that a process listens on."""
-
-    name = "host:port"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        host, _, port = value.rpartition(":")
-        if not (host and port.isdecimal() and int(port) < 2**16):
-            self.fail(f"{value}: expected HOST:PORT, such as 10.0.0.1:6000", param, ctx)
-        return value
 
 
 EGO_NAME = EgoName("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names())
@@ -279,7 +268,7 @@ def prepare_training(
     from icrl4aht_baselines.training.histories import prepare
 
     if method in PLAYING:
-        if unused := {"size"} if size else UNUSED_OPTIONS[method] & (train.keys() | model.keys()):
+        if unused := {"size"} if size else UNUSED_BY_RL2 & (train.keys() | model.keys()):
             raise click.UsageError(f"{_flags(unused)}: not with {method}, which learns by playing")
         sized = ModelOptions(**RL2_SETTINGS["model"] | model)
         options = TrainOptions(**RL2_SETTINGS["train"] | train)
@@ -326,7 +315,7 @@ def _flags(names: Iterable[str]) -> str:
 
 process_options = topic(
     "Machines",
-    click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines."),
+    click.option("--coordinator", metavar="HOST:PORT", help="Address of process 0, to train on several machines."),
     click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes."),
     click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process."),
 )
@@ -341,6 +330,8 @@ def join_processes(coordinator: str | None, processes: int, process: int) -> Non
     """
     import jax
 
+    if coordinator and not re.fullmatch(r".+:\d{1,5}", coordinator):
+        raise click.UsageError(f"--coordinator {coordinator}: expected HOST:PORT, such as 10.0.0.1:6000")
     if not coordinator and (processes, process) != (1, 0):
         raise click.UsageError(
             "--processes and --process: expected a --coordinator HOST:PORT as well, the same for all"

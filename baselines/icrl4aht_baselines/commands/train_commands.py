@@ -77,9 +77,9 @@ def evaluate_command(
     from icrl4aht_baselines.evaluate.programs import Programs
     from icrl4aht_baselines.evaluate.protocols import get_protocol, limit_tasks
     from icrl4aht_baselines.evaluate.segments import CONTROLS
-    from icrl4aht_baselines.report.controls import control_lines
     from icrl4aht_baselines.report.page import summary_lines
     from icrl4aht_baselines.report.results import note_results, read_run
+    from icrl4aht_baselines.report.scores import control_lines
 
     if forget and controls:
         raise click.UsageError("--controls: not with --forget, which is one of the controls; leave one of them out")

@@ -299,7 +299,6 @@ def collect_release(
     *,
     labeller: NamedEgo | None = None,
     swap: int | None = None,
-    data_version: str = "1.0.0",
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
@@ -315,7 +314,6 @@ def collect_release(
         out: folder of the release.
         labeller: another agent, whose choices become the expert actions; by default the agent's own, without noise.
         swap: number of episodes after which another teammate plays within a history, see `plan_swaps`; None for never.
-        data_version: version of the data.
         overwrite: whether to replace a release at `out`.
         progress: called with (description, episodes played, episodes).
 
@@ -368,7 +366,7 @@ def collect_release(
         for (layout, kind), tasks in groups.items()
         for number, task in enumerate(tasks)
     ]
-    write_release(out, "lite", new, data_version=data_version, overwrite=overwrite, sources=[teammates.root])
+    write_release(out, "lite", new, data_version="1.0.0", overwrite=overwrite, sources=[teammates.root])
     shutil.rmtree(parts)
     return out
 

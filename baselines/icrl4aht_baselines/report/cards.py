@@ -12,7 +12,6 @@ import numpy as np
 
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks, get_protocol
-from icrl4aht_baselines.methods.options import UNUSED_OPTIONS
 from icrl4aht_baselines.online.responses import find_behaviours
 from icrl4aht_baselines.report.page import markdown_sections
 from icrl4aht_baselines.report.results import (
@@ -30,8 +29,6 @@ from icrl4aht_data.utils.templates import fill_template, markdown_table
 
 HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json", "behaviours.json")
 
-_NOT_LISTED = ("layouts", "root", "groups", "selections", "sizes", "manifest_sha256", "data_version", "obs_shape")
-
 HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
 """Layout -> family -> reference ego -> mean return."""
 
@@ -46,19 +43,16 @@ def model_card(
     """Return README.md of a bundled model, which has a model for each track.
 
     Args:
-        run: results of all of its models on test tasks. The card's table of models has a row for each, and there are
-            settings for each that differ.
+        run: results of all of its models on test tasks. The card's table of models has a row for each.
         title: name of the bundled model.
         command: command that makes it.
         validation: further results, on validation tasks under the same protocol, which get tables, too.
         pictures: path of a picture with curves, relative to the card -> what it shows.
     """
     models: dict[str, list[ResultSource]] = defaultdict(list)
-    settings: dict[str, list[str]] = defaultdict(list)
     for source in run.sources:
         if source.trained:
             models[source.trained["run_hash"]].append(source)
-            settings[_settings(source.trained["config"])] += source.layouts
     configs: list[dict[str, Any]] = [(sources[0].trained or {})["config"] for sources in models.values()]
     config = configs[0]
     seeds = ", ".join(dict.fromkeys(str(config["train"]["seed"]) for config in configs))
@@ -76,10 +70,6 @@ def model_card(
     }
     sections = [section for one in (run, *validation) for section in markdown_sections([one], one.protocol)]
     shown = [f"{text}:\n\n![{Path(at).stem}]({at})" for at, text in pictures.items()]
-    listed = [
-        f"Tested on {', '.join(dict.fromkeys(layouts))}:\n\n{text}" if len(settings) > 1 else text
-        for text, layouts in settings.items()
-    ]
     return fill_template(
         "baseline.md",
         title=title,
@@ -87,7 +77,6 @@ def model_card(
         training=" ".join(dict.fromkeys(map(training_sentence, configs))),
         properties="\n".join(f"| {name} | {value} |" for name, value in properties.items()),
         models="\n".join(_model_row(run, sources) for sources in models.values()),
-        settings="\n\n".join(listed),
         protocol=run.protocol,
         results="\n\n".join(f"#{section}" for section in sections),
         curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
@@ -140,15 +129,6 @@ def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
         f"{sources[0].conditions}, {instances} in a cell",
     ]
     return f"| {' | '.join(values)} |"
-
-
-def _settings(config: Mapping[str, Any]) -> str:
-    """Return the settings of a model as a list."""
-    unused = {*UNUSED_OPTIONS.get(config.get("method", ""), ()), *_NOT_LISTED}
-    parts = [config["model"], config["train"], config.get("play", {}), config["histories"]]
-    parts.append({"started from run": (config.get("init") or {}).get("run")})
-    shown = {name: value for part in parts for name, value in part.items() if name not in unused}
-    return "\n".join(f"* {name.replace('_', ' ')}: {value}" for name, value in shown.items() if value not in (None, []))
 
 
 def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:

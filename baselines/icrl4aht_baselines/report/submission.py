@@ -1,12 +1,10 @@
 """Files of results that others add to the page of results: made from folders of `evaluate`, checked, and read.
 
-A file has the return of every episode, so the page can recompute all numbers. `Submission` defines its content;
-`icrl4aht-data submit --schema` prints the JSON schema.
+A file has the return of every episode, so the page can recompute all numbers. `Submission` defines its content.
 """
 
 from __future__ import annotations
 
-import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
@@ -99,11 +97,6 @@ class Submission(msgspec.Struct, forbid_unknown_fields=True):
     tracks: list[Literal["teammate", "layout"]]
     evaluations: Annotated[list[Evaluation], Meta(min_length=1)]
     update: bool = False
-
-
-def submission_schema() -> str:
-    """Return the JSON schema of a file of results."""
-    return json.dumps(msgspec.json.schema(Submission), indent=1)
 
 
 def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "", update: bool = False) -> Submission:

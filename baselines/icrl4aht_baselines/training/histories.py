@@ -264,17 +264,16 @@ class HistorySplit(NamedTuple):
     teammates: Dataset | None
 
 
-def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Dataset | None = None) -> HistorySplit:
+def hold_out(dataset: Dataset, share: float = 0.1, validation: Dataset | None = None) -> HistorySplit:
     """Hold out a share of the teammates, and a share of the histories with the others; at least one each.
 
     Where each task has one history, only teammates are held out. Every task with a teammate that is not held out keeps
-    at least one history. The choice depends on names and the seed alone, see `splitting`; `Dataset.split` makes the
+    at least one history. The choice depends on names alone, see `splitting`; `Dataset.split` makes the
     same choice of teammates or of histories.
 
     Args:
         dataset: the histories to divide.
         share: share of the teammates, and of the histories with the others.
-        seed: seed of the choice.
         validation: histories with other teammates, such as those of split validation: these are the part `teammates`
             then, and no teammate of `dataset` is held out.
 
@@ -283,12 +282,12 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
     """
     teammates = validation
     if validation is None:
-        with_held = choose_teammates(teammate_names(dataset), share, seed)
+        with_held = choose_teammates(teammate_names(dataset), share, 0)
         if with_held.any():
             dataset, teammates = dataset.select(~with_held), dataset.select(with_held)
     if teammates is not None and len(dataset) == len(set(dataset.column("task_id").tolist())):
         return HistorySplit(train=dataset, histories=None, teammates=teammates)
-    held = choose_histories(dataset, share, seed)
+    held = choose_histories(dataset, share, 0)
     return HistorySplit(train=dataset.select(~held), histories=dataset.select(held), teammates=teammates)
 
 

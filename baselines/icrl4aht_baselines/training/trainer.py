@@ -274,7 +274,10 @@ def train(
         checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
         if checkpoints.latest is None:
             state = trainer.init()
-            state = state if params is None else _with_params(state, params)
+            if params is not None:
+                placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), params, state.params)
+                slow = {"slow": jax.tree.map(jnp.copy, placed)} if getattr(state, "slow", None) is not None else {}
+                state = state._replace(params=placed, **slow)
         else:
             state = checkpoints.load(trainer.state_like())[0]
         first = int(state.step)
@@ -318,20 +321,6 @@ def train(
         if writes and can_draw():
             plot_training_log(folder / METRICS, folder / RUN_CURVES, method.name)
     return state
-
-
-def _with_params(state: Any, params: Any) -> Any:
-    """Return a state before the first step with other parameters.
-
-    Raises:
-        OptionError: if they are of another model.
-    """
-    found, expected = (jax.tree.map(jnp.shape, tree) for tree in (params, state.params))
-    if found != expected:
-        raise OptionError("initial parameters: of a model of other options; give those of the run that they come from")
-    placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), params, state.params)
-    has_copy = getattr(state, "slow", None) is not None
-    return state._replace(params=placed, **({"slow": jax.tree.map(jnp.copy, placed)} if has_copy else {}))
 
 
 def agree_on_stop(save: bool, received: int) -> tuple[bool, int]:
