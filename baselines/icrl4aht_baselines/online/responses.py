@@ -30,7 +30,7 @@ from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
 from icrl4aht_baselines.training.options import PlayOptions, ResponseOptions
-from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.benchmark.best_responses import (
     BestResponse,
     BestResponseCard,
@@ -223,8 +223,8 @@ class TrainingJob:
         def done(step: int, loss: float | None) -> None:
             on_update(step, (self.progress() or (0, 0.0))[1])
 
-        data, folder = TrainingData(None, {}), self.folder / "run"
-        state = train(method, data, options, folder, self.settings, trainer=trainer, done=done)
+        task = TrainingTask(method, TrainingData(None, {}), options, self.settings, trainer)
+        state = task.train(self.folder / "run", done=done)
         return trainer, state.params
 
 

@@ -18,14 +18,11 @@ class TrainingStopped(SystemExit):
     """
 
     def __init__(self, number: int, message: str) -> None:
-        super().__init__(128 + number)
-        self.message = message
+        super().__init__(number, message)
+        self.code = 128 + number
 
     def __str__(self) -> str:
-        return self.message
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (int(self.code or 128) - 128, self.message)
+        return self.args[1]
 
 
 class StopSignals:

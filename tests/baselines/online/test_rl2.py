@@ -35,7 +35,7 @@ from icrl4aht_baselines.online.teammates import BEHAVIOURS, MIXTURE, mixed_chanc
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import read_trained_on
-from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task
@@ -76,7 +76,7 @@ def episode(trainer) -> Any:
 @pytest.fixture(scope="module")
 def through(trainer, episode, tmp_path_factory) -> tuple[Path, Any]:
     folder = tmp_path_factory.mktemp("rl2") / "run"
-    return folder, train(METHOD, TrainingData(None, {}), OPTIONS, folder, {}, trainer=trainer)
+    return folder, TrainingTask(METHOD, TrainingData(None, {}), OPTIONS, {}, trainer).train(folder)
 
 
 def test_the_memory_continues_over_steps_and_calls():
@@ -155,9 +155,10 @@ def test_a_stopped_training_resumes_bit_for_bit(trainer, through, tmp_path):
         if step == 4:
             raise KeyboardInterrupt
 
+    task = TrainingTask(METHOD, TrainingData(None, {}), OPTIONS, {}, trainer)
     with pytest.raises(KeyboardInterrupt):
-        train(METHOD, TrainingData(None, {}), OPTIONS, tmp_path, {}, trainer=trainer, done=stop)
-    state = train(METHOD, TrainingData(None, {}), OPTIONS, tmp_path, {}, trainer=trainer)
+        task.train(tmp_path, done=stop)
+    state = task.train(tmp_path)
     jax.tree.map(np.testing.assert_array_equal, state.params, through[1].params)
     assert (tmp_path / "metrics.jsonl").read_bytes() == (through[0] / "metrics.jsonl").read_bytes()
 

@@ -28,10 +28,10 @@ from icrl4aht_baselines.training.stopping import StopSignals, TrainingStopped
 from icrl4aht_baselines.training.trainer import (
     Trainer,
     TrainingData,
+    TrainingTask,
     TrainState,
     agree_on_stop,
     learning_rate_schedule,
-    train,
     training_optimizer,
 )
 from icrl4aht_generation.learners.resume import Checkpoints
@@ -78,7 +78,7 @@ def compiled() -> Trainer:
 def trained(folder: Path, die_at: int | None = None, changes: Any = None, **options: Any) -> TrainState:
     data = TrainingData(Rows(0, die_at), {"held out": Rows(1)})
     settings = dataclasses.replace(OPTIONS, **(changes or {}))
-    return train(compiled().method, data, settings, folder, {}, trainer=compiled(), **options)
+    return TrainingTask(compiled().method, data, settings, {}, compiled()).train(folder, **options)
 
 
 @pytest.fixture(scope="module")
@@ -415,7 +415,6 @@ from pathlib import Path
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
-from icrl4aht_baselines.training.trainer import train
 options = TrainOptions(steps=3, batch_size=4, context=6, log_every=1, validation_batches=1, accumulate=2)
 model = ModelOptions(layers=1, width=8, heads=2)
 root, out = sys.argv[1].split(",")
@@ -423,7 +422,7 @@ job = prepare("ad", model, options, HistoryOptions(("demo_wide",), root))
 def done(step, loss):
     if step == 1 and os.environ.get("STOP"):
         os.kill(os.getpid(), int(os.environ["STOP"]))
-state = train(job.method, job.data, options, Path(out), job.about, done=done)
+state = job._replace(options=options).train(Path(out), done=done)
 print(json.dumps({"devices": jax.device_count()}))
 """
 
