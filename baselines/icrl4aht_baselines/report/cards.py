@@ -22,7 +22,7 @@ from icrl4aht_baselines.report.results import (
 )
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, SUBMITTED_SEEDS
 from icrl4aht_baselines.report.tables import PAPER_METHODS, instances_range, published_cells
-from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_training, overlap_legend
+from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
 from icrl4aht_data.utils.templates import fill_template, markdown_table
@@ -64,7 +64,6 @@ def model_card(
     ]
     properties = {
         "method": config["method"],
-        "data": "; ".join(dict.fromkeys(_release(one["histories"]) for one in configs)),
         "created with": f"icrl4aht-data {config['package_version']}",
         "made by": f"`{command}`",
     }
@@ -82,11 +81,6 @@ def model_card(
         curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
         limits="\n".join(f"* {limit}" for limit in limits),
     )
-
-
-def _release(histories: Mapping[str, Any]) -> str:
-    """Return the name and the data version of the release that a model was trained with."""
-    return f"the local release `{Path(histories['root']).name}`, data version {histories['data_version']}"
 
 
 def training_sentence(config: Mapping[str, Any]) -> str:
@@ -112,20 +106,14 @@ def training_sentence(config: Mapping[str, Any]) -> str:
 def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
     """Return a row of the table of models: training data and seed of one model, and its evaluation."""
     trained: dict[str, Any] = sources[0].trained or {}
-    config, histories = trained["config"], trained["config"]["histories"]
-    layouts = ", ".join(histories["layouts"])
-    if "groups" in histories:  # trained by playing
-        others = sum(cell["tasks"] for cell in config.get(TRAINED_ON, ()) if cell.get("source") == TASKS_SOURCE)
-        selection = f"none: {sum(histories['groups'].values())} tasks at a time, played with the teammates of the "
-        selection += f"release's histories of {layouts}" + f", and with those of {others} other tasks" * bool(others)
-    else:
-        selection = f"{histories['sizes']['train']} of {layouts}"
+    histories = trained["config"]["histories"]
     instances = instances_range(len(run.cells[cell]) for source in sources for cell in source.tasks)
     values = [
         ", ".join(dict.fromkeys(layout for source in sources for layout in source.layouts)),
-        f"{selection}; the release's manifest has SHA-256 `{trained['manifest_sha256']}`",
+        f"`{Path(histories['root']).name}`, data version {histories['data_version']}, manifest with SHA-256 "
+        f"`{trained['manifest_sha256']}`",
         describe_training(sources[0].seen),
-        str(config["train"]["seed"]),
+        str(trained["config"]["train"]["seed"]),
         f"{sources[0].conditions}, {instances} in a cell",
     ]
     return f"| {' | '.join(values)} |"

@@ -27,7 +27,7 @@ from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.plotting import plot_training_log
 from icrl4aht_baselines.training.options import SAVE_MINUTES, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, TENSORBOARD, format_versions, open_run
-from icrl4aht_baselines.training.stopping import StopSignals, TrainingStopped
+from icrl4aht_baselines.training.stopping import TrainingStopped, stop_signals
 from icrl4aht_baselines.training.tensorboard import TensorBoardLog, check_installed
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import can_draw
@@ -274,7 +274,7 @@ class TrainingTask(NamedTuple):
             if events:
                 stack.callback(events.close)
             batches = stack.enter_context(trainer.batches(self.data.train, first, options.steps))
-            stop = stack.enter_context(StopSignals())  # entered last: what came before ends by a signal as usual
+            stop = stack.enter_context(stop_signals())  # entered last: what came before ends by a signal as usual
             before = first, time.perf_counter(), 0.0
             save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * SAVE_MINUTES)
             loss: float | None = None
@@ -297,7 +297,7 @@ class TrainingTask(NamedTuple):
                     before = now
                     if events:
                         events.add(lines)
-                saves, stopped_by = agree_on_stop(save.due(step), stop.received)
+                saves, stopped_by = agree_on_stop(save.due(step), stop[0] if stop else 0)
                 if saves or stopped_by:
                     log.sync()  # a checkpoint whose log was lost could never get these lines again
                     checkpoints.save(state, step)

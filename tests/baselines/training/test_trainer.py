@@ -24,7 +24,7 @@ from icrl4aht_baselines.methods.registry import get_method
 from icrl4aht_baselines.training.histories import hold_out, prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions, open_run, read_config
-from icrl4aht_baselines.training.stopping import StopSignals, TrainingStopped
+from icrl4aht_baselines.training.stopping import TrainingStopped, stop_signals
 from icrl4aht_baselines.training.trainer import (
     Trainer,
     TrainingData,
@@ -188,9 +188,9 @@ class TestStopping:
     def test_a_second_sigint_does_not_wait(self):
         found = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
         try:
-            with pytest.raises(KeyboardInterrupt), StopSignals() as stop:
+            with pytest.raises(KeyboardInterrupt), stop_signals() as stop:
                 os.kill(os.getpid(), signal.SIGINT)
-                assert TrainingStopped(stop.received, "").code == 130
+                assert TrainingStopped(stop[0], "").code == 130
                 os.kill(os.getpid(), signal.SIGINT)
             assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         finally:
@@ -198,7 +198,7 @@ class TestStopping:
 
     def test_signals_are_not_noted_in_another_thread(self):
         def other_thread() -> Any:
-            with StopSignals():
+            with stop_signals():
                 return signal.getsignal(signal.SIGINT)
 
         with ThreadPoolExecutor(1) as pool:
