@@ -132,7 +132,7 @@ def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple
         names = [layout.name for layout in layouts if not tasks or layout in stored]
         if not names:
             return release, None, layouts
-    dataset = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
+    dataset = filter_histories(release.filter(split="train", layout=names), histories.filters)
     return release, dataset, layouts or list(dataset.layouts)
 
 

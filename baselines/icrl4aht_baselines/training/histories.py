@@ -40,9 +40,6 @@ _CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammat
 }
 """Name in an entry of `training_cells` -> field of the index."""
 
-VALIDATION = "validation"
-"""Split of the histories that are held out where a release has them."""
-
 
 def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
     """Return the training of a method on histories; each process of several gets its share of the batches.
@@ -138,7 +135,7 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
     every = ALL_LAYOUTS in histories.layouts
     release = load_icrl4aht(histories.root, obs="uint8")  # first, since it may carry layouts of its own
     names = None if every else [get_layout(name).name for name in histories.layouts]
-    found = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
+    found = filter_histories(release.filter(split="train", layout=names), histories.filters)
     differ = len({layout.obs_shape for layout in found.layouts}) > 1
     channels = histories.channels or ("canonical" if every or differ else "own")
     if channels == "own" and differ:
@@ -150,10 +147,9 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
     options: Any = {"obs": "state" if found.has_states else None, "channels": channels}
     filters: Any = {FILTERS[name]: list(values) for name, values in histories.filters.items()}
     validation = None
-    if histories.split != VALIDATION:
-        with suppress(EmptySelectionError):
-            validation = release.filter(split=VALIDATION, layout=[one.name for one in found.layouts], **filters)
-            validation = validation.with_options(**options)
+    with suppress(EmptySelectionError):
+        validation = release.filter(split="validation", layout=[one.name for one in found.layouts], **filters)
+        validation = validation.with_options(**options)
     return found.with_options(**options), validation
 
 

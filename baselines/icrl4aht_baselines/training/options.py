@@ -115,17 +115,15 @@ ALL_LAYOUTS = "all"
 
 @dataclass(frozen=True)
 class HistoryOptions:
-    """Choice of the histories that a run is trained on.
+    """Choice of the training histories of a release that a run is trained on.
 
     Attributes:
         layouts: names of training layouts, or `ALL_LAYOUTS` alone.
         root: folder or address of a release; None for the bundled mini release.
-        split: split of the release.
     """
 
     layouts: tuple[str, ...]
     root: str | None = None
-    split: str = "train"
     teammate_family: Annotated[
         tuple[str, ...],
         Option("Only histories with teammates of this family: rl (learned), H1, H2, H3 or H4; repeat for several."),
