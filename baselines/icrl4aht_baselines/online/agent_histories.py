@@ -49,9 +49,8 @@ from icrl4aht_data.format.provenance import (
     Provenance,
     ReferenceEgos,
     TeammateSwaps,
-    read_provenance,
 )
-from icrl4aht_data.format.schema import PROVENANCE, TASKS, TEAMMATES, curve_ends, episode_ends
+from icrl4aht_data.format.schema import TASKS, TEAMMATES, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
@@ -257,11 +256,8 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         OptionError: if the release does not describe the teammates of all of these histories, or for tasks with learned
             teammates.
     """
-    path = Path(dataset.root) / PROVENANCE
-    provenance = read_provenance(path) if path.is_file() else {}
     wanted = set(dataset.column("task_id").tolist())
-    listed = Path(dataset.root) / TASKS
-    known = [task for task in (read_tasks(listed) if listed.is_file() else []) if task.task_id in wanted]
+    known = [task for task in read_tasks(dataset.root / TASKS) if task.task_id in wanted]
     missing = wanted - {task.task_id for task in known}
     if missing:
         raise OptionError(
@@ -283,7 +279,7 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         seed = FIRST_SEED + number * _SEEDS + len(found)
         played = make_task(task.track, task.split, task.layout.name, task.teammate, seed, task.recipes)
         found[task.teammate_key] = played
-        made = provenance.get(task.task_id)
+        made = dataset.provenance.get(task.task_id)
         if made is not None and made.references is not None:
             references[played.task_id] = made.references
     suite = dataset.origin.below(TEAMMATES)

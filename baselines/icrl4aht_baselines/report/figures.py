@@ -211,7 +211,10 @@ def curve_charts(runs: NumberedRuns) -> list[Chart]:
 
 def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) -> Chart:
     raw = {(number, cell): run.cells[cell] for number, run in runs.items() for cell in cells if cell in run.cells}
-    smooth = {key: np.stack([_smooth(returns) for returns in of_cell]) for key, of_cell in raw.items()}
+    smooth = {
+        key: np.stack([running_mean(returns, min(SMOOTHING, len(returns) // 10)) for returns in of_cell])
+        for key, of_cell in raw.items()
+    }
     drawn = [*smooth.values(), *(of_cell.mean(axis=0) for of_cell in raw.values())]
     y = _Scale(*return_limits(float(value) for found in drawn for value in found.flat))
     episodes = max(returns.shape[1] for returns in raw.values())
@@ -229,11 +232,6 @@ def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) ->
     return Chart(
         title, describe_conditions(runs.values(), cells), _series(runs, cells), x_ticks, y_ticks, panels=panels
     )
-
-
-def _smooth(returns: np.ndarray) -> np.ndarray:
-    """Return the running mean of a task's returns over up to `SMOOTHING` episodes."""
-    return running_mean(returns, min(SMOOTHING, len(returns) // 10))
 
 
 def _curve(number: int, smooth: np.ndarray, raw: np.ndarray, x: _Scale, y: _Scale) -> Curve:

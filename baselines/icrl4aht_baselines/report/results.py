@@ -254,11 +254,6 @@ class EvaluationRun:
         varied = "" if self.variant is None else ", {} = {}".format(*self.variant)
         return self.agent + varied + (f" [{self.note}]" if self.note else "")
 
-    @cached_property
-    def name(self) -> str:
-        """The label with the protocol in parentheses."""
-        return f"{self.label} ({self.protocol})"
-
 
 def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
     """Return the mean return in each block that exists, (...), of the returns of all episodes, (..., episodes)."""
@@ -425,7 +420,7 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
     """
     merged: list[EvaluationRun] = []
     for run in runs:
-        same = [other for other in merged if other.name == run.name]
+        same = [other for other in merged if (other.label, other.protocol) == (run.label, run.protocol)]
         fitting = [
             other for other in same if _rules(other) == _rules(run) and not other.cells.keys() & run.cells.keys()
         ]
