@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules
-from icrl4aht_generation.learners.resume import differing_settings, xla_threads
+from icrl4aht_generation.learners.resume import xla_threads
 from icrl4aht_generation.policy import Policy, sometimes_random
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from jaxtyping import Array, Float, Int, Int8
@@ -38,6 +38,7 @@ from icrl4aht_baselines.evaluate.programs import Programs
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.segments import segment_lengths
 from icrl4aht_baselines.online.teammates import check_heuristics
+from icrl4aht_baselines.training.run_folder import check_same_settings
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, teammate_id
 from icrl4aht_data.dataset import Dataset
@@ -336,7 +337,11 @@ def collect_release(
         "xla_threads": xla_threads(),
         "code_version": version("icrl4aht-data"),
     }
-    _check_settings(parts / "settings.json", settings)
+    if (begun := parts / "settings.json").exists():
+        check_same_settings(parse_json(read_text(begun)), settings, f"{parts}: holds parts")
+    parts.mkdir(parents=True, exist_ok=True)
+    with atomic_write(begun) as partial:
+        write_json(partial, settings)
     groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
     for task in teammates.tasks:
         groups[task.layout.name, task.teammate_kind].append(task)
@@ -375,19 +380,6 @@ def _save_part(folder: Path, recorded: RecordedHistories) -> None:
     for name, array in recorded._asdict().items():
         np.save(partial / f"{name}.npy", array)
     partial.rename(folder)
-
-
-def _check_settings(path: Path, settings: dict[str, Any]) -> None:
-    """Write the settings of a collection, or check that they are those of the one that was begun here."""
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as partial:
-            write_json(partial, settings)
-        return
-    different = differing_settings(parse_json(read_text(path)), settings)
-    if different:
-        listed = "; ".join(f"{name}: it has {a!r:.80}, expected {b!r:.80}" for name, (a, b) in different.items())
-        raise OptionError(f"{path.parent}: parts of other settings ({listed}); remove it, or give another --out")
 
 
 def _agent_task(

@@ -155,7 +155,7 @@ class TestResume:
 
     def test_other_settings_are_refused(self, through):
         with pytest.raises(
-            OptionError, match=r"other settings \(train.seed: the run has 0, expected 3\); give another"
+            OptionError, match=r"other settings \(train.seed: it has 0, expected 3\); give another"
         ):
             trained(through[0], changes={"seed": 3})
 
