@@ -105,7 +105,7 @@ class HeadroomJob(TrainingJob):
             entries = with_equal_parameters([self.tasks[number].teammate for number in own])
             mates = [build_teammate(None if several else layouts[0], entry) for entry in entries]
             told = own if self.kind == "informed" else None
-            groups.append(TaskGroup(layouts if several else layouts[:1], kind, mates, False, self.title, told))
+            groups.append(TaskGroup(layouts, kind, mates, False, self.title, told))
         return groups, {group.name: own for group, own in zip(groups, numbers.values(), strict=True)}
 
 

@@ -266,7 +266,7 @@ class ResponseJob(TrainingJob):
         """
         task = self.tasks[0]
         mates = [build_teammate(task.layout, task.teammate)] * self.options.tasks
-        group = TaskGroup([task.layout], task.teammate_kind, mates, False, task.layout.name)
+        group = TaskGroup([task.layout] * len(mates), task.teammate_kind, mates, False, task.layout.name)
         trainer, params = self.train([task.layout], [group], on_update)
         modes = {}
         for mode, greedy in (("greedy", True), ("sampled", False)):

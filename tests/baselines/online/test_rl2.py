@@ -193,7 +193,7 @@ def test_tasks_on_different_layouts_in_one_batch():
     ]
     (player,) = make_players(mixed, METHOD, PLAY, mirror=False)
     (alone,) = make_players(
-        [TaskGroup([layouts[1]], "assembly_line", [mate] * 3, True, "")], METHOD, PLAY, mirror=False
+        [TaskGroup([layouts[1]] * 3, "assembly_line", [mate] * 3, True, "")], METHOD, PLAY, mirror=False
     )
     params, key = METHOD.init(jax.random.key(0)), jax.random.key(1)
     (after, found, returns), (alone_after, expected, alone_returns) = (
@@ -295,7 +295,7 @@ class TestPreparing:
         players = self.prepare(play).trainer.players
         groups = [group for player in players for group in player.groups]
         assert len(players) == len({group.family for group in groups})
-        assert all(group.hidden and len(group.layouts) in (1, len(group.teammates)) for group in groups)
+        assert all(group.hidden and len(group.layouts) == len(group.teammates) for group in groups)
         tasks = collections.Counter[str]()
         for group in groups:
             tasks[group.label] += len(group.teammates)
