@@ -221,7 +221,7 @@ class TestFolder:
         open_run(tmp_path / "run", first)
         assert open_run(tmp_path / "run", corrected) == corrected == read_config(tmp_path / "run")
         shutil.copytree(through[0] / CHECKPOINTS, tmp_path / "run" / CHECKPOINTS)
-        with pytest.raises(OptionError, match=r"train.batch_size: the run has 4, expected 1000000000"):
+        with pytest.raises(OptionError, match=r"train.batch_size: it has 4, expected 1000000000"):
             open_run(tmp_path / "run", first)
 
     def test_folders_with_other_files_are_refused(self, tmp_path):
