@@ -14,7 +14,7 @@ deterministic operations, as in `generate`. Models are untrained.
 
 `mfu` is the model FLOP utilisation: the operations of the matrix products in the traced program
 (`benchmarks.harness.product_flops`, backward pass included) per second of step time, divided by the speed of the
-large product with the same dtype, or by `--peak-tflops`. With `words` in training, the operations are those of a batch
+large product with the same dtype. With `words` in training, the operations are those of a batch
 whose observations all differ; equal ones are computed once.
 """
 
@@ -89,6 +89,10 @@ class Sizes:
     tasks: int
     seconds: float
 
+    def mfu(self, flops: float, seconds: float, dtype: str) -> float:
+        """Return the speed `flops / seconds` as a share of that of the large product."""
+        return round(flops / seconds / product_tflops(self.product, dtype, None, self.seconds / 4) / 1e12, 4)
+
 
 FULL_SIZES = Sizes(
     product=8192,
@@ -110,24 +114,6 @@ SMALL_SIZES = Sizes(
     tasks=2,
     seconds=0.05,
 )
-
-
-@dataclass(frozen=True)
-class Bench:
-    """Settings of a child process.
-
-    Attributes:
-        sizes: see `Sizes`.
-        peaks: name of a dtype -> TFLOP/s to divide by; measured where it is missing.
-    """
-
-    sizes: Sizes
-    peaks: dict[str, float]
-
-    def mfu(self, flops: float, seconds: float, dtype: str) -> float:
-        """Return the speed `flops / seconds` as a share of the peak."""
-        peak = self.peaks.get(dtype) or product_tflops(self.sizes.product, dtype, None, self.sizes.seconds / 4)
-        return round(flops / seconds / peak / 1e12, 4)
 
 
 def device_memory() -> dict[str, float]:
@@ -165,7 +151,7 @@ def product_tflops(size: int, dtype: str, precision: str | None, seconds: float)
     return 5 * 2 * size**3 / min(seconds_of_calls(several, seconds)) / 1e12
 
 
-def describe_device(bench: Bench) -> dict[str, Any]:
+def describe_device(sizes: Sizes) -> dict[str, Any]:
     """Return facts on machine, software and settings."""
     devices = jax.devices()
     root = Path(__file__).resolve().parent
@@ -180,22 +166,22 @@ def describe_device(bench: Bench) -> dict[str, Any]:
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "cores": usable_cores(),
         "xla_threads": xla_threads(),
-        "sizes": "full" if bench.sizes.product == FULL_SIZES.product else "small",
+        "sizes": "full" if sizes.product == FULL_SIZES.product else "small",
         **device_memory(),
     }
 
 
-def measure_product(bench: Bench) -> dict[str, Any]:
+def measure_product(sizes: Sizes) -> dict[str, Any]:
     """Return TFLOP/s of the large product in default float32, exact float32 and bfloat16."""
-    size, seconds = bench.sizes.product, bench.sizes.seconds / 4
+    size, seconds = sizes.product, sizes.seconds / 4
     kinds = {"float32": ("float32", None), "float32_highest": ("float32", "highest"), "bfloat16": ("bfloat16", None)}
     found = {f"tflops_{name}": product_tflops(size, *kind, seconds) for name, kind in kinds.items()}
     return {"size": size, **{name: round(value, 3) for name, value in found.items()}}
 
 
-def measure_learner(bench: Bench, encoder: EncoderKind) -> dict[str, Any]:
+def measure_learner(sizes: Sizes, encoder: EncoderKind) -> dict[str, Any]:
     """Measure environment steps/s of an ego's updates with teammate H4."""
-    learner = ego_learner(bench.sizes, encoder)
+    learner = ego_learner(sizes, encoder)
     config = learner.config
     state = jax.jit(learner.init)(jax.random.key(0))
     program = compile_measured(compiled_update(learner), state)
@@ -205,27 +191,27 @@ def measure_learner(bench: Bench, encoder: EncoderKind) -> dict[str, Any]:
         state, _, metrics = program.call(state)
         return metrics
 
-    seconds = statistics.median(seconds_of_calls(update, bench.sizes.seconds))
+    seconds = statistics.median(seconds_of_calls(update, sizes.seconds))
     return {
-        **bench.sizes.ppo,
+        **sizes.ppo,
         "epochs": config.epochs,
         "steps_per_second": round(config.steps_per_update / seconds, 1),
         "update_seconds": round(seconds, 4),
         "compile_seconds": round(program.compile_seconds, 1),
         "mflop_per_step": round(program.flops / config.steps_per_update / 1e6, 2),
-        "mfu": bench.mfu(program.flops, seconds, "float32"),
+        "mfu": sizes.mfu(program.flops, seconds, "float32"),
         "program_gib": gib(program.bytes),
         **device_memory(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
 
 
-def measure_training(bench: Bench, size: str, encoder: EncoderKind, dtype: str) -> dict[str, Any]:
+def measure_training(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> dict[str, Any]:
     """Measure training steps of AD, in as many parts (`accumulate`) as the memory requires."""
     parts, reason = 1, ""
-    while bench.sizes.batch % parts == 0:
+    while sizes.batch % parts == 0:
         try:
-            return _training_steps(bench, size, encoder, dtype, parts)
+            return _training_steps(sizes, size, encoder, dtype, parts)
         except (jax.errors.JaxRuntimeError, MemoryError) as error:
             if not isinstance(error, MemoryError) and _OUT_OF_MEMORY not in str(error):
                 raise
@@ -234,8 +220,8 @@ def measure_training(bench: Bench, size: str, encoder: EncoderKind, dtype: str) 
     raise MemoryError(f"no number of parts fits: {reason}")
 
 
-def _training_steps(bench: Bench, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
-    sizes, model = bench.sizes, architecture(bench.sizes, size, encoder, dtype)
+def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, parts: int) -> dict[str, Any]:
+    model = architecture(sizes, size, encoder, dtype)
     length = context_length(sizes, size)
     dataset = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state")
     options = TrainOptions(batch_size=sizes.batch, context=length, accumulate=parts)
@@ -269,15 +255,15 @@ def _training_steps(bench: Bench, size: str, encoder: EncoderKind, dtype: str, p
         "loader_wait_seconds_per_step": round(waited, 4),
         "compile_seconds": round(program.compile_seconds, 1),
         "mflop_per_transition": round(program.flops / transitions / 1e6, 2),
-        "mfu": bench.mfu(program.flops, seconds, dtype),
+        "mfu": sizes.mfu(program.flops, seconds, dtype),
         "program_gib": gib(program.bytes),
         **device_memory(),
     }
 
 
-def measure_loader(bench: Bench, size: str) -> dict[str, Any]:
+def measure_loader(sizes: Sizes, size: str) -> dict[str, Any]:
     """Measure seconds per batch of state records from the bundled release to the device."""
-    sizes, device = bench.sizes, jax.devices()[0]
+    device = jax.devices()[0]
     sampler = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state").ad(
         batch_size=sizes.batch, length=context_length(sizes, size), seed=0
     )
@@ -291,9 +277,9 @@ def measure_loader(bench: Bench, size: str) -> dict[str, Any]:
     }
 
 
-def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) -> dict[str, Any]:
+def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) -> dict[str, Any]:
     """Measure the evaluator's steps/s with full windows: over all streams (tasks times seeds), and per stream."""
-    sizes, context = bench.sizes, context_length(bench.sizes, size)
+    context = context_length(sizes, size)
     layout = get_layout(_LAYOUT)
     tasks = h4_tasks()[: sizes.tasks]
     method = ad_method(architecture(sizes, size, encoder, "float32"), [layout])
@@ -318,10 +304,10 @@ def measure_acting(bench: Bench, size: str, encoder: EncoderKind, seeds: int) ->
     }
 
 
-def measure_attention(bench: Bench) -> dict[str, Any]:
+def measure_attention(sizes: Sizes) -> dict[str, Any]:
     """Measure milliseconds of attention (forward and backward, bfloat16): our implementation, JAX's and cuDNN's."""
     small = SIZES["small"]
-    shape = (bench.sizes.batch, bench.sizes.length, small.heads, small.width // small.heads)
+    shape = (sizes.batch, sizes.length, small.heads, small.width // small.heads)
     q, k, v = jax.random.normal(jax.random.key(0), (3, *shape), jnp.bfloat16)
     library = partial(jax.nn.dot_product_attention, is_causal=True)
     ways: dict[str, Callable[..., Any]] = {
@@ -333,7 +319,7 @@ def measure_attention(bench: Bench) -> dict[str, Any]:
     for name, attend in ways.items():
         gradient = jax.jit(jax.grad(lambda *x, attend=attend: attend(*x).astype(jnp.float32).sum(), (0, 1, 2)))
         try:
-            seconds = seconds_of_calls(partial(gradient, q, k, v), bench.sizes.seconds / 4)
+            seconds = seconds_of_calls(partial(gradient, q, k, v), sizes.seconds / 4)
             facts[f"{name}_milliseconds"] = round(1e3 * statistics.median(seconds), 4)
         except Exception as error:  # cuDNN is missing, too old or refuses the shape
             if name == "models":
@@ -375,7 +361,7 @@ def short_message(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]
 
 
-CASES: dict[str, Callable[[Bench], dict[str, Any]]] = {
+CASES: dict[str, Callable[[Sizes], dict[str, Any]]] = {
     "device": describe_device,
     "product": measure_product,
     "learner/paper": partial(measure_learner, encoder="paper"),
@@ -399,11 +385,11 @@ CASES: dict[str, Callable[[Bench], dict[str, Any]]] = {
 PARTS = tuple(dict.fromkeys(name.split("/")[0] for name in CASES))
 
 
-def run_here(names: Sequence[str], bench: Callable[[], Bench]) -> bool:
+def run_here(names: Sequence[str], make_sizes: Callable[[], Sizes]) -> bool:
     """Run cases in this process until one fails, print their lines, and return whether all succeeded."""
     for name in names:
         try:
-            facts = CASES[name](bench())
+            facts = CASES[name](make_sizes())
         except Exception as error:
             print_case(name, {"error": short_message(error)})
             return False
@@ -424,13 +410,6 @@ def print_case(case: str, facts: Mapping[str, Any]) -> None:
 @click.option("--case-minutes", type=float, default=3.0, show_default=True, help="Time limit of a case.")
 @click.option("--small", is_flag=True, help="Use tiny sizes, as always on a CPU.")
 @click.option("--seconds", type=float, help="Least time of a measurement.  [default: 4, or 0.05 for tiny sizes]")
-@click.option(
-    "--peak-tflops",
-    "peaks",
-    multiple=True,
-    type=(click.Choice(["float32", "bfloat16"]), float),
-    help="Divide by this speed of a dtype, such as `bfloat16 989`, instead of the measured one.",
-)
 @click.option("--here", is_flag=True, help="Measure in this process, up to the first failure; no time limits.")
 def main(
     parts: tuple[str, ...], cases: tuple[str, ...], minutes: float, case_minutes: float, here: bool, **settings: Any
@@ -442,7 +421,7 @@ def main(
     if here:
         if learning == names:
             request_determinism()  # the same flag as in `generate`
-        sys.exit(0 if run_here(names, partial(make_bench, **settings)) else 1)
+        sys.exit(0 if run_here(names, partial(chosen_sizes, **settings)) else 1)
     failures = 0
     for _, group in groupby(names, key=lambda name: name in learning):
         failures += run_isolated(
@@ -462,21 +441,18 @@ def child_environment() -> dict[str, str]:
     return {**os.environ, **({} if any(name in os.environ for name in names) else {names[0]: "0.92"})}
 
 
-def make_bench(small: bool, seconds: float | None, peaks: Sequence[tuple[str, float]]) -> Bench:
-    """Return the settings of this process; initialises JAX."""
+def chosen_sizes(small: bool, seconds: float | None) -> Sizes:
+    """Return the sizes of this process; initialises JAX."""
     sizes = FULL_SIZES
     if small or jax.default_backend() == "cpu":
         sizes = SMALL_SIZES
         jax.config.update("jax_disable_most_optimizations", True)  # otherwise nearly all of the time is compilation
-    return Bench(replace(sizes, seconds=sizes.seconds if seconds is None else seconds), dict(peaks))
+    return replace(sizes, seconds=sizes.seconds if seconds is None else seconds)
 
 
-def child_options(
-    names: Sequence[str], small: bool, seconds: float | None, peaks: Sequence[tuple[str, float]]
-) -> list[str]:
+def child_options(names: Sequence[str], small: bool, seconds: float | None) -> list[str]:
     """Return the command-line options of a child process that measures cases under the same settings."""
     options = [word for name in names for word in ("--case", name)]
-    options += [word for dtype, peak in peaks for word in ("--peak-tflops", dtype, str(peak))]
     options += ["--seconds", str(seconds)] if seconds is not None else []
     return options + ["--small"] * small
 

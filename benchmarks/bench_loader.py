@@ -7,17 +7,14 @@ All read the same histories (bundled ones, rotated by complete episodes) and mak
     ours        ram, mmap, stream (with and without decoded chunks kept); states, uint8, float32; batch buffers reused
 
 Readers take turns, round by round. One JSON line for each of our readers, with the ratio to both peers and our target
-ratio. Part `index` measures opening an index of a million histories, in separate processes.
+ratio.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import statistics
-import subprocess
-import sys
 from collections.abc import Iterator
 from functools import partial
 from itertools import product
@@ -43,8 +40,6 @@ _AIMS = {("ram", "state"): 8000, ("ram", "uint8"): 400, ("ram", "float32"): 200}
 CACHES = ("ram", "mmap", "stream", "stream, nothing kept")
 REPEATS = {"state": 10, "uint8": 3, "float32": 3}
 """Form of observations -> batches per round, of which the median is reported."""
-
-_print = partial(print_line, "loader")
 
 
 def make_data(folder: Path, layout: str, histories: int) -> None:
@@ -115,65 +110,11 @@ def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads:
             rates[cache, obs].append(batch / batch_seconds(sampler, buffer, cache, 1000 * number + 1))
     for (cache, obs), peer in product(samplers, peers):
         aim = {"least_ratio": _AIMS.get((cache, obs))} if peer == "published" else {}
-        _print(part="read", cache=cache, obs=obs, peer=peer, **compared(rates, (cache, obs), peer), **aim)
-
-
-_OPEN_INDEX = """
-import json, resource, sys, time
-from pathlib import Path
-from icrl4aht_data.format.index import read_index
-started = time.perf_counter()
-index = read_index(Path(sys.argv[1]))
-opened = time.perf_counter()
-first = index.entry(0)
-index.query(layout=first.layout, teammate_family=first.teammate_family)
-seconds = {"open_seconds": opened - started, "query_seconds": time.perf_counter() - opened}
-print(json.dumps(seconds | {"peak_megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024}))
-"""
-
-
-def index_times(folder: Path, lines: int) -> None:
-    """Print the times to open a long index in separate processes, first with an empty cache folder."""
-    root = folder / f"index-{lines}"
-    if not (root / "meta" / "info.json").exists():
-        write_long_index(root, lines)
-    with_cache = os.environ | {"ICRL4AHT_CACHE_DIR": str(folder / "index-cache")}
-    shutil.rmtree(folder / "index-cache", ignore_errors=True)
-    for opening, most in (("first", 10), ("second", 0.05), ("third", 0.05)):
-        run = subprocess.run(
-            [sys.executable, "-c", _OPEN_INDEX, str(root)], env=with_cache, capture_output=True, text=True, check=True
-        )
-        _print(part="index", opening=opening, lines=lines, target_open_seconds=most, **json.loads(run.stdout))
-
-
-def write_long_index(root: Path, lines: int) -> None:
-    """Write an index of many tasks of 128 histories, with entries of the bundled release."""
-    source = load_icrl4aht()
-    rng = np.random.default_rng(0)
-    (root / "meta").mkdir(parents=True, exist_ok=True)
-    entries = [entry.to_json() for entry in source.entries]
-    scores = ("score", "return_start", "return_end", "return_mean")
-    with (root / "meta" / "histories.jsonl").open("w") as stream:
-        for number in range(lines):
-            task = number // 128
-            line = entries[7 * task % len(entries)]
-            name, _, ending = line["shard"].rpartition("/")
-            line = line | {
-                "history_id": number,
-                "env_idx": int(rng.integers(1024)),
-                "h5_row": number % 1024,
-                "task_id": f"{line['task_id']}_{task:06}",
-                "shard": f"{name}/{ending.split('-')[0]}-{number // 1024:05}-of-{lines // 1024 + 1:05}.h5",
-                **dict(zip(scores, rng.normal(30, 10, 4).tolist(), strict=True)),
-            }
-            stream.write(json.dumps(line) + "\n")
-    info = source.info.to_json() | {"histories": lines}
-    (root / "meta" / "info.json").write_text(json.dumps(info))
+        print_line("loader", part="read", cache=cache, obs=obs, peer=peer, **compared(rates, (cache, obs), peer), **aim)
 
 
 @click.command()
 @click.option("--folder", type=click.Path(path_type=Path), default=Path("build/bench-loader"), show_default=True)
-@click.option("--part", "parts", multiple=True, type=click.Choice(["read", "index"]), default=("read", "index"))
 @click.option("--layout", default="coord_simple", show_default=True)
 @click.option("--histories", type=COUNT, default=128, show_default=True)
 @click.option("--batch", type=COUNT, default=1024, show_default=True)
@@ -181,17 +122,11 @@ def write_long_index(root: Path, lines: int) -> None:
 @click.option("--rounds", type=COUNT, default=3, show_default=True)
 @click.option("--threads", type=COUNT, default=2, show_default=True)
 @click.option("--peer-windows", type=COUNT, help="Windows that the peers read in a round.", show_default="a batch")
-@click.option("--lines", type=COUNT, default=1_000_000, show_default=True, help="Lines of the long index.")
-def main(
-    folder: Path, parts: tuple[str, ...], layout: str, histories: int, lines: int, peer_windows: int | None, **read: int
-) -> None:
-    """Compare our loader with two readers of the published format, and open a long index; one JSON line each."""
+def main(folder: Path, layout: str, histories: int, peer_windows: int | None, **read: int) -> None:
+    """Compare our loader with two readers of the published format; one JSON line each."""
     os.environ.setdefault("ICRL4AHT_CACHE_DIR", str(folder.resolve() / "cache"))
-    if "read" in parts:
-        make_data(folder, layout, histories)
-        compare_readers(folder, **read, peer_windows=peer_windows or read["batch"])
-    if "index" in parts:
-        index_times(folder, lines)
+    make_data(folder, layout, histories)
+    compare_readers(folder, **read, peer_windows=peer_windows or read["batch"])
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from threading import Timer
 from typing import Any
 
@@ -37,69 +37,27 @@ def run_isolated(
     """
     pending, failures = list(cases), 0
     while pending and time.monotonic() < until:
-        child, failed = _Child(command(pending), environment), False
-        for facts in child.lines(until, case_seconds):
-            pending.remove(facts["case"])
-            failed = "error" in facts
-            print_facts(facts.pop("case"), facts)
+        failed, stopped, line, left = False, False, " ", 0.0
+        with subprocess.Popen(command(pending), stdout=subprocess.PIPE, text=True, env=environment) as child:
+            assert child.stdout is not None
+            while line:
+                left = until - time.monotonic()
+                timer = Timer(max(0.0, min(left, case_seconds)), child.kill)
+                timer.start()
+                line = child.stdout.readline()
+                stopped = not timer.is_alive()
+                timer.cancel()
+                if line.startswith("{"):  # other output is dropped
+                    facts = json.loads(line)
+                    failed = "error" in facts
+                    print_facts(pending.pop(0), {name: value for name, value in facts.items() if name != "case"})
         if pending and not failed:
-            print_facts(pending.pop(0), {"error": child.end})
+            why = f"the process ended with code {child.returncode}"
+            if stopped:
+                why = "stopped: no time left" if left < case_seconds else f"stopped after {case_seconds:.0f} s"
+            print_facts(pending.pop(0), {"error": why})
             failed = True
         failures += failed
     for case in pending:
         print_facts(case, {"skipped": "no time left"})
     return failures
-
-
-class _Child:
-    """A child process, killed when its next line takes too long.
-
-    Attributes:
-        end: reason why the process ended, set after its last line.
-    """
-
-    def __init__(self, command: list[str], environment: Mapping[str, str] | None) -> None:
-        self.end = ""
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-
-    def lines(self, until: float, case_seconds: float) -> Iterator[dict[str, Any]]:
-        """Yield the parsed lines of cases; other output is dropped."""
-        with self._process as process:
-            assert process.stdout is not None
-            timer = self._timer(until, case_seconds)
-            try:
-                for line in process.stdout:
-                    facts = _parse_line(line)
-                    if facts:
-                        timer.cancel()
-                        yield facts
-                        timer = self._timer(until, case_seconds)
-                process.wait()
-            except BaseException:
-                process.kill()
-                raise
-            finally:
-                timer.cancel()
-        self.end = self.end or f"the process ended with code {process.returncode}"
-
-    def _timer(self, until: float, case_seconds: float) -> Timer:
-        left = until - time.monotonic()
-        why = "stopped: no time left" if left < case_seconds else f"stopped after {case_seconds:.0f} s"
-
-        def kill() -> None:
-            self.end = why
-            self._process.kill()
-
-        timer = Timer(max(0.0, min(left, case_seconds)), kill)
-        timer.daemon = True
-        timer.start()
-        return timer
-
-
-def _parse_line(line: str) -> dict[str, Any] | None:
-    """Return the facts of a case's line; None for other output."""
-    try:
-        facts = json.loads(line)
-    except ValueError:
-        return None
-    return facts if isinstance(facts, dict) and "case" in facts else None

@@ -25,7 +25,6 @@ from benchmarks.bench_gpu import (
     FULL_SIZES,
     PARTS,
     SMALL_SIZES,
-    Bench,
     ad_method,
     architecture,
     context_length,
@@ -61,8 +60,8 @@ def test_the_command():
     cases = ["device", "product", "learner/mlp", "act/tiny", "loader/tiny", "train/tiny/mlp/bfloat16", "attention"]
     assert {case.split("/")[0] for case in cases} == set(PARTS)
     options = [word for case in cases for word in ("--case", case)]
-    command = [sys.executable, "-m", "benchmarks.bench_gpu", *options, "--seconds", "0.01", "--peak-tflops"]
-    done = subprocess.run([*command, "float32", "1e-3"], cwd=ROOT, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "benchmarks.bench_gpu", *options, "--seconds", "0.01"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     found = lines_of(done.stdout)
     assert list(found) == cases
@@ -70,8 +69,7 @@ def test_the_command():
         assert MEASURED[case.split("/")[0]] <= line.keys(), case
     assert found["device"]["sizes"] == "small"
     assert found["learner/mlp"]["xla_flags"].count("xla_gpu_deterministic_ops") == 1
-    speed, work = found["learner/mlp"]["steps_per_second"], found["learner/mlp"]["mflop_per_step"]
-    assert found["learner/mlp"]["mfu"] == pytest.approx(speed * work / 1e3, rel=0.02)
+    assert found["learner/mlp"]["mfu"] > 0
 
 
 def test_cases_without_time_are_reported_as_skipped():
@@ -83,7 +81,7 @@ def test_cases_without_time_are_reported_as_skipped():
 
 
 def test_an_error_is_reported_and_ends_the_process(monkeypatch):
-    monkeypatch.setitem(CASES, "product", lambda bench: 1 / 0)
+    monkeypatch.setitem(CASES, "product", lambda sizes: 1 / 0)
     result = CliRunner().invoke(main, ["--here", "--part", "product", "--part", "loader"], catch_exceptions=False)
     assert result.exit_code == 1
     assert lines_of(result.output) == {
@@ -94,7 +92,7 @@ def test_an_error_is_reported_and_ends_the_process(monkeypatch):
 def test_a_batch_that_does_not_fit_is_computed_in_parts(monkeypatch):
     tried = []
 
-    def steps(bench, size, encoder, dtype, parts):
+    def steps(sizes, size, encoder, dtype, parts):
         tried.append(parts)
         if parts < 4:
             raise (MemoryError("96 GiB"), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: .."))[parts - 1]
@@ -102,10 +100,10 @@ def test_a_batch_that_does_not_fit_is_computed_in_parts(monkeypatch):
 
     monkeypatch.setattr(bench_gpu, "_training_steps", steps)
     measure = partial(measure_training, size="small", encoder="paper", dtype="float32")
-    assert measure(Bench(FULL_SIZES, {})) == {"accumulate": 4}
+    assert measure(FULL_SIZES) == {"accumulate": 4}
     assert tried == [1, 2, 4]
     with pytest.raises(MemoryError, match="no number of parts fits: RESOURCE_EXHAUSTED"):
-        measure(Bench(SMALL_SIZES, {}))  # of 2 rows
+        measure(SMALL_SIZES)  # of 2 rows
 
 
 @pytest.mark.slow

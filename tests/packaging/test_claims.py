@@ -320,5 +320,5 @@ def test_behaviours_of_the_test_tasks():
 def test_alike_tasks_of_a_layout():
     own = [task for task in tasks("test") if task.layout.name == "test_wide"]
     ids = {task.task_id for task in own}
-    found = [[task.task_id for task in one.tasks] for one in find_behaviours(own) if len(one.tasks) > 1]
+    found = [[task.task_id for task in alike] for alike in find_behaviours(own) if len(alike) > 1]
     assert found == [group for group in alike_tasks() if group[0] in ids]

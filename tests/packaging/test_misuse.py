@@ -68,7 +68,7 @@ evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent empty --out e | empty: not a run: config.json is missing
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
 evaluate --agent stay --out e --split train | unknown split 'train'; valid: test, validation
-evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --split: not with --manifest
+evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --manifest: not with --split, which
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """

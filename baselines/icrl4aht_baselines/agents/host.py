@@ -39,7 +39,7 @@ class EgoInput(NamedTuple):
 
 
 class HostPolicy(Policy):
-    """A policy whose functions take a batch of B tasks, with B keys and B views, for agents that cannot be vmapped."""
+    """A policy whose functions take a batch of B tasks, with B keys and B `EgoInput`s, for agents without a vmap."""
 
 
 class HostAgent(Protocol):

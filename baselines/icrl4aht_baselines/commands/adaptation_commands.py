@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,45 +15,66 @@ from icrl4aht_baselines.training.options import ResponseOptions
 from icrl4aht_data.benchmark.best_responses import best_responses_file
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
-from icrl4aht_data.commands.options import COUNT, FAMILY, Folder, Names, examples
+from icrl4aht_data.commands.options import COUNT, Folder, Names, examples
 from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.utils.options import replace_options
 
-_tasks_topic = topic(
-    "Tasks",
-    shared.track_option,
-    click.option(
-        "--split",
-        "splits",
-        type=shared.EVALUATION_SPLIT,
-        multiple=True,
-        default=("test",),
-        help="test, validation or diverse; repeat for several.",
-    ),
-    shared.only_layouts_option,
-    click.option("--family", "families", type=FAMILY, multiple=True, help="Only with this family; repeat."),
-    shared.manifest_option,
-)
 _STEPS = 8_000_000  # of the training of an informed or episodic ego
-_seeds_option = click.option("--seeds", type=COUNT, default=3, help="Trainings of each ego, with different seeds.")
 
 
-def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, float]]:
-    """Return model -> task id -> mean return, of the stored results of models on some tasks."""
-    from icrl4aht_baselines.agents.egos import OTHER_WAYS
+def _training_options(out: str, card: str, *own: Callable[[Any], Any], **default_text: str) -> Callable[[Any], Any]:
+    """Return a decorator with the options of both commands; `own` are further options of the training."""
+    training = dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text=default_text)
+    seeds = click.option("--seeds", type=COUNT, default=3, help="Trainings of each ego, with different seeds.")
+    options = [
+        topic("Tasks", *shared.tasks_options),
+        topic("Training", *own, seeds, training),
+        topic("Machines", queue_options),
+        click.option("--out", type=Folder(), metavar="FOLDER", default=out, help="Write trainings here."),
+        click.option("--bundle", is_flag=True, help=f"Also update {card} of the package's cards."),
+    ]
+    return lambda command: shared.add_options(command, options)
+
+
+def _run_trainings(
+    make_jobs: Callable[[list[Task]], Sequence[Any]],
+    write: Callable[[Sequence[Any], Path], Path],
+    table: Callable[[Path], str],
+    queue: dict[str, Any],
+    out: Path,
+    bundle: bool,
+    choice: dict[str, Any],
+) -> None:
+    """Run the jobs of the chosen tasks, add their results to the files of results, and print the table."""
+    options = read_queue_options(queue)
+    from icrl4aht_generation.jobs.queue import run_jobs
+    from icrl4aht_generation.learners.resume import limit_xla_threads
+    from rich.console import Console
+
+    limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
+    console, jobs = Console(soft_wrap=True), make_jobs(shared.chosen_tasks(**choice))
+    try:
+        run_jobs(jobs, out, console, options)
+    finally:
+        for folder in (out, best_responses_file().parent)[: 1 + bundle]:
+            console.print(f"wrote {write(jobs, folder)}")
+        click.echo(table(out))
+
+
+def _model_returns() -> dict[str, dict[str, float]]:
+    """Return model -> task id -> mean return, of the stored results of models on test tasks."""
     from icrl4aht_baselines.report.comparison import read_stored, results_file
-    from icrl4aht_baselines.report.results import task_label
+    from icrl4aht_baselines.report.results import bundled_by_id, task_label
 
-    table, names = read_stored(results_file()).table, {task_label(task.task_id): task.task_id for task in tasks}
-    table = table[table["control"].isin(["", *OTHER_WAYS])]
-    named = table["agent"].where(table["control"] == "", table["agent"] + " (" + table["control"] + ")")
-    table = table.assign(agent=named)
-    chosen = table[(table["protocol"] == protocol) & (table["block"] == "all")]
-    means = chosen[chosen["task"].isin(list(names))].groupby(["agent", "task"])["return"].mean()
-    found: dict[str, dict[str, float]] = defaultdict(dict)
-    for (agent, task), value in means.items():  # type: ignore[misc]
-        found[str(agent)][names[str(task)]] = float(value)
-    return found
+    ids, stored = {task_label(task): task for task in bundled_by_id("test")}, read_stored(results_file())
+    return {
+        agent: {
+            ids[task]: float(values.mean())
+            for of in cells.values()
+            for task, values in zip(of.tasks, of.mean, strict=True)
+        }
+        for agent, cells in stored.with_other_ways(stored.returns()).items()
+    }
 
 
 @click.command(
@@ -63,11 +85,9 @@ def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, floa
         "icrl4aht-data best-response --split test --split validation --workers 2 --bundle",
     ),
 )
-@_tasks_topic
-@topic(
-    "Training",
-    _seeds_option,
-    dataclass_options(ResponseOptions, "training", exclude=("learning_rate",)),
+@_training_options(
+    "runs/best-responses",
+    "best_responses.json",
     click.option(
         "--init",
         "inits",
@@ -78,13 +98,10 @@ def _model_returns(tasks: list[Task], protocol: str) -> dict[str, dict[str, floa
         "repeat for both.",
     ),
 )
-@topic("Machines", queue_options)
-@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/best-responses", help="Write trainings here.")
-@click.option("--bundle", is_flag=True, help="Also update best_responses.json of the package's cards.")
 def best_response_command(
+    inits: tuple[str, ...],
     seeds: int,
     training: dict[str, Any],
-    inits: tuple[str, ...],
     queue: dict[str, Any],
     out: Path,
     bundle: bool,
@@ -98,14 +115,7 @@ def best_response_command(
     Writes OUT/best_responses.json and prints it; finished trainings are kept, stopped ones resume. Where the return
     still rises in the last quarter, give more --steps.
     """
-    options = read_queue_options(queue)
-    from icrl4aht_generation.jobs.queue import run_jobs
-    from icrl4aht_generation.learners.resume import limit_xla_threads
-    from rich.console import Console
-
     from icrl4aht_baselines.online.responses import (
-        PROTOCOL,
-        RESPONSES_FILE,
         ResponseJob,
         find_behaviours,
         responses_table,
@@ -113,21 +123,19 @@ def best_response_command(
         write_responses,
     )
 
-    limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
-    chosen = with_headroom(shared.chosen_tasks(**choice))
-    if not chosen:
-        raise EmptySelectionError("none of these tasks has headroom; choose others")
-    console, behaviours = Console(soft_wrap=True), find_behaviours(chosen)
-    console.print(f"{len(chosen)} tasks with headroom, {len(behaviours)} behaviours")
-    settings = [ResponseOptions(**training, init=None if init == "oracle" else init) for init in inits]
-    jobs = [ResponseJob(one, seed, own, out) for seed in range(seeds) for own in settings for one in behaviours]
-    try:
-        run_jobs(jobs, out, console, options)
-    finally:
-        for path in (out / RESPONSES_FILE, best_responses_file())[: 1 + bundle]:
-            write_responses(jobs, path, _model_returns(chosen, PROTOCOL))
-            console.print(f"wrote {path}")
-        click.echo(responses_table(out / RESPONSES_FILE))
+    def make_jobs(tasks: list[Task]) -> list[ResponseJob]:
+        chosen = with_headroom(tasks)
+        if not chosen:
+            raise EmptySelectionError("none of these tasks has headroom; choose others")
+        behaviours = find_behaviours(chosen)
+        click.echo(f"{len(chosen)} tasks with headroom, {len(behaviours)} behaviours")
+        settings = [ResponseOptions(**training, init=None if init == "oracle" else init) for init in inits]
+        return [ResponseJob(one, seed, own, out) for seed in range(seeds) for own in settings for one in behaviours]
+
+    def write(jobs: Sequence[ResponseJob], folder: Path) -> Path:
+        return write_responses(jobs, folder, _model_returns())
+
+    _run_trainings(make_jobs, write, responses_table, queue, out, bundle, choice)
 
 
 @click.command(
@@ -138,16 +146,12 @@ def best_response_command(
         "icrl4aht-data adaptation-headroom --track preference --workers 2 --bundle",
     ),
 )
-@_tasks_topic
-@topic(
-    "Training",
+@_training_options(
+    "runs/adaptation",
+    "adaptation.json",
     click.option("--together", is_flag=True, help="One ego for all layouts instead of one for each."),
-    _seeds_option,
-    dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text={"steps": f"{_STEPS:,}"}),
+    steps=f"{_STEPS:,}",
 )
-@topic("Machines", queue_options)
-@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/adaptation", help="Write trainings here.")
-@click.option("--bundle", is_flag=True, help="Also update adaptation.json of the package's cards.")
 def adaptation_headroom_command(
     together: bool,
     seeds: int,
@@ -163,23 +167,13 @@ def adaptation_headroom_command(
     find out in each episode. Prints the difference of their returns with an interval over the seeds. Both learn for
     --steps only, so it is an estimate. Writes OUT/adaptation.json; finished trainings are kept, stopped ones resume.
     """
-    options = read_queue_options(queue)
-    from icrl4aht_generation.jobs.queue import run_jobs
-    from icrl4aht_generation.learners.resume import limit_xla_threads
-    from rich.console import Console
+    from icrl4aht_baselines.online.adaptation import HeadroomJob, adaptation_table, headroom_jobs, write_adaptation
 
-    from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
+    def make_jobs(tasks: list[Task]) -> list[HeadroomJob]:
+        sets: dict[str, list[Task]] = defaultdict(list)
+        for task in tasks:
+            where = "all" if together else task.layout.name
+            sets["-".join((task.track, task.split, where, *choice["families"]))].append(task)
+        return headroom_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
 
-    limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
-    sets: dict[str, list[Task]] = defaultdict(list)
-    for task in shared.chosen_tasks(**choice):
-        where = "all" if together else task.layout.name
-        sets["-".join((task.track, task.split, where, *choice["families"]))].append(task)
-    settings = replace_options(ResponseOptions(_STEPS), training)
-    console, jobs = Console(soft_wrap=True), headroom_jobs(sets, seeds, settings, out)
-    try:
-        run_jobs(jobs, out, console, options)
-    finally:
-        for folder in (out, best_responses_file().parent)[: 1 + bundle]:
-            console.print(f"wrote {write_adaptation(jobs, folder)}")
-        click.echo(adaptation_table(out))
+    _run_trainings(make_jobs, write_adaptation, adaptation_table, queue, out, bundle, choice)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -11,17 +12,16 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_OPTIONS, ModelOptions
+from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_BY_RL2, ModelOptions
 from icrl4aht_baselines.training.options import (
     ALL_LAYOUTS,
-    SAVE_MINUTES,
     HistoryOptions,
     PlayOptions,
     TrainOptions,
 )
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options, topic
+from icrl4aht_data.commands.dataclass_options import dataclass_options, topic
 from icrl4aht_data.commands.options import (
     COUNT,
     COUNT_OR_NONE,
@@ -36,7 +36,6 @@ from icrl4aht_data.commands.options import (
 )
 from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.options import Positive
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
@@ -61,18 +60,6 @@ def find_ego(option: str, value: str, **mode: Any) -> Any:
         return find_agent(value, **mode)
     except UnknownNameError as error:
         raise click.UsageError(f"{option}: {error}") from error
-
-
-class HostPort(click.ParamType):
-    """Address that a process listens on."""
-
-    name = "host:port"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        host, _, port = value.rpartition(":")
-        if not (host and port.isdecimal() and int(port) < 2**16):
-            self.fail(f"{value}: expected HOST:PORT, such as 10.0.0.1:6000", param, ctx)
-        return value
 
 
 EGO_NAME = Names("agent", lambda: import_module("icrl4aht_baselines.agents.egos").agent_names(), checked_later)
@@ -109,18 +96,33 @@ greedy_option = click.option(
     show_default="greedy; a bundled model's own, see `models`",
 )
 EVALUATION_SPLIT = Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS"))
-track_option = click.option(
-    "--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only tasks of this track; repeat for several."
-)
 only_layouts_option = click.option(
     "--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several."
 )
-manifest_option = click.option(
-    "--manifest",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
-    help="Tasks of this file instead of the tracks' tasks.",
+_MANIFEST: Any = {"type": click.Path(path_type=Path, exists=True, dir_okay=False), "metavar": "FILE"}
+tasks_options = (
+    click.option(
+        "--track",
+        type=TRACK,
+        multiple=True,
+        default=tuple(TRACKS),
+        help="Only of this track; repeat for several.",
+    ),
+    click.option(
+        "--split",
+        type=EVALUATION_SPLIT,
+        multiple=True,
+        default=("test",),
+        help="Which tasks: test, or validation and diverse, by which models are chosen; repeat for several.",
+    ),
+    only_layouts_option,
+    click.option(
+        "--family", "families", type=FAMILY, multiple=True, help="Only with teammates of this family; repeat."
+    ),
+    click.option("--manifest", **_MANIFEST, help="Tasks of this file instead of the tracks' tasks."),
 )
+"""Options that choose tasks; `chosen_tasks` takes their values."""
+
 evaluation_split_option = click.option(
     "--split",
     type=EVALUATION_SPLIT,
@@ -141,12 +143,6 @@ suite_option = click.option(
 tensorboard_option = click.option(
     "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
 )
-save_minutes_option = click.option(
-    "--save-minutes",
-    type=OptionValue(Positive),
-    default=SAVE_MINUTES,
-    help="Most minutes between checkpoints, which are also written every --save-every steps.",
-)
 gifs_option = click.option(
     "--gifs/--no-gifs", default=True, help="The first and last episode with each family on the page."
 )
@@ -156,26 +152,29 @@ root_option = click.option(
 
 
 def chosen_tasks(
-    track: Iterable[str],
-    splits: Iterable[str],
-    layouts: Iterable[str],
+    track: Sequence[str],
+    split: Sequence[str],
+    layouts: Sequence[str],
+    families: Sequence[str],
     manifest: Path | None,
-    families: Iterable[str] = (),
 ) -> list[Task]:
-    """Return the tasks that options choose: those of a manifest, or of tracks and splits in the package.
+    """Return the tasks that `tasks_options` choose: those of a manifest, or of tracks and splits in the package.
 
     Raises:
         EmptySelectionError: if there is none on these layouts with these families.
+        click.UsageError: for a manifest, whose tasks have splits of their own, together with a split.
     """
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 
-    bundled = ((name, split) for split in splits for name in track)
+    if manifest:
+        check_alone("--manifest", "split")
+    bundled = ((name, of_split) for of_split in split for name in track)
     given = read_tasks(manifest) if manifest else [task for each in bundled for task in bundled_tasks(*each)]
     names = {get_layout(name).name for name in layouts}
     chosen = [task for task in given if not names or task.layout.name in names]
     chosen = [task for task in chosen if not families or task.teammate_family in families]
     if not chosen:
-        found = manifest or f"the tasks of split {' and '.join(splits)}"
+        found = manifest or f"the tasks of split {' and '.join(split)}"
         wanted = "".join(f" {word} {', '.join(sorted(of))}" for word, of in (("on", names), ("with", families)) if of)
         raise EmptySelectionError(f"no task{wanted} in {found}: choose another --layout or --family, or none")
     return chosen
@@ -193,8 +192,7 @@ history_filters = dataclass_options(HistoryOptions, "filters", exclude=_NO_FILTE
 manifests_option = click.option(
     "--manifest",
     "manifests",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
+    **_MANIFEST,
     multiple=True,
     help="Also play with the teammates of this file's tasks, heuristics; repeat for several.",
 )
@@ -262,7 +260,7 @@ def prepare_training(
     from icrl4aht_baselines.training.histories import prepare
 
     if method in PLAYING:
-        if unused := {"size"} if size else UNUSED_OPTIONS[method] & (train.keys() | model.keys()):
+        if unused := {"size"} if size else UNUSED_BY_RL2 & (train.keys() | model.keys()):
             raise click.UsageError(f"{_flags(unused)}: not with {method}, which learns by playing")
         sized = ModelOptions(**RL2_SETTINGS["model"] | model)
         options = TrainOptions(**RL2_SETTINGS["train"] | train)
@@ -309,7 +307,7 @@ def _flags(names: Iterable[str]) -> str:
 
 process_options = topic(
     "Machines",
-    click.option("--coordinator", type=HostPort(), help="Address of process 0, to train on several machines."),
+    click.option("--coordinator", metavar="HOST:PORT", help="Address of process 0, to train on several machines."),
     click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes."),
     click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process."),
 )
@@ -324,6 +322,8 @@ def join_processes(coordinator: str | None, processes: int, process: int) -> Non
     """
     import jax
 
+    if coordinator and not re.fullmatch(r".+:\d{1,5}", coordinator):
+        raise click.UsageError(f"--coordinator {coordinator}: expected HOST:PORT, such as 10.0.0.1:6000")
     if not coordinator and (processes, process) != (1, 0):
         raise click.UsageError(
             "--processes and --process: expected a --coordinator HOST:PORT as well, the same for all"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,7 @@ from icrl4aht_data.utils.text import counted_noun
 @shared.forget_option
 @shared.controls_option
 @shared.protocol_option
-@shared.track_option
-@shared.evaluation_split_option
-@shared.only_layouts_option
-@shared.manifest_option
+@functools.partial(shared.add_options, options=shared.tasks_options)
 @shared.tasks_option
 @shared.episodes_option
 @shared.suite_option
@@ -59,16 +57,13 @@ def evaluate_command(
     forget: bool,
     controls: bool,
     protocol: str,
-    track: tuple[str, ...],
-    split: str | None,
-    layouts: tuple[str, ...],
-    manifest: Path | None,
     tasks: int | None,
     episodes: int | None,
     suite: Path | None,
     seeds: int,
     chosen_seeds: tuple[int, ...],
     out: Path,
+    **choice: Any,
 ) -> None:
     """Evaluate an agent on test tasks, or on validation tasks.
 
@@ -82,16 +77,14 @@ def evaluate_command(
     from icrl4aht_baselines.evaluate.programs import Programs
     from icrl4aht_baselines.evaluate.protocols import get_protocol, limit_tasks
     from icrl4aht_baselines.evaluate.segments import CONTROLS
-    from icrl4aht_baselines.report.controls import control_lines
     from icrl4aht_baselines.report.page import summary_lines
     from icrl4aht_baselines.report.results import note_results, read_run
+    from icrl4aht_baselines.report.scores import control_lines
 
-    if manifest and split:
-        raise click.UsageError("--split: not with --manifest, whose tasks have their own splits; leave one of them out")
     if forget and controls:
         raise click.UsageError("--controls: not with --forget, which is one of the controls; leave one of them out")
     ego = find_ego("--agent", agent, acting=acting, greedy=greedy)
-    chosen = limit_tasks(shared.chosen_tasks(track, (split or "test",), layouts, manifest), tasks)
+    chosen = limit_tasks(shared.chosen_tasks(**choice), tasks)
     if chosen_seeds:
         shared.check_alone("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
@@ -215,7 +208,6 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
 @topic(
     "Run",
     click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD"),
-    shared.save_minutes_option,
     shared.tensorboard_option,
 )
 @shared.process_options
@@ -231,7 +223,6 @@ def train_command(
     histories: dict[str, Any],
     play: dict[str, Any],
     manifests: tuple[Path, ...],
-    save_minutes: float,
     tensorboard: bool,
     **machines: Any,
 ) -> None:
@@ -255,8 +246,7 @@ def train_command(
     click.echo(description)
     params, steps = None if init is None else start_from(init, job.method, job.about), job.options.steps
     with progress_bars(unit="steps") as show:
-        watched: Any = {"tensorboard": tensorboard, "save_minutes": save_minutes, "params": params}
-        job.train(folder, done=show_steps(show, method, steps), **watched)
+        job.train(folder, params=params, tensorboard=tensorboard, done=show_steps(show, method, steps))
     trained = counted_noun(steps, "step")
     click.echo(f"{trained} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it")
     if not can_draw():

@@ -23,7 +23,7 @@ from icrl4aht_baselines.methods.dpt import dpt
 from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.training.options import TrainOptions
-from icrl4aht_baselines.training.trainer import StepProgress, TrainingData, TrainState, train
+from icrl4aht_baselines.training.trainer import StepProgress, TrainingData, TrainingTask, TrainState
 
 BANDIT_MODEL = ModelOptions(layers=2, width=32, heads=2, dropout=0.0)
 DARK_ROOM_MODEL = replace(BANDIT_MODEL, width=64, heads=4)
@@ -201,4 +201,4 @@ def _train(
     )
     samplers = [worlds.RowSampler(part, size.batch_size, seed) for seed, part in enumerate(rows)]
     data = TrainingData(samplers[0], {"held out": samplers[1]})
-    return train(method, data, options, folder, {"control": asdict(size)}, done=done)
+    return TrainingTask(method, data, options, {"control": asdict(size)}).train(folder, done=done)

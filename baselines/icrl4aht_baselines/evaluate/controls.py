@@ -55,17 +55,16 @@ def evaluate_controls(
     tasks: Sequence[Task],
     protocol: Protocol | str = "seeded",
     *,
-    seeds: Sequence[int] = (0,),
-    suite: Path | None = None,
     out: Path | None = None,
-    details: dict[str, Any] | None = None,
     programs: Programs | None = None,
+    **options: Any,
 ) -> ControlledResults:
     """Evaluate an ego and its controls, see `segments.CONTROLS`.
 
     Args:
-        agent, make_ego, tasks, protocol, seeds, suite, details, programs: see `evaluate`.
+        agent, make_ego, tasks, protocol, programs: see `evaluate`.
         out: folder of the ego's results; those of the controls are in its folders `forgets` and `swapped`.
+        options: `seeds`, `suite` and `details` of `evaluate`.
 
     Raises:
         OptionError: as `evaluate`; if a task has no partner, if there are less than 2 episodes, or if the protocol
@@ -75,20 +74,9 @@ def evaluate_controls(
     plan_tasks(tasks, rules, "swapped")  # fails before hours of work
     # Equal egos share compiled programs, and an adapter makes new functions each time it is called.
     make = make_ego if make_ego in SCRIPTED else cache(make_ego)
-    programs = Programs() if programs is None else programs
+    options["programs"] = Programs() if programs is None else programs
     results = {
-        control: evaluate(
-            agent,
-            make,
-            tasks,
-            rules,
-            seeds=seeds,
-            suite=suite,
-            control=control,
-            out=out if out is None or control is None else out / control,
-            details=details,
-            programs=programs,
-        )
+        control: evaluate(agent, make, tasks, rules, control=control, out=out and out / (control or ""), **options)
         for control in (None, *CONTROLS)
     }
     return ControlledResults(results[None], results["forgets"], results["swapped"], rules.last_episodes)

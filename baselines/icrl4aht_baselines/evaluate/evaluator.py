@@ -276,22 +276,15 @@ def prepare_rollout(
     every: Any = layouts if several and make_ego in SCRIPTED else layouts[0]
     ego = make_ego(every)
     rollout = EvaluationRollout(layouts if several else layouts[0], ego, mates, protocol, numbers)
-    state = _first_state(rollout, tasks, seeds) if earlier is None else _next_state(rollout, earlier)
+    if earlier is None:
+        keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
+        state = rollout.start(keys) if isinstance(ego, HostPolicy) else jax.jit(rollout.start)(keys)
+    else:
+        before = earlier.rollout
+        is_same = rollout.layout == before.layout and np.array_equal(rollout.numbers, before.numbers)  # type: ignore[arg-type]
+        state = earlier.state if is_same else jax.jit(rollout.enter)(earlier.state)
     programs = Programs() if programs is None else programs
     return PreparedRollout(rollout, state, programs.episode(rollout, state))
-
-
-def _first_state(rollout: EvaluationRollout, tasks: Sequence[Task], seeds: Sequence[int]) -> RolloutState:
-    keys = jnp.stack([task_key(seed, task.task_id) for task in tasks for seed in seeds])
-    return rollout.start(keys) if isinstance(rollout.ego, HostPolicy) else jax.jit(rollout.start)(keys)
-
-
-def _next_state(rollout: EvaluationRollout, earlier: PreparedRollout) -> RolloutState:
-    before = earlier.rollout
-    numbers = [None if one.numbers is None else one.numbers.tolist() for one in (rollout, before)]
-    if rollout.layout == before.layout and numbers[0] == numbers[1]:
-        return earlier.state
-    return jax.jit(rollout.enter)(earlier.state)
 
 
 def play_tasks(

@@ -50,12 +50,10 @@ class Programs:
         shapes = tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
         rules = rollout.protocol.steps, rollout.protocol.four_recipes  # others are in states and policies
         key = layouts, rules, *policies, structure, shapes
+        mine = Future[EpisodeProgram]()
         with self._lock:
-            found = self._found.get(key)
-            mine = found is None
-            if found is None:
-                found = self._found[key] = Future()
-        if mine:
+            found = self._found.setdefault(key, mine)
+        if found is mine:
             try:
                 found.set_result(_compile(rollout, arguments))
             except BaseException as error:

@@ -9,8 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from icrl4aht_generation.learners.resume import differing_settings
-
+from icrl4aht_baselines.training.run_folder import check_same_settings
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, check_own_folder, json_hash
@@ -72,10 +71,7 @@ def find_results(
     found = {result.task_id: result for result in map(read_result, filter(Path.exists, paths))}
     for result in found.values():
         path, expected = result_path(out, result.task_id), list(partners.get(result.task_id, ()))
-        different = differing_settings(result.settings, settings)
-        if different:
-            listed = "; ".join(f"{name}: it has {one!r}, expected {two!r}" for name, (one, two) in different.items())
-            raise OptionError(f"{path}: holds a result of other settings ({listed}); give another --out")
+        check_same_settings(result.settings, settings, f"{path}: holds a result")
         if result.partners != expected:
             raise OptionError(
                 f"{path}: holds a result with the teammates of {', '.join(result.partners)}, expected those of "

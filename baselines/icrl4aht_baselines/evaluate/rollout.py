@@ -120,9 +120,6 @@ class EvaluationRollout:
     def ego_actions(self, params: Any, state: RolloutState, keys: jax.Array) -> tuple[Int[Array, " B"], Any]:
         """Return the egos' actions in the next step, and their memories after it."""
         if self.ego.sees not in ("ego_input", "canonical_input"):
-            if isinstance(self.ego, HostPolicy):
-                view = state.env.record if self.ego.sees == "state" else self.env.observe_one(state.env, EGO)
-                return self.ego.act(params, state.ego, view, keys)
             return self.env.act(self.ego, params, state.ego, state.env, EGO, keys, own=False)
         view = state.before._replace(obs=self.env.observe_one(state.env, EGO, self.ego.sees == "canonical_input"))
         if isinstance(self.ego, HostPolicy):

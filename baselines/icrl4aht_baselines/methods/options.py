@@ -114,17 +114,8 @@ class ModelOptions:
             raise OptionError(f"width = {self.width}: expected a multiple of twice the heads ({2 * self.heads})")
 
 
-_UNUSED_WITHOUT_TRANSFORMER = {"layers", "heads", "positions", "remat"}
-
-UNUSED_OPTIONS: dict[str, set[str]] = {
-    "ad": {"recurrent_layers", "discounts"},
-    "dpt": {"recurrent_layers", "discounts"},
-    "hybrid_ad": {"discounts", *_UNUSED_WITHOUT_TRANSFORMER},
-    "amago_offline": {"recurrent_layers"},
-    "rl2": {
-        *_UNUSED_WITHOUT_TRANSFORMER,
-        *("discounts", "dropout", "next_obs", "label_smoothing", "bfloat16"),
-        *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),
-    },
+UNUSED_BY_RL2 = {
+    *("layers", "heads", "positions", "remat", "discounts", "dropout", "next_obs", "label_smoothing", "bfloat16"),
+    *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),
 }
-"""Method -> options of models and of trainings that it does not use."""
+"""Options of models and of trainings that RL^2 does not use."""

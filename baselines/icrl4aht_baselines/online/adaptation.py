@@ -36,13 +36,12 @@ MEASURED_EPISODES = 100
 _MEASURE_SEED = 1_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HeadroomJob(TrainingJob):
-    """The training of an informed or episodic ego on a set of tasks.
+    """The training of an informed or episodic ego on a set of tasks, at most as many as are played at once.
 
     Attributes:
         title: name of the set of tasks.
-        tasks: the tasks, at most as many as are played at once.
         kind: "informed" or "episodic".
 
     Raises:
@@ -50,12 +49,7 @@ class HeadroomJob(TrainingJob):
     """
 
     title: str
-    tasks: tuple[Task, ...]
     kind: EgoKind
-    seed: int
-    options: ResponseOptions
-    out: Path
-    xla_threads: int | None = 1
 
     def __post_init__(self) -> None:
         if len(self.tasks) > self.options.tasks:
@@ -111,7 +105,7 @@ class HeadroomJob(TrainingJob):
             entries = with_equal_parameters([self.tasks[number].teammate for number in own])
             mates = [build_teammate(None if several else layouts[0], entry) for entry in entries]
             told = own if self.kind == "informed" else None
-            groups.append(TaskGroup(layouts if several else layouts[:1], kind, mates, False, self.title, told))
+            groups.append(TaskGroup(layouts, kind, mates, False, self.title, told))
         return groups, {group.name: own for group, own in zip(groups, numbers.values(), strict=True)}
 
 
@@ -120,7 +114,7 @@ def headroom_jobs(
 ) -> list[HeadroomJob]:
     """Return the jobs that measure sets of tasks, by name, with all kinds of egos; first those of the first seed."""
     return [
-        HeadroomJob(title, tuple(tasks), kind, seed, options, out)
+        HeadroomJob(tuple(tasks), seed, options, out, title=title, kind=kind)
         for seed in range(seeds)
         for title, tasks in sets.items()
         for kind in EGO_KINDS

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules
-from icrl4aht_generation.learners.resume import differing_settings, xla_threads
+from icrl4aht_generation.learners.resume import xla_threads
 from icrl4aht_generation.policy import Policy, sometimes_random
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from jaxtyping import Array, Float, Int, Int8
@@ -38,6 +38,7 @@ from icrl4aht_baselines.evaluate.programs import Programs
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.segments import segment_lengths
 from icrl4aht_baselines.online.teammates import check_heuristics
+from icrl4aht_baselines.training.run_folder import check_same_settings
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, teammate_id
 from icrl4aht_data.dataset import Dataset
@@ -49,9 +50,8 @@ from icrl4aht_data.format.provenance import (
     Provenance,
     ReferenceEgos,
     TeammateSwaps,
-    read_provenance,
 )
-from icrl4aht_data.format.schema import PROVENANCE, TASKS, TEAMMATES, curve_ends, episode_ends
+from icrl4aht_data.format.schema import TASKS, TEAMMATES, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
@@ -257,11 +257,8 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         OptionError: if the release does not describe the teammates of all of these histories, or for tasks with learned
             teammates.
     """
-    path = Path(dataset.root) / PROVENANCE
-    provenance = read_provenance(path) if path.is_file() else {}
     wanted = set(dataset.column("task_id").tolist())
-    listed = Path(dataset.root) / TASKS
-    known = [task for task in (read_tasks(listed) if listed.is_file() else []) if task.task_id in wanted]
+    known = [task for task in read_tasks(dataset.root / TASKS) if task.task_id in wanted]
     missing = wanted - {task.task_id for task in known}
     if missing:
         raise OptionError(
@@ -283,7 +280,7 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         seed = FIRST_SEED + number * _SEEDS + len(found)
         played = make_task(task.track, task.split, task.layout.name, task.teammate, seed, task.recipes)
         found[task.teammate_key] = played
-        made = provenance.get(task.task_id)
+        made = dataset.provenance.get(task.task_id)
         if made is not None and made.references is not None:
             references[played.task_id] = made.references
     suite = dataset.origin.below(TEAMMATES)
@@ -299,7 +296,6 @@ def collect_release(
     *,
     labeller: NamedEgo | None = None,
     swap: int | None = None,
-    data_version: str = "1.0.0",
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
@@ -315,7 +311,6 @@ def collect_release(
         out: folder of the release.
         labeller: another agent, whose choices become the expert actions; by default the agent's own, without noise.
         swap: number of episodes after which another teammate plays within a history, see `plan_swaps`; None for never.
-        data_version: version of the data.
         overwrite: whether to replace a release at `out`.
         progress: called with (description, episodes played, episodes).
 
@@ -342,7 +337,11 @@ def collect_release(
         "xla_threads": xla_threads(),
         "code_version": version("icrl4aht-data"),
     }
-    _check_settings(parts / "settings.json", settings)
+    if (begun := parts / "settings.json").exists():
+        check_same_settings(parse_json(read_text(begun)), settings, f"{parts}: holds parts")
+    parts.mkdir(parents=True, exist_ok=True)
+    with atomic_write(begun) as partial:
+        write_json(partial, settings)
     groups: dict[tuple[str, str], list[Task]] = defaultdict(list)
     for task in teammates.tasks:
         groups[task.layout.name, task.teammate_kind].append(task)
@@ -368,7 +367,7 @@ def collect_release(
         for (layout, kind), tasks in groups.items()
         for number, task in enumerate(tasks)
     ]
-    write_release(out, "lite", new, data_version=data_version, overwrite=overwrite, sources=[teammates.root])
+    write_release(out, "lite", new, data_version="1.0.0", overwrite=overwrite, sources=[teammates.root])
     shutil.rmtree(parts)
     return out
 
@@ -381,19 +380,6 @@ def _save_part(folder: Path, recorded: RecordedHistories) -> None:
     for name, array in recorded._asdict().items():
         np.save(partial / f"{name}.npy", array)
     partial.rename(folder)
-
-
-def _check_settings(path: Path, settings: dict[str, Any]) -> None:
-    """Write the settings of a collection, or check that they are those of the one that was begun here."""
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as partial:
-            write_json(partial, settings)
-        return
-    different = differing_settings(parse_json(read_text(path)), settings)
-    if different:
-        listed = "; ".join(f"{name}: it has {a!r:.80}, expected {b!r:.80}" for name, (a, b) in different.items())
-        raise OptionError(f"{path.parent}: parts of other settings ({listed}); remove it, or give another --out")
 
 
 def _agent_task(

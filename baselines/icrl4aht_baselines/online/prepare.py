@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,8 +25,6 @@ from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.provenance import read_provenance
-from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
@@ -132,7 +129,7 @@ def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple
         names = [layout.name for layout in layouts if not tasks or layout in stored]
         if not names:
             return release, None, layouts
-    dataset = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
+    dataset = filter_histories(release.filter(split="train", layout=names), histories.filters)
     return release, dataset, layouts or list(dataset.layouts)
 
 
@@ -268,10 +265,8 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
         own = draw is None or draw.oracle - draw.stay >= LEAST_HEADROOM
         matters[task.layout.name] = matters.get(task.layout.name, False) or own
     if dataset is not None:
-        path = Path(dataset.root) / PROVENANCE
-        provenance = read_provenance(path) if path.is_file() else {}
         for layout, task_id in zip(dataset.column("layout"), dataset.column("task_id"), strict=True):
-            made = provenance.get(str(task_id))
+            made = dataset.provenance.get(str(task_id))
             own = made is None or made.references is None or made.references.matters
             matters[str(layout)] = matters.get(str(layout), False) or own
     return {layout: 1.0 if found else FLAT_SHARE for layout, found in matters.items()}

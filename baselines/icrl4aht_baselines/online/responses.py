@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
@@ -27,13 +27,12 @@ from msgspec import structs, to_builtins
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import PlayMode, learned, with_view
 from icrl4aht_baselines.evaluate.evaluator import evaluate
-from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import PlayOptions, ResponseOptions
-from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.benchmark.best_responses import (
     BestResponse,
     BestResponseCard,
@@ -73,23 +72,8 @@ PLAY = PlayOptions(task_end=1.0)
 """Options of playing: each episode is a task of its own, since nothing is to be found out."""
 
 
-class Behaviour(NamedTuple):
-    """Tasks on one layout with teammates that act alike, and so have one best response.
-
-    Attributes:
-        tasks: the tasks; the first one's teammate is trained with.
-    """
-
-    tasks: tuple[Task, ...]
-
-    @property
-    def layout(self) -> Layout:
-        """The layout, with the recipes of the tasks."""
-        return self.tasks[0].layout
-
-
-def find_behaviours(tasks: Iterable[Task]) -> list[Behaviour]:
-    """Group the tasks of one split, layout, dish and family whose teammates act alike.
+def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
+    """Group the tasks of one split, layout, dish and family whose teammates act alike, and so have one best response.
 
     Teammates act alike if their distance on the states of `teammates.distances` is below `SAME_BEHAVIOUR`.
 
@@ -102,13 +86,13 @@ def find_behaviours(tasks: Iterable[Task]) -> list[Behaviour]:
     found = []
     for own in groups.values():
         if len(own) == 1:
-            found.append(Behaviour((own[0],)))
+            found.append((own[0],))
             continue
         plain = replace(own[0], recipes=None).layout
         actions = act_along(plain, [build_teammate(plain, task.teammate) for task in own], common_states(plain).records)
         numbers = np.array(group_behaviours(actions))
         for number in dict.fromkeys(numbers.tolist()):
-            found.append(Behaviour(tuple(own[k] for k in np.flatnonzero(numbers == number))))
+            found.append(tuple(own[k] for k in np.flatnonzero(numbers == number)))
     return found
 
 
@@ -130,22 +114,23 @@ def with_headroom(tasks: Iterable[Task]) -> list[Task]:
     return kept
 
 
+@dataclass(frozen=True)
 class TrainingJob:
     """A training by playing and the measurement of its ego, a job of a queue, see `icrl4aht_generation.jobs.job.Job`.
 
-    Base of dataclasses with these fields.
-
     Attributes:
+        tasks: the tasks that the ego plays.
         seed: seed of the training.
         options: settings of the training.
         out: folder of all trainings.
         xla_threads: threads of XLA on a CPU.
     """
 
+    tasks: tuple[Task, ...]
     seed: int
     options: ResponseOptions
     out: Path
-    xla_threads: int | None
+    xla_threads: int | None = 1
 
     @property
     def name(self) -> str:
@@ -243,35 +228,28 @@ class TrainingJob:
         def done(step: int, loss: float | None) -> None:
             on_update(step, (self.progress() or (0, 0.0))[1])
 
-        played: Any = {"trainer": trainer, "params": params, "done": done}
-        state = train(method, TrainingData(None, {}), options, self.folder / "run", self.settings, **played)
+        task = TrainingTask(method, TrainingData(None, {}), options, self.settings, trainer)
+        state = task.train(self.folder / "run", params=params, done=done)
         return trainer, state.params
 
 
 @dataclass(frozen=True)
 class ResponseJob(TrainingJob):
-    """The training and evaluation of one best response.
+    """The training and evaluation of one best response, to the teammates of one of `find_behaviours`.
 
-    Attributes:
-        behaviour: whom it plays with.
+    It trains with the teammate of the first task.
     """
-
-    behaviour: Behaviour
-    seed: int
-    options: ResponseOptions
-    out: Path
-    xla_threads: int | None = 1
 
     @property
     def name(self) -> str:
         """Task, the model that it starts from, width and seed."""
         start = f"-{self.options.init}" if self.options.init else ""
-        return f"{self.behaviour.tasks[0].task_id}{start}-{self.ending}"
+        return f"{self.tasks[0].task_id}{start}-{self.ending}"
 
     @property
     def label(self) -> str:
         """Layout, teammate and seed."""
-        task, others = self.behaviour.tasks[0], len(self.behaviour.tasks) - 1
+        task, others = self.tasks[0], len(self.tasks) - 1
         alike = f" and {others} alike" if others else ""
         return f"{task.layout.name} {task.teammate_family}/t{task.teammate['theta_id']}{alike}, seed {self.seed}"
 
@@ -279,7 +257,7 @@ class ResponseJob(TrainingJob):
     def settings(self) -> dict[str, Any]:
         """What the result depends on."""
         seeds = {"choice_seeds": list(CHOICE_SEEDS), "report_seeds": list(REPORT_SEEDS), "protocol": PROTOCOL}
-        return {"tasks": [task.task_id for task in self.behaviour.tasks], **super().settings, **seeds}
+        return {"tasks": [task.task_id for task in self.tasks], **super().settings, **seeds}
 
     def finished_text(self) -> str:
         """Return the text on the finished training."""
@@ -289,17 +267,17 @@ class ResponseJob(TrainingJob):
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
         """Train the ego, play the tasks, and return the returns on the episodes to choose by and to report.
 
-        The returns are means over the behaviour's tasks, of the most probable actions ("greedy") and of drawn ones
+        The returns are means over the tasks, of the most probable actions ("greedy") and of drawn ones
         ("sampled"). "slope" is the rise of the training's return from the third to the last quarter of its steps.
         """
-        task, params = self.behaviour.tasks[0], None
-        mates = [build_teammate(task.layout, task.teammate)] * self.options.tasks
-        group = TaskGroup([task.layout], task.teammate_kind, mates, False, task.layout.name)
+        task, params = self.tasks[0], None
         if self.options.init:
             models = bundled_models()
             if self.options.init not in models:
                 raise unknown("bundled model", self.options.init, models)
             params = read_trained(models[self.options.init].runs[track_of(task.layout.name)]).params
+        mates = [build_teammate(task.layout, task.teammate)] * self.options.tasks
+        group = TaskGroup([task.layout] * len(mates), task.teammate_kind, mates, False, task.layout.name)
         trainer, params = self.train([task.layout], [group], on_update, params)
         modes = {}
         for mode, greedy in (("greedy", True), ("sampled", False)):
@@ -315,8 +293,7 @@ class ResponseJob(TrainingJob):
     def _mean_return(self, policy: Policy, seeds: Sequence[int]) -> float:
         # The memory is cleared before each episode, as it was in training.
         played: dict[str, Any] = {"seeds": seeds, "control": "forgets", "played": lambda count: None}
-        tasks = list(self.behaviour.tasks)
-        results = evaluate("best response", lambda layout: policy, tasks, get_protocol(PROTOCOL), **played)
+        results = evaluate("best response", lambda layout: policy, self.tasks, PROTOCOL, **played)
         return round(float(np.mean([result.returns for result in results])), 3)
 
 
@@ -337,19 +314,19 @@ def trained_response(job: ResponseJob) -> TrainedResponse:
     )
 
 
-def best_of(behaviour: Behaviour, trainings: Iterable[TrainedResponse]) -> BestResponse:
-    """Return the best response to a behaviour.
+def best_of(tasks: Sequence[Task], trainings: Iterable[TrainedResponse]) -> BestResponse:
+    """Return the best response in tasks whose teammates act alike.
 
     The best training is that with the highest return on the episodes to choose by; B is its return on the others. Of
     trainings with the same seed, start, steps and width the last one counts.
     """
-    task, seeds = behaviour.tasks[0], {(one.init, one.steps, one.width, one.seed): one for one in trainings}
+    task, seeds = tasks[0], {(one.init, one.steps, one.width, one.seed): one for one in trainings}
     best = chosen_training(seeds.values())
     return BestResponse(
         layout=task.layout.name,
         family=task.teammate_family,
         split=task.split,
-        tasks=tuple(one.task_id for one in behaviour.tasks),
+        tasks=tuple(one.task_id for one in tasks),
         seeds=tuple(seeds.values()),
         best=best.mean_return,
         agent=f"best response, seed {best.seed}" + (f" from {best.init}" if best.init else ""),
@@ -361,7 +338,7 @@ def best_with_models(found: BestResponse, models: Mapping[str, Mapping[str, floa
 
     Args:
         found: the best response.
-        models: model -> task id -> mean return; models without one of the behaviour's tasks do not count.
+        models: model -> task id -> mean return; models without one of its tasks do not count.
     """
     earned = {
         name: float(np.mean([returns[task] for task in found.tasks]))
@@ -375,41 +352,42 @@ def best_with_models(found: BestResponse, models: Mapping[str, Mapping[str, floa
 
 
 def write_responses(
-    jobs: Sequence[ResponseJob], path: Path, models: Mapping[str, Mapping[str, float]] = MappingProxyType({})
-) -> None:
-    """Add the best responses of finished trainings to a file, see `icrl4aht_data.benchmark.best_responses`.
+    jobs: Sequence[ResponseJob], folder: Path, models: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+) -> Path:
+    """Add the best responses of finished trainings to a folder's `RESPONSES_FILE`. Return its path.
 
-    Earlier trainings of a behaviour in the file are kept. An entry that shares only some tasks with a new one is
+    Earlier trainings of the same tasks in the file are kept. An entry that shares only some tasks with a new one is
     removed. The version is a hash of all entries.
 
     Args:
         jobs: the trainings.
-        path: the file.
+        folder: the folder.
         models: returns of other models, see `best_with_models`.
     """
-    finished: dict[tuple[str, ...], list[ResponseJob]] = defaultdict(list)
+    path, finished = folder / RESPONSES_FILE, defaultdict[tuple[str, ...], list[ResponseJob]](list)
     for job in jobs:
         if job.is_finished():
-            finished[tuple(task.task_id for task in job.behaviour.tasks)].append(job)
+            finished[tuple(task.task_id for task in job.tasks)].append(job)
     known = {one.tasks: one for one in (read_best_responses(path).behaviours if path.is_file() else ())}
     found = {}
     for ids, own in finished.items():
         before = known[ids].seeds if ids in known else ()
-        found[ids] = best_of(own[0].behaviour, [*before, *map(trained_response, own)])
+        found[ids] = best_of(own[0].tasks, [*before, *map(trained_response, own)])
     new = {task for ids in found for task in ids}
     kept = [one for ids, one in known.items() if new.isdisjoint(ids)]
     behaviours = tuple(best_with_models(one, models) for one in (*kept, *found.values()))
     card = BestResponseCard(json_hash(to_builtins(behaviours)), PROTOCOL, ABOUT, behaviours)
     write_best_responses(path, card)
+    return path
 
 
-def responses_table(path: Path) -> str:
-    """Return a Markdown table of a file's best responses: B, the least and most of the trainings, and their rise.
+def responses_table(folder: Path) -> str:
+    """Return a Markdown table of a folder's best responses: B, the least and most of the trainings, and their rise.
 
     The rise is that of the last quarter of the best training's steps; one of several points says that it was too short.
     """
     body = []
-    for one in read_best_responses(path).behaviours:
+    for one in read_best_responses(folder / RESPONSES_FILE).behaviours:
         returns, best = [seed.mean_return for seed in one.seeds], chosen_training(one.seeds)
         numbers = ", ".join(task.rsplit("_", 3)[1] for task in one.tasks)
         spread = f"{min(returns):.1f} to {max(returns):.1f}" if len(returns) > 1 else ""

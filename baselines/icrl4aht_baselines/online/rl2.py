@@ -82,10 +82,10 @@ class PlayState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TaskGroup:
-    """Tasks of one family of teammates, on one layout or on one for each task.
+    """Tasks of one family of teammates.
 
     Attributes:
-        layouts: the layout of all tasks alone, or one for each task.
+        layouts: layout of each task.
         family: kind of the teammates, such as "assembly_line".
         teammates: policies that share their functions, one for each task.
         hidden: whether the model does not see recipe indicators.
@@ -104,11 +104,6 @@ class TaskGroup:
     def name(self) -> str:
         """Name in the log."""
         return f"{self.label} {self.family}"
-
-    @property
-    def task_layouts(self) -> Sequence[Layout]:
-        """The layout of each task."""
-        return self.layouts if len(self.layouts) > 1 else [self.layouts[0]] * len(self.teammates)
 
 
 def make_groups(
@@ -134,7 +129,7 @@ def make_groups(
         count = max(1, round(tasks * shares[layout.name] / total / families[layout.name]))
         chosen = [policies[number] for number in chosen_teammates(len(policies), count)]
         mates = with_behaviours(chosen, mixed_chances(count))
-        groups.append(TaskGroup([layout], family, mates, layout.name in hidden, layout.name))
+        groups.append(TaskGroup([layout] * count, family, mates, layout.name in hidden, layout.name))
     return groups
 
 
@@ -173,7 +168,7 @@ class _Player:
         self._partners = jnp.asarray(np.concatenate(told), jnp.int32) if told else None
         # A model whose view never changes needs no code for it, which is a part of every step and of its compilation.
         self._changes = mirror or bool(self._hidden.any())
-        played = [layout for group in groups for layout in group.task_layouts]
+        played = [layout for group in groups for layout in group.layouts]
         layouts = list(dict.fromkeys(played))
         number = {layout: position for position, layout in enumerate(layouts)}
         several = len(layouts) > 1

@@ -12,7 +12,6 @@ import numpy as np
 
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks, get_protocol
-from icrl4aht_baselines.methods.options import UNUSED_OPTIONS
 from icrl4aht_baselines.online.responses import find_behaviours
 from icrl4aht_baselines.report.page import markdown_sections
 from icrl4aht_baselines.report.results import (
@@ -23,14 +22,12 @@ from icrl4aht_baselines.report.results import (
 )
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, SUBMITTED_SEEDS
 from icrl4aht_baselines.report.tables import PAPER_METHODS, instances_range, published_cells
-from icrl4aht_baselines.training.seen import TASKS_SOURCE, TRAINED_ON, describe_training, overlap_legend
+from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
 from icrl4aht_data.utils.templates import fill_template, markdown_table
 
 HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json", "behaviours.json")
-
-_NOT_LISTED = ("layouts", "root", "groups", "selections", "sizes", "manifest_sha256", "data_version", "obs_shape")
 
 HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
 """Layout -> family -> reference ego -> mean return."""
@@ -46,19 +43,16 @@ def model_card(
     """Return README.md of a bundled model, which has a model for each track.
 
     Args:
-        run: results of all of its models on test tasks. The card's table of models has a row for each, and there are
-            settings for each that differ.
+        run: results of all of its models on test tasks. The card's table of models has a row for each.
         title: name of the bundled model.
         command: command that makes it.
         validation: further results, on validation tasks under the same protocol, which get tables, too.
         pictures: path of a picture with curves, relative to the card -> what it shows.
     """
     models: dict[str, list[ResultSource]] = defaultdict(list)
-    settings: dict[str, list[str]] = defaultdict(list)
     for source in run.sources:
         if source.trained:
             models[source.trained["run_hash"]].append(source)
-            settings[_settings(source.trained["config"])] += source.layouts
     configs: list[dict[str, Any]] = [(sources[0].trained or {})["config"] for sources in models.values()]
     config = configs[0]
     seeds = ", ".join(dict.fromkeys(str(config["train"]["seed"]) for config in configs))
@@ -70,16 +64,11 @@ def model_card(
     ]
     properties = {
         "method": config["method"],
-        "data": "; ".join(dict.fromkeys(_release(one["histories"]) for one in configs)),
         "created with": f"icrl4aht-data {config['package_version']}",
         "made by": f"`{command}`",
     }
     sections = [section for one in (run, *validation) for section in markdown_sections([one], one.protocol)]
     shown = [f"{text}:\n\n![{Path(at).stem}]({at})" for at, text in pictures.items()]
-    listed = [
-        f"Tested on {', '.join(dict.fromkeys(layouts))}:\n\n{text}" if len(settings) > 1 else text
-        for text, layouts in settings.items()
-    ]
     return fill_template(
         "baseline.md",
         title=title,
@@ -87,17 +76,11 @@ def model_card(
         training=" ".join(dict.fromkeys(map(training_sentence, configs))),
         properties="\n".join(f"| {name} | {value} |" for name, value in properties.items()),
         models="\n".join(_model_row(run, sources) for sources in models.values()),
-        settings="\n\n".join(listed),
         protocol=run.protocol,
         results="\n\n".join(f"#{section}" for section in sections),
         curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
         limits="\n".join(f"* {limit}" for limit in limits),
     )
-
-
-def _release(histories: Mapping[str, Any]) -> str:
-    """Return the name and the data version of the release that a model was trained with."""
-    return f"the local release `{Path(histories['root']).name}`, data version {histories['data_version']}"
 
 
 def training_sentence(config: Mapping[str, Any]) -> str:
@@ -123,32 +106,17 @@ def training_sentence(config: Mapping[str, Any]) -> str:
 def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
     """Return a row of the table of models: training data and seed of one model, and its evaluation."""
     trained: dict[str, Any] = sources[0].trained or {}
-    config, histories = trained["config"], trained["config"]["histories"]
-    layouts = ", ".join(histories["layouts"])
-    if "groups" in histories:  # trained by playing
-        others = sum(cell["tasks"] for cell in config.get(TRAINED_ON, ()) if cell.get("source") == TASKS_SOURCE)
-        selection = f"none: {sum(histories['groups'].values())} tasks at a time, played with the teammates of the "
-        selection += f"release's histories of {layouts}" + f", and with those of {others} other tasks" * bool(others)
-    else:
-        selection = f"{histories['sizes']['train']} of {layouts}"
+    histories = trained["config"]["histories"]
     instances = instances_range(len(run.cells[cell]) for source in sources for cell in source.tasks)
     values = [
         ", ".join(dict.fromkeys(layout for source in sources for layout in source.layouts)),
-        f"{selection}; the release's manifest has SHA-256 `{trained['manifest_sha256']}`",
+        f"`{Path(histories['root']).name}`, data version {histories['data_version']}, manifest with SHA-256 "
+        f"`{trained['manifest_sha256']}`",
         describe_training(sources[0].seen),
-        str(config["train"]["seed"]),
+        str(trained["config"]["train"]["seed"]),
         f"{sources[0].conditions}, {instances} in a cell",
     ]
     return f"| {' | '.join(values)} |"
-
-
-def _settings(config: Mapping[str, Any]) -> str:
-    """Return the settings of a model as a list."""
-    unused = {*UNUSED_OPTIONS.get(config.get("method", ""), ()), *_NOT_LISTED}
-    parts = [config["model"], config["train"], config.get("play", {}), config["histories"]]
-    parts.append({"started from run": (config.get("init") or {}).get("run")})
-    shown = {name: value for part in parts for name, value in part.items() if name not in unused}
-    return "\n".join(f"* {name.replace('_', ' ')}: {value}" for name, value in shown.items() if value not in (None, []))
 
 
 def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:
@@ -178,7 +146,7 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
 def find_alike_tasks() -> list[list[str]]:
     """Return lists of test task ids; the teammates of the tasks in a list act alike."""
     tasks = [task for track in TRACKS for task in bundled_tasks(track, "test")]
-    return [[task.task_id for task in one.tasks] for one in find_behaviours(tasks) if len(one.tasks) > 1]
+    return [[task.task_id for task in alike] for alike in find_behaviours(tasks) if len(alike) > 1]
 
 
 def write_headroom_cards(runs: Sequence[EvaluationRun], alike: Sequence[Sequence[str]], folder: Path) -> list[Path]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from types import MappingProxyType
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.report.tables import describe_conditions, mean_of
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
-from icrl4aht_data.plotting import MOST_PANELS, return_limits, running_mean
+from icrl4aht_data.plotting import return_limits, running_mean
 
 SMOOTHING = 10
 """Most episodes in the running mean of a curve of returns; of few episodes a tenth."""
@@ -195,42 +195,26 @@ def _series(runs: NumberedRuns, cells: Sequence[ResultCell]) -> list[tuple[int, 
     ]
 
 
-def split_cells(cells: Iterable[ResultCell], most: int = MOST_PANELS) -> list[list[ResultCell]]:
-    """Return cells in lists of at most `most`, such as for pictures.
-
-    A list has one kind of tasks, and all cells of a layout unless these are more than `most`.
-    """
-    split: list[list[ResultCell]] = []
-    ordered = sorted(cells, key=lambda cell: (cell.order[-1], cell.order))
-    for (kind, _), group in groupby(ordered, key=lambda cell: (cell.kind, cell.layout)):
-        of_layout = list(group)
-        if split and split[-1][0].kind == kind and len(split[-1]) + len(of_layout) <= most:
-            split[-1] += of_layout
-        else:
-            split += [of_layout[start : start + most] for start in range(0, len(of_layout), most)]
-    return split
-
-
 def curve_charts(runs: NumberedRuns) -> list[Chart]:
-    """Return charts with a panel per cell and each run's return per episode, of at most `MOST_PANELS` panels.
+    """Return a chart for each kind of tasks and layout, with a panel per family and each run's return per episode.
 
     Lines are running means of the mean over a cell's instances; bands are the range of the instances' running means.
     """
     charts = []
-    parts = split_cells({cell for run in runs.values() for cell in run.cells})
-    kinds = [cells[0].kind for cells in parts]
-    for cells in parts:
-        title = f"{cells[0].kind.capitalize()} tasks"
-        if kinds.count(cells[0].kind) > 1:
-            title += f" on {', '.join(dict.fromkeys(cell.layout for cell in cells))}"
-        shown = {number: run for number, run in runs.items() if not run.cells.keys().isdisjoint(cells)}
-        charts.append(_curve_chart(title, shown, cells))
+    cells = sorted({cell for run in runs.values() for cell in run.cells}, key=lambda cell: (cell.order[-1], cell.order))
+    for (kind, layout), group in groupby(cells, key=lambda cell: (cell.kind, cell.layout)):
+        of_layout = list(group)
+        shown = {number: run for number, run in runs.items() if not run.cells.keys().isdisjoint(of_layout)}
+        charts.append(_curve_chart(f"{kind.capitalize()} tasks on {layout}", shown, of_layout))
     return charts
 
 
 def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) -> Chart:
     raw = {(number, cell): run.cells[cell] for number, run in runs.items() for cell in cells if cell in run.cells}
-    smooth = {key: np.stack([_smooth(returns) for returns in of_cell]) for key, of_cell in raw.items()}
+    smooth = {
+        key: np.stack([running_mean(returns, min(SMOOTHING, len(returns) // 10)) for returns in of_cell])
+        for key, of_cell in raw.items()
+    }
     drawn = [*smooth.values(), *(of_cell.mean(axis=0) for of_cell in raw.values())]
     y = _Scale(*return_limits(float(value) for found in drawn for value in found.flat))
     episodes = max(returns.shape[1] for returns in raw.values())
@@ -248,11 +232,6 @@ def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) ->
     return Chart(
         title, describe_conditions(runs.values(), cells), _series(runs, cells), x_ticks, y_ticks, panels=panels
     )
-
-
-def _smooth(returns: np.ndarray) -> np.ndarray:
-    """Return the running mean of a task's returns over up to `SMOOTHING` episodes."""
-    return running_mean(returns, min(SMOOTHING, len(returns) // 10))
 
 
 def _curve(number: int, smooth: np.ndarray, raw: np.ndarray, x: _Scale, y: _Scale) -> Curve:

@@ -18,6 +18,7 @@ from typing import Any
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.report.figures import SMOOTHING, bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, family_gifs
 from icrl4aht_baselines.report.results import (
@@ -37,7 +38,6 @@ REPORT_FILES = ("report.md", "report.csv")
 """Files that `write_report` writes."""
 
 _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
-_REFERENCE_RANK = {"oracle": 1, "random": 2, "stay": 3}
 
 
 def write_report(runs: Sequence[EvaluationRun], out: Path) -> list[Path]:
@@ -133,16 +133,15 @@ def write_page_with_episodes(
 ) -> Path:
     """Write the page with episodes of a task per family of teammates, of at most three runs. Return its path.
 
+    Reference egos come after the other runs.
+
     Args:
         runs, path, notes: see `write_page`.
         episodes: False for a page without episodes.
         suite: folder of learned teammates' checkpoints.
         progress: called with (description, tasks drawn, tasks).
     """
-    # The page has few episodes: different agents come before the second run of one, and reference egos come last.
-    repeats = [sum(earlier.agent == run.agent for earlier in runs[:number]) for number, run in enumerate(runs)]
-    order = sorted(range(len(runs)), key=lambda k: (_REFERENCE_RANK.get(runs[k].agent, 0), repeats[k], k))
-    shown = [runs[number] for number in order[:_RUNS_WITH_EPISODES]] if episodes else []
+    shown = sorted(runs, key=lambda run: run.agent in AGENTS)[:_RUNS_WITH_EPISODES] if episodes else []
     left = [run.label for run in runs if run not in shown]
     if shown and left:
         notes = [*notes, f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}"]

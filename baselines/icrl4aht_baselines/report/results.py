@@ -254,36 +254,6 @@ class EvaluationRun:
         varied = "" if self.variant is None else ", {} = {}".format(*self.variant)
         return self.agent + varied + (f" [{self.note}]" if self.note else "")
 
-    @cached_property
-    def name(self) -> str:
-        """The label with the protocol in parentheses."""
-        return f"{self.label} ({self.protocol})"
-
-
-def cell_rows(
-    agent: tuple[Any, ...],
-    cell: ResultCell,
-    returns: np.ndarray,
-    overlaps: Iterable[str] = (),
-    tasks: Sequence[str] = (),
-    seeds: Sequence[int] = (),
-) -> list[tuple[Any, ...]]:
-    """Return the rows of a table for one cell, with a value for each of `TABLE_COLUMNS`.
-
-    Args:
-        agent: values of `AGENT_COLUMNS`.
-        cell, overlaps: see the module's docstring.
-        returns: return of each episode, (tasks, seeds, episodes).
-        tasks, seeds: keys of the tasks, and the seeds; numbers by default.
-    """
-    marks = " ".join(overlaps)
-    return [
-        (*agent, *cell, marks, tasks[row] if tasks else str(row), seeds[column] if seeds else column, block, value)
-        for block, values in episode_blocks(returns).items()
-        for row, of_task in enumerate(values.tolist())
-        for column, value in enumerate(of_task)
-    ]
-
 
 def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
     """Return the mean return in each block that exists, (...), of the returns of all episodes, (..., episodes)."""
@@ -415,7 +385,12 @@ def as_run(
         returns = np.array([of_task for _, of_task in played[cell]], np.float64)  # (tasks, seeds, episodes)
         cells[cell], tracks[track][cell] = returns.mean(axis=1), of_cell
         overlaps, names = find_overlaps(of_cell, seen[track]), [task_label(task.task_id) for task in of_cell]
-        rows += cell_rows((agent[0], 0, agent[1], ""), cell, returns, overlaps, names, seeds)
+        rows += [
+            (agent[0], 0, agent[1], "", *cell, " ".join(overlaps), name, seed, block, value)
+            for block, values in episode_blocks(returns).items()
+            for name, of_task in zip(names, values.tolist(), strict=True)
+            for seed, value in zip(seeds, of_task, strict=True)
+        ]
     sources = tuple(ResultSource(where, settings, trained, own, seen[track]) for track, own in tracks.items())
     variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
     return EvaluationRun(*agent, pd.DataFrame(rows, columns=TABLE_COLUMNS), cells, variant, sources=sources)
@@ -445,7 +420,7 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
     """
     merged: list[EvaluationRun] = []
     for run in runs:
-        same = [other for other in merged if other.name == run.name]
+        same = [other for other in merged if (other.label, other.protocol) == (run.label, run.protocol)]
         fitting = [
             other for other in same if _rules(other) == _rules(run) and not other.cells.keys() & run.cells.keys()
         ]

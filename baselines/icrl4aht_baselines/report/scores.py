@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from icrl4aht_baselines.evaluate.controls import ControlledResults
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS
 from icrl4aht_baselines.report.results import (
     CELL_COLUMNS,
@@ -33,6 +34,8 @@ from icrl4aht_baselines.report.statistics import MeanInterval, Stratum, interqua
 from icrl4aht_data.benchmark.best_responses import best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
 from icrl4aht_data.benchmark.reference_returns import alike_tasks, has_headroom, read_headroom, stay_returns
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.utils.text import counted_noun
 
 
 class TaskScale(NamedTuple):
@@ -282,3 +285,32 @@ def cell_scores(run: EvaluationRun, scales: CellScales) -> dict[ResultCell, Mean
         cell: ratio_interval([[_scaled(run.returns[cell], scales[cell])[-1]]])
         for cell in scored_cells(run, run.returns, scales)
     }
+
+
+def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str]:
+    """Return two lines for each track: M and P, means over layouts and families with their 95 % intervals.
+
+    The intervals are those of the scores: within each layout and family, behaviours of teammates are resampled, or the
+    seeds of the tasks if there is one behaviour.
+
+    Args:
+        results: results of the tasks.
+        tasks: the tasks, in the order of the results.
+    """
+    alike, last, lines = behaviour_names(), counted_noun(results.last, "last episode"), []
+    names = [alike.get(task_label(task.task_id), task.task_id) for task in tasks]
+    cells = pd.DataFrame([(task.track, task.layout.name, task.teammate_family) for task in tasks])
+    for track, of_track in cells.groupby(0, sort=False):
+        texts = []
+        for values in (results.memory, results.partner):
+            strata = [
+                behaviour_stratum(values[None, own.index], np.ones(len(own)), [names[row] for row in own.index])
+                for _, own in of_track.groupby([1, 2], sort=False)
+            ]
+            texts.append(ratio_interval([[stratum] for stratum in strata]).text(sign="+"))
+        memory, partner = texts
+        lines += [
+            f"track {track}, memory M: {memory}, return minus return with the memory cleared before each episode",
+            f"track {track}, partner P: {partner}, return in the {last} minus return in them after another teammate",
+        ]
+    return lines

@@ -40,9 +40,6 @@ _CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammat
 }
 """Name in an entry of `training_cells` -> field of the index."""
 
-VALIDATION = "validation"
-"""Split of the histories that are held out where a release has them."""
-
 
 def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
     """Return the training of a method on histories; each process of several gets its share of the batches.
@@ -138,7 +135,7 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
     every = ALL_LAYOUTS in histories.layouts
     release = load_icrl4aht(histories.root, obs="uint8")  # first, since it may carry layouts of its own
     names = None if every else [get_layout(name).name for name in histories.layouts]
-    found = filter_histories(release.filter(split=histories.split, layout=names), histories.filters)
+    found = filter_histories(release.filter(split="train", layout=names), histories.filters)
     differ = len({layout.obs_shape for layout in found.layouts}) > 1
     channels = histories.channels or ("canonical" if every or differ else "own")
     if channels == "own" and differ:
@@ -150,10 +147,9 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
     options: Any = {"obs": "state" if found.has_states else None, "channels": channels}
     filters: Any = {FILTERS[name]: list(values) for name, values in histories.filters.items()}
     validation = None
-    if histories.split != VALIDATION:
-        with suppress(EmptySelectionError):
-            validation = release.filter(split=VALIDATION, layout=[one.name for one in found.layouts], **filters)
-            validation = validation.with_options(**options)
+    with suppress(EmptySelectionError):
+        validation = release.filter(split="validation", layout=[one.name for one in found.layouts], **filters)
+        validation = validation.with_options(**options)
     return found.with_options(**options), validation
 
 
@@ -264,17 +260,16 @@ class HistorySplit(NamedTuple):
     teammates: Dataset | None
 
 
-def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Dataset | None = None) -> HistorySplit:
+def hold_out(dataset: Dataset, share: float = 0.1, validation: Dataset | None = None) -> HistorySplit:
     """Hold out a share of the teammates, and a share of the histories with the others; at least one each.
 
     Where each task has one history, only teammates are held out. Every task with a teammate that is not held out keeps
-    at least one history. The choice depends on names and the seed alone, see `splitting`; `Dataset.split` makes the
+    at least one history. The choice depends on names alone, see `splitting`; `Dataset.split` makes the
     same choice of teammates or of histories.
 
     Args:
         dataset: the histories to divide.
         share: share of the teammates, and of the histories with the others.
-        seed: seed of the choice.
         validation: histories with other teammates, such as those of split validation: these are the part `teammates`
             then, and no teammate of `dataset` is held out.
 
@@ -283,12 +278,12 @@ def hold_out(dataset: Dataset, share: float = 0.1, seed: int = 0, validation: Da
     """
     teammates = validation
     if validation is None:
-        with_held = choose_teammates(teammate_names(dataset), share, seed)
+        with_held = choose_teammates(teammate_names(dataset), share, 0)
         if with_held.any():
             dataset, teammates = dataset.select(~with_held), dataset.select(with_held)
     if teammates is not None and len(dataset) == len(set(dataset.column("task_id").tolist())):
         return HistorySplit(train=dataset, histories=None, teammates=teammates)
-    held = choose_histories(dataset, share, seed)
+    held = choose_histories(dataset, share, 0)
     return HistorySplit(train=dataset.select(~held), histories=dataset.select(held), teammates=teammates)
 
 

@@ -108,7 +108,7 @@ class ResponseOptions:
 
 
 SAVE_MINUTES = 5.0
-"""Most minutes between checkpoints of a training run. Results do not depend on it, so it is no setting of a run."""
+"""Most minutes between checkpoints of a training run, which are also written every `save_every` steps."""
 
 FILTERS = {name: name for name in ("teammate_family", "source", "label_view")} | {"algorithm": "teammate_kind"}
 """Field of `HistoryOptions` -> the field of a release's index that it filters by."""
@@ -120,17 +120,15 @@ ALL_LAYOUTS = "all"
 
 @dataclass(frozen=True)
 class HistoryOptions:
-    """Choice of the histories that a run is trained on.
+    """Choice of the training histories of a release that a run is trained on.
 
     Attributes:
         layouts: names of training layouts, or `ALL_LAYOUTS` alone.
         root: folder or address of a release; None for the bundled mini release.
-        split: split of the release.
     """
 
     layouts: tuple[str, ...]
     root: str | None = None
-    split: str = "train"
     teammate_family: Annotated[
         tuple[str, ...],
         Option("Only histories with teammates of this family: rl (learned), H1, H2, H3 or H4; repeat for several."),

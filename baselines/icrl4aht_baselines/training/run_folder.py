@@ -50,6 +50,22 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
+def check_same_settings(found: dict[str, Any], expected: dict[str, Any], what: str) -> None:
+    """Check that stored settings are the expected ones.
+
+    Args:
+        found: the stored settings.
+        expected: the settings of what is to be resumed.
+        what: path and kind of what has the stored settings, for the message.
+
+    Raises:
+        OptionError: if not; names each setting that differs.
+    """
+    if different := differing_settings(found, expected):
+        listed = "; ".join(f"{name}: it has {a!r:.80}, expected {b!r:.80}" for name, (a, b) in different.items())
+        raise OptionError(f"{what} of other settings ({listed}); give another --out, or remove it")
+
+
 def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
     """Start a run in a folder, or check that the run in it has the same settings. Return the settings in the folder.
 
@@ -65,10 +81,7 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
     """
     if (folder / CONFIG).exists() and Checkpoints(folder / CHECKPOINTS).latest is not None:
         found = read_config(folder)
-        different = differing_settings(found, config)
-        if different:
-            listed = "; ".join(f"{name}: the run has {a!r}, expected {b!r}" for name, (a, b) in different.items())
-            raise OptionError(f"{folder}: holds a run of other settings ({listed}); give another --out")
+        check_same_settings(found, config, f"{folder}: holds a run")
         return found
     check_own_folder(folder, _FILES, "a run")
     folder.mkdir(parents=True, exist_ok=True)

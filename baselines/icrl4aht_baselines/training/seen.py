@@ -125,8 +125,7 @@ def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[s
 
 def _overlap_kinds(names: Iterable[str]) -> list[OverlapKind]:
     """Return kinds of overlap in the order of `OVERLAPS`."""
-    found = set(names)
-    return [kind for name, kind in OVERLAPS.items() if name in found]
+    return [OVERLAPS[name] for name in sorted(set(names), key=[*OVERLAPS].index)]
 
 
 def overlap_marks(overlaps: Iterable[str]) -> str:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import signal
-from types import FrameType, TracebackType
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import current_thread, main_thread
+from types import FrameType
 from typing import Any
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -18,45 +21,34 @@ class TrainingStopped(SystemExit):
     """
 
     def __init__(self, number: int, message: str) -> None:
-        super().__init__(128 + number)
-        self.message = message
+        super().__init__(number, message)
+        self.code = 128 + number
 
     def __str__(self) -> str:
-        return self.message
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (int(self.code or 128) - 128, self.message)
+        return self.args[1]
 
 
-class StopSignals:
-    """Context in which SIGTERM and SIGINT are noted instead of ending the process.
+@contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """Context in which SIGTERM and SIGINT are noted, in the list that it yields, instead of ending the process.
 
     Further SIGTERMs are ignored, since schedulers and wrappers may send several; a second SIGINT has its usual effect.
     Outside the main thread, where Python accepts no handlers, nothing is noted.
-
-    Attributes:
-        received: number of the first signal; 0 if there was none.
     """
+    received: list[int] = []
+    before: dict[int, Any] = {}
 
-    def __init__(self) -> None:
-        self.received = 0
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> StopSignals:
-        try:
-            for number in _SIGNALS:
-                self._before[number] = signal.signal(number, self._note) or signal.SIG_DFL
-        except ValueError:  # not the main thread
-            self._before.clear()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.received = self.received or number
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
         if number == signal.SIGINT:
-            signal.signal(number, self._before[number])
+            signal.signal(number, before[number])
+
+    if current_thread() is main_thread():
+        before = {number: signal.getsignal(number) or signal.SIG_DFL for number in _SIGNALS}
+        for number in _SIGNALS:
+            signal.signal(number, note)
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

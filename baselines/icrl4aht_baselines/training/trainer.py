@@ -27,7 +27,7 @@ from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.plotting import plot_training_log
 from icrl4aht_baselines.training.options import SAVE_MINUTES, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, TENSORBOARD, format_versions, open_run
-from icrl4aht_baselines.training.stopping import StopSignals, TrainingStopped
+from icrl4aht_baselines.training.stopping import TrainingStopped, stop_signals
 from icrl4aht_baselines.training.tensorboard import TensorBoardLog, check_installed
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import can_draw
@@ -61,28 +61,6 @@ class TrainingData(NamedTuple):
 
     train: Any
     validation: Mapping[str, Any]
-
-
-class TrainingTask(NamedTuple):
-    """Arguments of `train`, except for a folder.
-
-    Attributes:
-        method: what to train.
-        data: batches to train on and to validate with.
-        options: how to train.
-        about: settings of model and data for config.json.
-        trainer: what computes the steps; None for a `Trainer`.
-    """
-
-    method: Method
-    data: TrainingData
-    options: TrainOptions
-    about: dict[str, Any]
-    trainer: Any = None
-
-    def train(self, folder: Path, **watched: Any) -> Any:
-        """Train into a folder, see `train`; `watched` are its further arguments."""
-        return train(self.method, self.data, self.options, folder, self.about, trainer=self.trainer, **watched)
 
 
 class TrainState(NamedTuple):
@@ -223,117 +201,113 @@ class Trainer:
         return lines
 
 
-def train(
-    method: Method,
-    data: TrainingData,
-    options: TrainOptions,
-    folder: Path,
-    about: Mapping[str, Any],
-    *,
-    trainer: Any = None,
-    params: Any = None,
-    tensorboard: bool = False,
-    save_minutes: float = SAVE_MINUTES,
-    done: StepProgress = lambda step, loss: None,
-) -> Any:
-    """Train to the end, from the start or from the last checkpoint in the folder.
+class TrainingTask(NamedTuple):
+    """A training, without its folder.
 
-    SIGTERM and SIGINT end the training after the running step, once its state is saved; a second SIGINT does not wait.
-
-    Args:
+    Attributes:
         method: what to train.
-        data: batches of `options.batch_size` rows.
-        options: how.
-        folder: receives config.json, metrics.jsonl (a function of the settings), timing.jsonl, checkpoints/ and, if
-            matplotlib is installed, curves.png.
-        about: further settings for config.json, such as the model's and the data's.
-        trainer: what computes the steps, with the interface of `Trainer`, which is the default.
-        params: initial parameters, such as those of another run; drawn by the seed by default.
-        tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
-        save_minutes: most minutes between checkpoints, which are also written every `options.save_every` steps.
-        done: called after every step, see `StepProgress`.
-
-    Returns:
-        The state after the last step, such as a `TrainState`.
-
-    Raises:
-        OptionError: if the folder has a run with other settings, or with another number of XLA threads, with which the
-            resumed training would give different bits; if tensorboardX is required and not installed.
-        BusyError: if another process trains in the folder.
-        TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
+        data: batches of `options.batch_size` rows to train on and to validate with; unused by methods that play.
+        options: how to train.
+        about: settings of model and data for config.json.
+        trainer: what computes the steps, with the interface of `Trainer`; None for a `Trainer`.
     """
-    if tensorboard:
-        check_installed()
-    trainer = trainer or Trainer(method, options)
-    config = {**format_versions(), "method": method.name, **about, "train": asdict(options)}
-    with ExitStack() as stack:
-        # All processes compute the same state; one of them writes it.
-        writes = jax.process_index() == 0
-        if writes:
-            stack.enter_context(run_lock(folder))
-        config = open_run(folder, config)
-        # The number of threads decides the order of sums, and so the bits that a resumed run must reach.
-        checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
-        if checkpoints.latest is None:
-            state = trainer.init()
-            state = state if params is None else _with_params(state, params)
-        else:
-            state = checkpoints.load(trainer.state_like())[0]
-        first = int(state.step)
-        # Lines after the checkpoint are dropped, since their steps are computed again.
-        log = stack.enter_context(closing(RunLog(folder, lambda line: line["step"] <= first)))
-        events = TensorBoardLog(folder / TENSORBOARD, folder / METRICS) if tensorboard and writes else None
-        if events:
-            stack.callback(events.close)
-        batches = stack.enter_context(trainer.batches(data.train, first, options.steps))
-        stop = stack.enter_context(StopSignals())  # entered last: what came before ends by a signal as usual
-        before = first, time.perf_counter(), 0.0
-        save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * save_minutes)
-        loss: float | None = None
-        for step, batch in enumerate(batches, start=first + 1):
-            state, numbers = trainer.step(state, batch)
-            last, lines = step == options.steps, []
-            if step % options.log_every == 0 or last:
-                # Reading numbers waits for the device, so that it is done only in steps that are logged.
-                lines.append({"step": step, "part": "train", **_as_floats(numbers)})
-                loss = lines[0]["loss"]
-            done(step, loss)
-            if step % options.validate_every == 0 or last:
-                lines += trainer.validation_lines(state, data.validation, step)
-            if lines:
-                waited = getattr(batches, "waited", 0.0)  # steps that are played have no loader
-                now = step, time.perf_counter(), waited
-                steps, seconds, waited = np.subtract(now, before)
-                speed = {"steps_per_second": round(steps / seconds, 4), "loader_wait": round(waited / seconds, 4)}
-                log.write(*lines, timing={"step": step, **speed})
-                before = now
-                if events:
-                    events.add(lines)
-            saves, stopped_by = agree_on_stop(save.due(step), stop.received)
-            if saves or stopped_by:
-                log.sync()  # a checkpoint whose log was lost could never get these lines again
-                checkpoints.save(state, step)
-            if stopped_by:
-                name = signal.Signals(stopped_by).name
-                where = f"{folder}: stopped by {name} after step {step} of {options.steps}"
-                raise TrainingStopped(stopped_by, f"{where}, whose state is saved; the same command resumes it")
-        if writes and can_draw():
-            plot_training_log(folder / METRICS, folder / RUN_CURVES, method.name)
-    return state
 
+    method: Method
+    data: TrainingData
+    options: TrainOptions
+    about: dict[str, Any]
+    trainer: Any = None
 
-def _with_params(state: Any, params: Any) -> Any:
-    """Return a state before the first step with other parameters.
+    def train(
+        self,
+        folder: Path,
+        *,
+        params: Any = None,
+        tensorboard: bool = False,
+        done: StepProgress = lambda step, loss: None,
+    ) -> Any:
+        """Train to the end, from the start or from the last checkpoint in the folder.
 
-    Raises:
-        OptionError: if they are of another model.
-    """
-    found, expected = (jax.tree.map(jnp.shape, tree) for tree in (params, state.params))
-    if found != expected:
-        raise OptionError("initial parameters: of a model of other options; give those of the run that they come from")
-    placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), params, state.params)
-    has_copy = getattr(state, "slow", None) is not None
-    return state._replace(params=placed, **({"slow": jax.tree.map(jnp.copy, placed)} if has_copy else {}))
+        SIGTERM and SIGINT end the training after the running step, once its state is saved; a second SIGINT does not
+        wait.
+
+        Args:
+            folder: receives config.json, metrics.jsonl (a function of the settings), timing.jsonl, checkpoints/ and, if
+                matplotlib is installed, curves.png.
+            params: initial parameters, such as those of another run; drawn by the seed by default.
+            tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
+            done: called after every step, see `StepProgress`.
+
+        Returns:
+            The state after the last step, such as a `TrainState`.
+
+        Raises:
+            OptionError: if the folder has a run with other settings, or with another number of XLA threads, with which
+                the resumed training would give different bits; if tensorboardX is required and not installed.
+            BusyError: if another process trains in the folder.
+            TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
+        """
+        if tensorboard:
+            check_installed()
+        options, trainer = self.options, self.trainer or Trainer(self.method, self.options)
+        config = {**format_versions(), "method": self.method.name, **self.about, "train": asdict(options)}
+        with ExitStack() as stack:
+            # All processes compute the same state; one of them writes it.
+            writes = jax.process_index() == 0
+            if writes:
+                stack.enter_context(run_lock(folder))
+            config = open_run(folder, config)
+            # The number of threads decides the order of sums, and so the bits that a resumed run must reach.
+            checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
+            if checkpoints.latest is None:
+                state = trainer.init()
+                if params is not None:
+                    placed = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), params, state.params)
+                    slow = {"slow": jax.tree.map(jnp.copy, placed)} if getattr(state, "slow", None) is not None else {}
+                    state = state._replace(params=placed, **slow)
+            else:
+                state = checkpoints.load(trainer.state_like())[0]
+            first = int(state.step)
+            # Lines after the checkpoint are dropped, since their steps are computed again.
+            log = stack.enter_context(closing(RunLog(folder, lambda line: line["step"] <= first)))
+            events = TensorBoardLog(folder / TENSORBOARD, folder / METRICS) if tensorboard and writes else None
+            if events:
+                stack.callback(events.close)
+            batches = stack.enter_context(trainer.batches(self.data.train, first, options.steps))
+            stop = stack.enter_context(stop_signals())  # entered last: what came before ends by a signal as usual
+            before = first, time.perf_counter(), 0.0
+            save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * SAVE_MINUTES)
+            loss: float | None = None
+            for step, batch in enumerate(batches, start=first + 1):
+                state, numbers = trainer.step(state, batch)
+                last, lines = step == options.steps, []
+                if step % options.log_every == 0 or last:
+                    # Reading numbers waits for the device, so that it is done only in steps that are logged.
+                    lines.append({"step": step, "part": "train", **_as_floats(numbers)})
+                    loss = lines[0]["loss"]
+                done(step, loss)
+                if step % options.validate_every == 0 or last:
+                    lines += trainer.validation_lines(state, self.data.validation, step)
+                if lines:
+                    waited = getattr(batches, "waited", 0.0)  # steps that are played have no loader
+                    now = step, time.perf_counter(), waited
+                    steps, seconds, waited = np.subtract(now, before)
+                    speed = {"steps_per_second": round(steps / seconds, 4), "loader_wait": round(waited / seconds, 4)}
+                    log.write(*lines, timing={"step": step, **speed})
+                    before = now
+                    if events:
+                        events.add(lines)
+                saves, stopped_by = agree_on_stop(save.due(step), stop[0] if stop else 0)
+                if saves or stopped_by:
+                    log.sync()  # a checkpoint whose log was lost could never get these lines again
+                    checkpoints.save(state, step)
+                if stopped_by:
+                    name = signal.Signals(stopped_by).name
+                    where = f"{folder}: stopped by {name} after step {step} of {options.steps}"
+                    raise TrainingStopped(stopped_by, f"{where}, whose state is saved; the same command resumes it")
+            if writes and can_draw():
+                plot_training_log(folder / METRICS, folder / RUN_CURVES, self.method.name)
+        return state
 
 
 def agree_on_stop(save: bool, received: int) -> tuple[bool, int]:

@@ -19,7 +19,6 @@ from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
-from icrl4aht_baselines.training.trainer import train
 from icrl4aht_generation.teammates.instances import published_task
 from PIL import Image
 
@@ -36,7 +35,7 @@ def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("bundled") / "run"
     histories = HistoryOptions(("demo_wide",), source=("noise",), channels="canonical", labels="oracle")
     job = prepare("ad", MODEL, OPTIONS, histories)
-    train(job.method, job.data, job.options, folder, job.about)
+    job.train(folder)
     return folder
 
 

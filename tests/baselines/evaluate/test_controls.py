@@ -19,8 +19,8 @@ from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
 from icrl4aht_baselines.evaluate.segments import plan_tasks, segment_lengths
-from icrl4aht_baselines.report.controls import control_lines
 from icrl4aht_baselines.report.results import read_run
+from icrl4aht_baselines.report.scores import control_lines
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task, published_tasks
 from icrl4aht_generation.teammates.registry import build_teammate

@@ -160,7 +160,7 @@ def test_a_stopped_collection_resumes(release, teammates, tmp_path, monkeypatch)
         with pytest.raises(KeyboardInterrupt):
             collect_release(COOK, teammates, CONFIG, target)
     assert not target.exists() and played == ["cramped_up"]
-    with pytest.raises(OptionError, match=r"release\.parts: parts of other settings \(.*noise.histories.*; remove it"):
+    with pytest.raises(OptionError, match=r"release\.parts: holds parts of other settings .*histories.*remove it"):
         collect_release(COOK, teammates, NoiseConfig(3, 10), target)
     collect_release(COOK, teammates, CONFIG, target)
     assert played == ["cramped_up"]

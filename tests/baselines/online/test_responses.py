@@ -11,7 +11,6 @@ from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
 from icrl4aht_baselines.online.adaptation import HeadroomJob, adaptation_table, headroom_jobs, write_adaptation
 from icrl4aht_baselines.online.responses import (
-    Behaviour,
     ResponseJob,
     ResponseOptions,
     best_of,
@@ -45,7 +44,7 @@ def test_tasks_with_headroom():
 def test_teammates_that_act_alike_share_a_best_response():
     """H4's instances are one behaviour on test_wide, H3's are five."""
     tasks = [task for family in ("H3", "H4") for task in tasks_of("teammate", "test_wide", family)]
-    assert [len(one.tasks) for one in find_behaviours(tasks)] == [1] * 5 + [5]
+    assert [len(alike) for alike in find_behaviours(tasks)] == [1] * 5 + [5]
 
 
 def finished(job, choice: float, earned: float, slope: float = 0.0) -> None:
@@ -57,7 +56,7 @@ def finished(job, choice: float, earned: float, slope: float = 0.0) -> None:
 
 
 def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
-    behaviour = Behaviour((DEMO[0],))
+    behaviour = (DEMO[0],)
     jobs = [ResponseJob(behaviour, seed, TINY, tmp_path) for seed in range(3)]
     assert not any(job.is_finished() for job in jobs)
     finished(jobs[0], choice=10.0, earned=9.0)
@@ -65,22 +64,23 @@ def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
     entry = best_of(behaviour, map(trained_response, jobs[:2]))
     assert (entry.best, entry.agent) == (9.0, "best response, seed 0")
     assert [one.acting for one in entry.seeds] == ["greedy"] * 2
-    path = tmp_path / "responses.json"
-    write_responses(jobs[:1], path)
+    path = write_responses(jobs[:1], tmp_path)
     first = read_best_responses(path)
     assert first.behaviours == (best_of(behaviour, [trained_response(jobs[0])]),)
-    write_responses(jobs[1:], path)  # the first training is kept
+    write_responses(jobs[1:], tmp_path)  # the first training is kept
     second = read_best_responses(path)
     assert second.behaviours == (entry,)
     assert second.version != first.version
     models = {"better": {DEMO[0].task_id: 9.5}, "worse": {DEMO[0].task_id: 8.0}, "elsewhere": {"other": 50.0}}
-    write_responses(jobs, path, models)
+    write_responses(jobs, tmp_path, models)
     (third,) = read_best_responses(path).behaviours
     assert (third.best, third.agent, third.seeds) == (9.5, "better", entry.seeds)
-    assert "| demo_wide | test | H1 t0 | 9.5 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |" in responses_table(path)
-    pair = ResponseJob(Behaviour((DEMO[0], DEMO[1])), 0, TINY, tmp_path / "pair")
+    assert "| demo_wide | test | H1 t0 | 9.5 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |" in responses_table(
+        tmp_path
+    )
+    pair = ResponseJob((DEMO[0], DEMO[1]), 0, TINY, tmp_path / "pair")
     finished(pair, choice=1.0, earned=1.0)
-    write_responses([pair], path)
+    write_responses([pair], tmp_path)
     assert [one.tasks for one in read_best_responses(path).behaviours] == [(DEMO[0].task_id, DEMO[1].task_id)]
     other = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
     assert not other.is_finished()  # a result of other settings
@@ -111,15 +111,13 @@ def test_the_documented_headroom_is_the_bundled_one():
 
 def test_every_task_must_be_played(tmp_path):
     with pytest.raises(OptionError, match=r"tasks = 4: demo_wide has 20 tasks, .* give --tasks 20 or more"):
-        HeadroomJob("demo_wide", tuple(DEMO), "informed", 0, TINY, tmp_path)
+        HeadroomJob(tuple(DEMO), 0, TINY, tmp_path, title="demo_wide", kind="informed")
 
 
 @pytest.mark.slow
 def test_tiny_trainings(tmp_path):
-    """A best response on one task from a bundled model, and both egos on two layouts and families; a second call does
-    nothing."""
-    behaviour = Behaviour((DEMO[0],))
-    job = ResponseJob(behaviour, 0, replace(TINY, init="rl2-reference"), tmp_path)
+    """A best response on one task, and both egos on two layouts and families; a second call does nothing."""
+    job = ResponseJob((DEMO[0],), 0, TINY, tmp_path)
     calls = []
     job.run(lambda updates, speed: calls.append(updates))
     assert calls == [1]

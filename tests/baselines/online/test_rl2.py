@@ -35,7 +35,7 @@ from icrl4aht_baselines.online.teammates import BEHAVIOURS, MIXTURE, mixed_chanc
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import read_trained_on
-from icrl4aht_baselines.training.trainer import TrainingData, train
+from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task
@@ -76,7 +76,7 @@ def episode(trainer) -> Any:
 @pytest.fixture(scope="module")
 def through(trainer, episode, tmp_path_factory) -> tuple[Path, Any]:
     folder = tmp_path_factory.mktemp("rl2") / "run"
-    return folder, train(METHOD, TrainingData(None, {}), OPTIONS, folder, {}, trainer=trainer)
+    return folder, TrainingTask(METHOD, TrainingData(None, {}), OPTIONS, {}, trainer).train(folder)
 
 
 def test_the_memory_continues_over_steps_and_calls():
@@ -155,9 +155,10 @@ def test_a_stopped_training_resumes_bit_for_bit(trainer, through, tmp_path):
         if step == 4:
             raise KeyboardInterrupt
 
+    task = TrainingTask(METHOD, TrainingData(None, {}), OPTIONS, {}, trainer)
     with pytest.raises(KeyboardInterrupt):
-        train(METHOD, TrainingData(None, {}), OPTIONS, tmp_path, {}, trainer=trainer, done=stop)
-    state = train(METHOD, TrainingData(None, {}), OPTIONS, tmp_path, {}, trainer=trainer)
+        task.train(tmp_path, done=stop)
+    state = task.train(tmp_path)
     jax.tree.map(np.testing.assert_array_equal, state.params, through[1].params)
     assert (tmp_path / "metrics.jsonl").read_bytes() == (through[0] / "metrics.jsonl").read_bytes()
 
@@ -192,7 +193,7 @@ def test_tasks_on_different_layouts_in_one_batch():
     ]
     (player,) = make_players(mixed, METHOD, PLAY, mirror=False)
     (alone,) = make_players(
-        [TaskGroup([layouts[1]], "assembly_line", [mate] * 3, True, "")], METHOD, PLAY, mirror=False
+        [TaskGroup([layouts[1]] * 3, "assembly_line", [mate] * 3, True, "")], METHOD, PLAY, mirror=False
     )
     params, key = METHOD.init(jax.random.key(0)), jax.random.key(1)
     (after, found, returns), (alone_after, expected, alone_returns) = (
@@ -294,7 +295,7 @@ class TestPreparing:
         players = self.prepare(play).trainer.players
         groups = [group for player in players for group in player.groups]
         assert len(players) == len({group.family for group in groups})
-        assert all(group.hidden and len(group.layouts) in (1, len(group.teammates)) for group in groups)
+        assert all(group.hidden and len(group.layouts) == len(group.teammates) for group in groups)
         tasks = collections.Counter[str]()
         for group in groups:
             tasks[group.label] += len(group.teammates)

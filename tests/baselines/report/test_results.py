@@ -11,7 +11,6 @@ import pytest
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.evaluate.results import Result
 from icrl4aht_baselines.report import merge
-from icrl4aht_baselines.report.figures import split_cells
 from icrl4aht_baselines.report.results import BLOCKS, ResultCell, as_run, cell_of, episode_blocks, task_label
 from icrl4aht_baselines.training.seen import OVERLAPS
 
@@ -126,14 +125,6 @@ def test_results_of_other_conditions_are_not_merged():
     assert other.sources[0].conditions == (
         "protocol seeded, 1 seed (0), 40 episodes of 100 steps, cached acting, memory cleared before each episode"
     )
-
-
-def test_cells_are_split_by_kind_and_layout():
-    run = evaluated_run("AD", ("coord_ring", "test_wide", "demo_simple", "demo_wide"))
-    cells = [*run.cells, ResultCell("demo_wide", "H1", "validation")]
-    parts = split_cells(cells, 12)
-    assert [len(part) for part in parts] == [12, 4, 1]
-    assert [cell for part in parts for cell in part] == cells
 
 
 def test_results_are_kept_for_each_track(tmp_path):
