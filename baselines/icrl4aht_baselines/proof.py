@@ -161,7 +161,9 @@ class ProofJob:
     def progress(self) -> tuple[int, float] | None:
         """Return training steps done, and steps of histories per second."""
         timing = last_line(self.folder / "run" / TIMING)
-        return timing and (timing["step"], timing["steps_per_second"] * self.options.batch_size * self.options.context)
+        if not timing:
+            return None
+        return timing["step"], timing["steps_per_second"] * self.options.batch_size * self.options.context
 
     def finished_text(self) -> str:
         """Return the text on the finished job."""
