@@ -135,7 +135,7 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
         for one in (agent, *map(find_agent, _AGENTS))
     ]
     cleared = evaluate_agent(
-        agent, tasks, settings.protocol, out / "results" / "cleared", seeds=settings.seeds, control="forgets"
+        agent, tasks, settings.protocol, out / "results" / "cleared", seeds=settings.seeds, control="cleared"
     )
     runs.insert(1, cleared)
     write(block_table(runs).to_string())

@@ -209,7 +209,7 @@ def play(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = Tru
         Name of the set, with " cleared" for the second -> block of episodes -> mean return of the tasks.
     """
     found = {}
-    for control in (None, "forgets")[: 1 + controls]:
+    for control in (None, "cleared")[: 1 + controls]:
         for name, tasks in options.task_sets.items():
             folder = out / f"{name}{' cleared' if control else ''}"
             run = evaluate_agent(agent, tasks, PROTOCOL, folder, control=control, show=lambda *shown: None)

@@ -91,7 +91,7 @@ class Recipe:
         own_round: whether a second training follows, with histories that the model plays and RL^2 labels, in addition
             to the first ones.
         greedy: whether it plays its most probable actions or draws them.
-        forgets: whether to evaluate it on test tasks with its memory cleared at the start of each episode as well.
+        cleared: whether to evaluate it on test tasks with its memory cleared at the start of each episode as well.
     """
 
     method: str
@@ -101,7 +101,7 @@ class Recipe:
     histories: dict[str, Any] = field(default_factory=dict)
     own_round: bool = False
     greedy: bool = False
-    forgets: bool = False
+    cleared: bool = False
 
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
@@ -114,7 +114,7 @@ RECIPES = {
     "rl2": Recipe("rl2", "", RL2_SETTINGS["model"], {**RL2_SETTINGS["train"], "steps": 1600}),
     "ad-student": Recipe("ad", "agent", _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True),
     "dpt-student": Recipe("dpt", "agent", _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True),
-    "ad-rising": Recipe("ad", "rising", _TINY, _LONG, forgets=True),
+    "ad-rising": Recipe("ad", "rising", _TINY, _LONG, cleared=True),
 }
 """Reference models by name: those of the bundled rl2-reference, ad-reference, dpt-reference and ad-rising."""
 
@@ -268,13 +268,13 @@ class _Steps:
         found = {}
         kinds = [(kind, "seeded", 1, False) for kind in VALIDATION_KINDS]
         kinds += [(f"test-{protocol}", protocol, seeds, False) for protocol, seeds in TEST_SEEDS.items()]
-        kinds += [("test-seeded-forgets", "seeded", 1, True)] if recipe.forgets else []
-        for kind, protocol, seeds, forgets in kinds:
+        kinds += [("test-seeded-cleared", "seeded", 1, True)] if recipe.cleared else []
+        for kind, protocol, seeds, cleared in kinds:
             tasks = bundled_tasks(self.track, kind if kind in VALIDATION_KINDS else "test")
             folder = self.out / "results" / f"{name}-{self.track}" / kind
             agent = find_agent(run, greedy=recipe.greedy)._replace(name=name)
             shown = {"show": self.show, "what": f"{name}-{self.track}, {kind}"}
-            control = "forgets" if forgets else None
+            control = "cleared" if cleared else None
             evaluate_agent(agent, tasks, get_protocol(protocol), folder, seeds=range(seeds), control=control, **shown)
             found[kind] = folder
         return found

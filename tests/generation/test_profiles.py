@@ -69,9 +69,9 @@ def test_shipped_profiles_load(name):
     for source in profile.sources:
         for layout in profile.layouts_of(source):
             assert profile.tasks_on(layout, source) > 0
-    works = profile.works()
-    assert len({work.name for work in works}) == len(works)
-    for work in works:
+    units = profile.units()
+    assert len({work.name for work in units}) == len(units)
+    for work in units:
         layouts = PREFERENCE_LAYOUTS if work.source == "search" else TRACKS[work.task.track]
         assert work.task.layout.name in (*layouts["train"], *profile.generated)
         assert work.task.split == "train" or (work.task.split == "validation" and work.source in SCRIPTED_SOURCES)
@@ -101,7 +101,7 @@ def test_paper_profile_keeps_146_episodes():
 
 def test_settings_of_an_artefact_are_the_task_the_learner_and_its_ego(changed):
     def settings(profile: Profile, learner: int = 0) -> dict:
-        return artefact_settings(profile.works()[-1]._replace(learner=learner), profile)
+        return artefact_settings(profile.units()[-1]._replace(learner=learner), profile)
 
     plain = load_profile(changed("keep = 8", "keep = 8"))
     assert settings(plain) == settings(load_profile(changed("keep = 8", "keep = 7")))
@@ -111,7 +111,7 @@ def test_settings_of_an_artefact_are_the_task_the_learner_and_its_ego(changed):
     other = load_profile(changed("[release]", "[ego.layouts.coord_simple]\nentropy = 0.02\n[release]"))
     assert (other.ego_on("coord_simple").entropy, other.ego_on("cramped_up").entropy) == (0.02, 0.01)
     assert settings(other) == settings(plain)
-    assert artefact_settings(other.works()[0], other) != artefact_settings(plain.works()[0], plain)
+    assert artefact_settings(other.units()[0], other) != artefact_settings(plain.units()[0], plain)
 
 
 def test_given_hyper_parameters_replace_the_profiles_and_enter_its_hashes(changed):
@@ -137,7 +137,7 @@ def test_a_profile_by_its_path(changed):
     assert profile.layouts == ("coord_simple", "cramped_up")
     assert profile.ego.widths == Widths((4,), (4,), 8, 8, 8)
     assert (profile.ego.updates, profile.ego.episodes, profile.ego.epochs) == (100, 10, 4)
-    tasks = [work.task for work in profile.works()]
+    tasks = [work.task for work in profile.units()]
     made = [(task.layout.name, task.track, task.teammate["theta"]["inertia"], task.seed) for task in tasks]
     assert made == [
         ("coord_simple", "teammate", 0.3, 0),
@@ -164,21 +164,21 @@ def test_sampled_teammates_of_both_sources(changed):
             f"{sampled}\nper_layout = {{ coord_simple = 3, cramped_up = 2 }}\nppo = 1\nvalidation = 1",
         )
     )
-    works = profile.works()
-    made = [(work.source, work.task.layout.name, work.task.split, work.learner) for work in works]
+    units = profile.units()
+    made = [(work.source, work.task.layout.name, work.task.split, work.learner) for work in units]
     of_ppo = [("ppo", layout, "train", learner) for layout in profile.layouts for learner in (0, 1)]
     of_noise = [("noise", "coord_simple", "train", 0)] * 3 + [("noise", "coord_simple", "validation", 0)]
     of_noise += [("noise", "cramped_up", "train", 0)] * 2 + [("noise", "cramped_up", "validation", 0)]
     assert made == of_ppo + of_noise
-    assert len({work.name for work in works}) == len(works) == 11
-    assert len({work.task.seed for work in works}) == 9  # the learners of a task share its seed
-    assert works[0].name + "-l1" == works[1].name
-    teammates = [(w.task.layout, json.dumps(w.task.teammate["theta"])) for w in works if w.source == "noise"]
+    assert len({work.name for work in units}) == len(units) == 11
+    assert len({work.task.seed for work in units}) == 9  # the learners of a task share its seed
+    assert units[0].name + "-l1" == units[1].name
+    teammates = [(w.task.layout, json.dumps(w.task.teammate["theta"])) for w in units if w.source == "noise"]
     assert len(set(teammates)) == len(teammates)
-    assert {work.task.teammate["base_seed"] for work in works if work.task.split == "validation"} == {1}
-    assert [work.task.teammate for work in works[:3:2]] == [works[4].task.teammate, works[8].task.teammate]
+    assert {work.task.teammate["base_seed"] for work in units if work.task.split == "validation"} == {1}
+    assert [work.task.teammate for work in units[:3:2]] == [units[4].task.teammate, units[8].task.teammate]
     learned = make_task("layout", "train", "cramped_up", LEARNED_ENTRY, 7)
-    assert [work.task for work in profile.works([learned]) if work.task.teammate == LEARNED_ENTRY] == [
+    assert [work.task for work in profile.units([learned]) if work.task.teammate == LEARNED_ENTRY] == [
         learned,
         learned,
         make_task("layout", "train", "cramped_up", LEARNED_ENTRY, 2_500_007),
@@ -206,9 +206,9 @@ def spread_profile(changed, more: str, spread: str = "per_layout = 2\nppo = 1\nv
 
 
 def test_spread_teammates_of_both_sources(changed, listed):
-    works = spread_profile(changed, "").works()
+    units = spread_profile(changed, "").units()
     for layout in ("coord_simple", "cramped_up"):
-        own = [work for work in works if work.task.layout.name == layout]
+        own = [work for work in units if work.task.layout.name == layout]
         train, validation = (spread_teammates(layout, split, n) for split, n in (("train", 2), ("validation", 1)))
         assert [(work.source, work.task.split) for work in own] == [
             ("ppo", "train"),
@@ -216,10 +216,10 @@ def test_spread_teammates_of_both_sources(changed, listed):
             ("noise", "validation"),
         ]
         assert [work.task.teammate for work in own] == [train[0], *train, *validation]
-    sampled = load_profile("noise").works() + load_profile("small").works()
-    seeds = [work.task.seed for work in works + load_profile("mini").works()]
+    sampled = load_profile("noise").units() + load_profile("small").units()
+    seeds = [work.task.seed for work in units + load_profile("mini").units()]
     assert len({*seeds}) == len(seeds)
-    assert not {*seeds[: len(works)]} & {work.task.seed for work in sampled}
+    assert not {*seeds[: len(units)]} & {work.task.seed for work in sampled}
 
 
 def test_sampled_and_spread_teammates_on_other_layouts(changed, listed):
@@ -247,20 +247,20 @@ def test_no_validation_teammate_trains(changed, monkeypatch):
 
 
 def test_presets_of_both_sources(changed):
-    works = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\npresets =')).works()
-    assert [(work.source, work.task.seed) for work in works] == [
+    units = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\npresets =')).units()
+    assert [(work.source, work.task.seed) for work in units] == [
         *(("ppo", seed) for seed in range(4)),
         *(("noise", 2_500_000 + seed) for seed in range(4)),
     ]
-    assert [work.task.teammate for work in works[:4]] == [work.task.teammate for work in works[4:]]
+    assert [work.task.teammate for work in units[:4]] == [work.task.teammate for work in units[4:]]
 
 
 def test_given_tasks_have_the_sources_that_they_had(changed):
     """As those of a release, which say in their provenance how their histories were made."""
     profile = load_profile(changed("presets =", 'sources = ["ppo", "noise"]\nlearners = 2\npresets ='))
-    tasks = [work.task for work in profile.works() if work.learner == 0][:3]
+    tasks = [work.task for work in profile.units() if work.learner == 0][:3]
     first, second, third = (task.task_id for task in tasks)
-    found = profile.works_of(tasks, {second: "noise", third: "ppo"})
+    found = profile.units_of(tasks, {second: "noise", third: "ppo"})
     assert [(work.task.task_id, work.source, work.learner) for work in found] == [
         (first, "ppo", 0),
         (first, "ppo", 1),
@@ -270,7 +270,7 @@ def test_given_tasks_have_the_sources_that_they_had(changed):
     ]
     of_ppo = load_profile(changed("keep = 8", "keep = 7"))
     with pytest.raises(OptionError, match=rf"task {second}: its source is noise, those of profile mine are ppo: "):
-        of_ppo.works_of(tasks, {second: "noise"})
+        of_ppo.units_of(tasks, {second: "noise"})
 
 
 LEARNED_ENTRY = {
@@ -348,7 +348,7 @@ def test_tasks_know_both_names_of_a_layout_and_where_it_belongs():
 
 
 def test_task_files_round_trip(tmp_path):
-    tasks = [work.task for work in load_profile("mini").works()]
+    tasks = [work.task for work in load_profile("mini").units()]
     path = tmp_path / "tasks.jsonl"
     write_tasks(path, tasks)
     assert read_tasks(path) == tasks
@@ -359,7 +359,7 @@ def test_task_files_round_trip(tmp_path):
 
 @cache
 def _lines() -> list[str]:
-    return [json.dumps(task_fields(work.task)) for work in load_profile("mini").works()[:2]]
+    return [json.dumps(task_fields(work.task)) for work in load_profile("mini").units()[:2]]
 
 
 def _with(line: str, **fields) -> str:
@@ -395,7 +395,7 @@ def test_faults_of_task_files_are_named_with_the_line(tmp_path, change, message)
 def test_threads_are_chosen_before_teammates_are_drawn(monkeypatch):
     """Drawing starts JAX, whose number of threads can then no longer change."""
     calls: list[str] = []
-    works = Profile.works
-    monkeypatch.setattr(Profile, "works", lambda profile: calls.append("works") or works(profile))
+    units = Profile.units
+    monkeypatch.setattr(Profile, "units", lambda profile: calls.append("units") or units(profile))
     load_profile("smoke", lambda profile: calls.append(f"threads {profile.xla_threads}"))
-    assert calls == ["threads 1", "works"]
+    assert calls == ["threads 1", "units"]

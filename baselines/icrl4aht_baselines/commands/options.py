@@ -86,7 +86,7 @@ forget_option = click.option("--forget", is_flag=True, help="Clear the agent's m
 controls_option = click.option(
     "--controls",
     is_flag=True,
-    help="Also play with the memory cleared before each episode, into OUT/forgets, and with another task's teammate in "
+    help="Also play with the memory cleared before each episode, into OUT/cleared, and with another task's teammate in "
     "all but the last 20 episodes, into OUT/swapped. Prints what memory (M) and the right partner (P) are worth.",
 )
 greedy_option = click.option(

@@ -96,7 +96,7 @@ def evaluate_command(
         for control in CONTROLS:
             note_results(out / control, ego.run, chosen)
     else:
-        evaluate(ego.name, ego.make, chosen, rules, control="forgets" if forget else None, **options)
+        evaluate(ego.name, ego.make, chosen, rules, control="cleared" if forget else None, **options)
     note_results(out, ego.run, chosen)
     for line in [*summary_lines([read_run(out)]), *lines]:
         click.echo(line)

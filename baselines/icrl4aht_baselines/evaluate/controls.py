@@ -24,20 +24,20 @@ class ControlledResults(NamedTuple):
 
     Attributes:
         plain: results of the ego.
-        forgets: those with its memory cleared before each episode.
+        cleared: those with its memory cleared before each episode.
         swapped: those in which another task's teammate plays all episodes but the last ones.
         last: number of these last episodes.
     """
 
     plain: list[Result]
-    forgets: list[Result]
+    cleared: list[Result]
     swapped: list[Result]
     last: int
 
     @property
     def memory(self) -> Float[np.ndarray, "U S"]:
         """M: return minus return with the memory cleared before each episode, mean over all episodes."""
-        return (_returns(self.plain) - _returns(self.forgets)).mean(axis=-1)
+        return (_returns(self.plain) - _returns(self.cleared)).mean(axis=-1)
 
     @property
     def partner(self) -> Float[np.ndarray, "U S"]:
@@ -63,7 +63,7 @@ def evaluate_controls(
 
     Args:
         agent, make_ego, tasks, protocol, programs: see `evaluate`.
-        out: folder of the ego's results; those of the controls are in its folders `forgets` and `swapped`.
+        out: folder of the ego's results; those of the controls are in its folders `cleared` and `swapped`.
         options: `seeds`, `suite` and `details` of `evaluate`.
 
     Raises:
@@ -79,4 +79,4 @@ def evaluate_controls(
         control: evaluate(agent, make, tasks, rules, control=control, out=out and out / (control or ""), **options)
         for control in (None, *CONTROLS)
     }
-    return ControlledResults(results[None], results["forgets"], results["swapped"], rules.last_episodes)
+    return ControlledResults(results[None], results["cleared"], results["swapped"], rules.last_episodes)

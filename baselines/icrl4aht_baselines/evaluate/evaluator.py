@@ -76,7 +76,7 @@ def evaluate(
         seeds: seeds of the episodes, such as (0, 1, 2); the ego plays every task once with each of them.
         suite: folder with the checkpoints of learned teammates, if tasks have any.
         control: plays a control of the ego, one of `CONTROLS`. Its results have a name of their own, such as
-            "mine (forgets)". `evaluate_controls` plays the ego and all controls.
+            "mine (cleared)". `evaluate_controls` plays the ego and all controls.
         out: folder for one JSON file per task. Results found there under the same settings are not computed again.
         details: further settings that the results depend on, as JSON; stored and compared with the results.
             `trained_on` among them states the training data, which reports compare with the tasks: see
@@ -198,7 +198,7 @@ class _Evaluation:
             prepared = prepare_rollout(
                 make_ego, tasks, self.protocol, self.seeds, self.suite, programs=self.programs, earlier=prepared
             )
-            state = yield from play_episodes(prepared, episodes, forget=self.control == "forgets")
+            state = yield from play_episodes(prepared, episodes, forget=self.control == "cleared")
             prepared = prepared._replace(state=state)
 
 

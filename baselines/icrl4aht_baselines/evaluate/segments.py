@@ -16,14 +16,14 @@ from icrl4aht_baselines.evaluate.protocols import Protocol
 from icrl4aht_data.benchmark.tasks import Task, teammate_id
 from icrl4aht_data.errors import OptionError
 
-Control = Literal["forgets", "swapped"]
-CONTROLS: dict[Control, str] = {"forgets": "forget", "swapped": "swapped"}
-"""Control of an evaluation -> its mark in the details of results. `forgets`: the ego's memory is cleared before each
+Control = Literal["cleared", "swapped"]
+CONTROLS: dict[Control, str] = {"cleared": "forget", "swapped": "swapped"}
+"""Control of an evaluation -> its mark in the details of results. `cleared`: the ego's memory is cleared before each
 episode. `swapped`: the teammate of another task plays all episodes but the last ones, see `Protocol.last_episodes`."""
 
 
 def controlled_name(agent: str, control: Control) -> str:
-    """Return the name that the results of an agent's control have, such as "mine (forgets)"."""
+    """Return the name that the results of an agent's control have, such as "mine (cleared)"."""
     return f"{agent} ({control})"
 
 

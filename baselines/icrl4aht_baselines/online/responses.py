@@ -292,7 +292,7 @@ class ResponseJob(TrainingJob):
 
     def _mean_return(self, policy: Policy, seeds: Sequence[int]) -> float:
         # The memory is cleared before each episode, as it was in training.
-        played: dict[str, Any] = {"seeds": seeds, "control": "forgets", "played": lambda count: None}
+        played: dict[str, Any] = {"seeds": seeds, "control": "cleared", "played": lambda count: None}
         results = evaluate("best response", lambda layout: policy, self.tasks, PROTOCOL, **played)
         return round(float(np.mean([result.returns for result in results])), 3)
 

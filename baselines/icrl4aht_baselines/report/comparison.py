@@ -274,12 +274,12 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
     The means are over the cells with headroom, or over all cells that the agent played if best responses were not
     measured. M and P are bold if they are above 0 with a p-value below 0.05, corrected for all M and P of the table.
     """
-    controls = {control: stored.returns(control) for control in ("forgets", "swapped")}
+    controls = {control: stored.returns(control) for control in ("cleared", "swapped")}
     found: dict[tuple[str, str], MeanInterval] = {}
     chosen = {}
     for agent, cells in results.items():
         chosen[agent] = [cell for cell in open_cells(scales) if cell in cells] or [*cells]
-        for name, control, block in (("M", "forgets", "all"), ("P", "swapped", "last 20")):
+        for name, control, block in (("M", "cleared", "all"), ("P", "swapped", "last 20")):
             other = controls[control].get(agent, {})
             played = [cell for cell in chosen[agent] if cell in other]
             if difference := block_difference(cells, other, played, block):
@@ -350,7 +350,7 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
     for axes, layout in zip(grid, layouts, strict=False):
         for number, agent in enumerate(shown):
             color = f"C{number % 10}"
-            for control, style in (("", "-"), ("forgets", "--")):
+            for control, style in (("", "-"), ("cleared", "--")):
                 if (curve := curves.get((agent, control, layout))) is not None:
                     label = agent if not control else f"{agent}, memory cleared"
                     axes.plot(np.arange(1, len(curve) + 1), curve, style, color=color, linewidth=1.2, label=label)

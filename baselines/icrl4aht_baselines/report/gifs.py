@@ -148,7 +148,7 @@ def restore_ego(source: ResultSource) -> JaxEgoMaker:
         OptionError: if the ego is neither a reference ego nor trained, or its run folder is missing or has changed.
     """
     name, details = source.settings["agent"], dict(source.settings.get("details", {}))
-    name = name.removesuffix(controlled_name("", "forgets")) if details.pop("forget", None) else name
+    name = name.removesuffix(controlled_name("", "cleared")) if details.pop("forget", None) else name
     if name in AGENTS:
         return AGENTS[name]
     folder = details.get("model") or (source.trained or {}).get("run")

@@ -362,18 +362,18 @@ class _PopulationTraining:
                 "step": update * run.config.steps_per_update,
                 "seed": run.seed,
                 "code_version": version("icrl4aht-data"),
-                "seats": [1] if run.has_best_responses else [0, 1],
+                "agents": [1] if run.has_best_responses else [0, 1],
                 "return": float(returns[k]),
                 "teammate_return": float(as_teammate[k]),
                 "return_of": f"{EPISODES_PER_PAIR} episodes of 400 steps with its best response or itself, both "
-                "drawing their actions; as a teammate it acts greedily, in seat 1",
+                "drawing their actions; as a teammate it acts greedily, as agent 1",
             }
             own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
             save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
             if run.has_best_responses and checkpoint == POLICY_CHECKPOINTS - 1:
                 response = jax.tree.map(lambda leaf, k=k: leaf[k], partners)
                 path = self.folder / RESPONSES / f"m{k}"
-                save_policy(path, population.network, response, card | {"role": "best response", "seats": [0]})
+                save_policy(path, population.network, response, card | {"role": "best response", "agents": [0]})
 
     def _finish(self) -> None:
         files = {

@@ -113,12 +113,12 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
         profile = _profile(path.stem, msgspec.toml.decode(path.read_bytes(), type=_ProfileFile))
     prepare(profile)
     with _named_errors(path):
-        works = profile.works()  # raises for unknown presets, and for more sampled teammates than there are
-        if not works and not profile.algorithms:
+        units = profile.units()  # raises for unknown presets, and for more sampled teammates than there are
+        if not units and not profile.algorithms:
             raise OptionError(
                 "no tasks: expected teammates in tasks.presets, tasks.sampled, tasks.spread or tasks.algorithms"
             )
-        _check_splits(works, profile.sampled, profile.spread)
+        _check_splits(units, profile.sampled, profile.spread)
     return profile
 
 
@@ -225,7 +225,7 @@ def _counts(
     return counts
 
 
-def _check_splits(works: Sequence[Work], sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
+def _check_splits(units: Sequence[Work], sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
     """Check that no teammate of a layout is in the splits of training and of validation.
 
     Raises:
@@ -238,8 +238,8 @@ def _check_splits(works: Sequence[Work], sampled: SampledConfig | None, spread: 
                 f"{name}: {both[0]} teammates of tasks.sampled and {both[1]} of tasks.spread, whose validation "
                 f"behaviours may train in the other; expected one of them for a layout"
             )
-    trained = {_behaviour(work) for work in works if work.task.split == "train"}
-    shared = {work.task.task_id for work in works if work.task.split == "validation" and _behaviour(work) in trained}
+    trained = {_behaviour(work) for work in units if work.task.split == "train"}
+    shared = {work.task.task_id for work in units if work.task.split == "validation" and _behaviour(work) in trained}
     if shared:
         raise OptionError(
             f"{len(shared)} of the validation tasks have a teammate that also trains, such as {min(shared)}: leave it "
@@ -248,7 +248,7 @@ def _check_splits(works: Sequence[Work], sampled: SampledConfig | None, spread: 
 
 
 def _behaviour(work: Work) -> tuple[Any, ...]:
-    """Return what is equal for works with one teammate on one layout with one dish."""
+    """Return what is equal for units with one teammate on one layout with one dish."""
     return work.task.layout.name, work.task.recipes, teammate_id(work.task.teammate)
 
 

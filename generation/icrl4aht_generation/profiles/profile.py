@@ -220,7 +220,7 @@ class Profile:
         """Return the names of a source's layouts."""
         return self.preference if source == "search" else self.layouts
 
-    def works(self, learned: Sequence[Task] = ()) -> list[Work]:
+    def units(self, learned: Sequence[Task] = ()) -> list[Work]:
         """Return the units of work, by source and layout.
 
         Args:
@@ -229,15 +229,15 @@ class Profile:
         Raises:
             OptionError: if a layout has too few draws of sampled teammates.
         """
-        works = []
+        units = []
         for source in self.sources:
             for layout in self.layouts_of(source):
                 own = [task for task in learned if task.layout.name == layout and source != "search"]
                 tasks = [*self._heuristic_tasks(layout, source), *(_of_source(task, source) for task in own)]
-                works += [Work(task, source, learner) for task in tasks for learner in range(self._learners(source))]
-        return works
+                units += [Work(task, source, learner) for task in tasks for learner in range(self._learners(source))]
+        return units
 
-    def works_of(self, tasks: Sequence[Task], sources: Mapping[str, str]) -> list[Work]:
+    def units_of(self, tasks: Sequence[Task], sources: Mapping[str, str]) -> list[Work]:
         """Return the units of work of given tasks.
 
         Args:
@@ -247,7 +247,7 @@ class Profile:
         Raises:
             OptionError: if a task's source is none of the profile's.
         """
-        works = []
+        units = []
         for task in tasks:
             source = sources.get(task.task_id, self.sources[0])
             if source not in self.sources:
@@ -255,8 +255,8 @@ class Profile:
                     f"task {task.task_id}: its source is {source}, those of profile {self.name} are "
                     f"{', '.join(self.sources)}: choose a profile with both, or leave the task out"
                 )
-            works += [Work(task, source, learner) for learner in range(self._learners(source))]
-        return works
+            units += [Work(task, source, learner) for learner in range(self._learners(source))]
+        return units
 
     def _learners(self, source: str) -> int:
         return self.learners if source == "ppo" else 1

@@ -76,12 +76,12 @@ def build_releases(
     names = {"artefacts", SUITE, FAILED, f".{FAILED}.lock", _PACKING_LOCK, *KINDS, *(f".{kind}.old" for kind in KINDS)}
     check_own_folder(out, names | ({suite.name} if suite.parent == out else set()), "a rebuild")
     if tasks is None:
-        works, headroom, left_out = train_teammates(profile, suite, seed, console, options)
+        units, headroom, left_out = train_teammates(profile, suite, seed, console, options)
     else:
-        works, headroom, left_out = profile.works_of(tasks, sources or {}), {}, []
-    jobs = [CollectionJob(work, profile, out / "artefacts", suite) for work in works]
+        units, headroom, left_out = profile.units_of(tasks, sources or {}), {}, []
+    jobs = [CollectionJob(work, profile, out / "artefacts", suite) for work in units]
     run_jobs(jobs, out, console, options)
-    tasks = list({work.task.task_id: work.task for work in works}.values())
+    tasks = list({work.task.task_id: work.task for work in units}.values())
     artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
     with process_lock(out / _PACKING_LOCK):  # another collector on this folder packs the same releases
         facts = teammate_facts(tasks, artefacts, suite, headroom)
@@ -91,7 +91,7 @@ def build_releases(
                 package_release(
                     artefacts,
                     release,
-                    works,
+                    units,
                     profile,
                     suite,
                     kind,
@@ -117,30 +117,30 @@ def train_teammates(
         FailedJobsError: if there is no task, because no teammate is good enough.
     """
     if not profile.algorithms:
-        return profile.works(), {}, []
+        return profile.units(), {}, []
     selections = build_suite(profile, suite, profile.algorithms, seed, console, options)
     learned = make_tasks(suite, selections, "train")
     headroom = learned_headroom(learned, suite)
     of_teammate = {task.teammate_key: headroom[task.task_id] for task in learned}
-    works, left_out = [], []
-    for work in profile.works(learned):
+    units, left_out = [], []
+    for work in profile.units(learned):
         earned = of_teammate.get(work.task.teammate_key)
         if earned is None or earned.matters:
-            works.append(work)
+            units.append(work)
         elif work.learner == 0:
             reason = f"the ego does not matter: {earned.describe()}"
             console.print(f"{work.task.task_id}: left out, {reason}")
             task, name = work.task, teammate_name(work.task)
             left_out.append(LeftOutTask(task.task_id, task.layout.name, name, work.source, 0, 0, None, None, reason))
-    if not works and left_out:
+    if not units and left_out:
         raise FailedJobsError(
             f"{suite}: the ego matters with none of the learned teammates: train others, or add drawn heuristics "
             f"([tasks.sampled]) to profile {profile.name}"
         )
-    if not works:
+    if not units:
         names = dict.fromkeys(chain(*profile.algorithms.values()))
         raise FailedJobsError(
             f"{suite}: no checkpoint of {', '.join(names)} exceeds the return of {THRESHOLD:g} that a "
             f"teammate needs: raise teammates.total_steps in profile {profile.name}"
         )
-    return works, headroom, left_out
+    return units, headroom, left_out

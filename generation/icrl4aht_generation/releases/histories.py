@@ -59,7 +59,7 @@ class TaskHistories(NamedTuple):
 
 
 def select_histories(
-    artefacts: Path, works: Sequence[Work], profile: Profile, facts: TeammateFacts, *, headroom: bool
+    artefacts: Path, units: Sequence[Work], profile: Profile, facts: TeammateFacts, *, headroom: bool
 ) -> TaskHistories | LeftOutTask:
     """Choose the histories of a task that a release keeps.
 
@@ -69,13 +69,13 @@ def select_histories(
 
     Args:
         artefacts: folder of the finished artefacts.
-        works: the task's units of work.
+        units: the task's units of work.
         profile: the profile.
         facts: facts about the teammate.
         headroom: whether the ego matters with any teammate of the profile on this layout.
     """
-    task, source = works[0].task, works[0].source
-    folders = [artefacts / work.name for work in works]
+    task, source = units[0].task, units[0].source
+    folders = [artefacts / work.name for work in units]
     returns = [stream_returns(np.load(folder / "rewards.npy", mmap_mode="r")) for folder in folders]
     least = profile.least_improvement if headroom else None
     if source == "ppo":

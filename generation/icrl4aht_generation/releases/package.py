@@ -49,7 +49,7 @@ from icrl4aht_generation.releases.measures import (
 def package_release(
     artefacts: Path,
     target: Path,
-    works: Sequence[Work],
+    units: Sequence[Work],
     profile: Profile,
     suite: Path,
     kind: Kind,
@@ -66,7 +66,7 @@ def package_release(
     Args:
         artefacts: folder of the finished artefacts.
         target: the release folder; a release of this profile there is replaced atomically.
-        works: the units of work, by task in the release's order.
+        units: the units of work, by task in the release's order.
         profile: their profile.
         suite: folder of the learned teammates.
         kind: kind of the release.
@@ -79,7 +79,7 @@ def package_release(
     """
     check_release_folder(target, profile)
     tasks: dict[str, list[Work]] = {}
-    for work in works:
+    for work in units:
         tasks.setdefault(work.task.task_id, []).append(work)
     if facts is None:
         facts = teammate_facts((members[0].task for members in tasks.values()), artefacts, suite)

@@ -87,7 +87,7 @@ def test_memory_and_partner_are_exact(alone, programs, tmp_path):
     assert len(programs) == 2  # one for each family of teammates
     plain = np.array([[stays[0, 0], *wanders[0, 1:]], stays[1]])
     np.testing.assert_array_equal([result.returns[0] for result in found.plain], plain)
-    np.testing.assert_array_equal([result.returns[0] for result in found.forgets], stays)
+    np.testing.assert_array_equal([result.returns[0] for result in found.cleared], stays)
     # After H4, which pays, the ego stays with H1; after H1, which does not, it acts randomly with H4.
     swapped = np.array([result.returns[0] for result in found.swapped])
     np.testing.assert_array_equal(swapped[:, 2:], [stays[0, 2:], wanders[1, 2:]])
@@ -148,7 +148,7 @@ def test_results_are_found_again(programs, tmp_path):
         raise AssertionError("plays again")
 
     assert evaluate_controls("mine", never, TASKS, FOUR, out=tmp_path, details={"of": 1}) == first
-    plain, forgets, swapped = (results[0].settings for results in first[:3])
+    plain, cleared, swapped = (results[0].settings for results in first[:3])
     assert plain["protocol"] == {
         "name": "seeded",
         "noise": "seeded",
@@ -157,7 +157,7 @@ def test_results_are_found_again(programs, tmp_path):
         "steps": 100,
     }
     assert (plain["agent"], plain["details"]) == ("mine", {"of": 1})
-    assert (forgets["agent"], forgets["details"]) == ("mine (forgets)", {"of": 1, "forget": True})
+    assert (cleared["agent"], cleared["details"]) == ("mine (cleared)", {"of": 1, "forget": True})
     assert (swapped["agent"], swapped["details"]) == ("mine (swapped)", {"of": 1, "swapped": True})
     assert "partners" not in first.plain[0].to_json()
     message = f"holds a result with the teammates of {H1.task_id}, {H4.task_id}, expected those of {H2.task_id}, "
@@ -187,11 +187,11 @@ def test_host_agents_are_reset_before_each_episode(tmp_path):
     evaluate_controls("host", from_host(agent), TASKS, short)
     # Two teammate families: both play plainly, then with 4 resets each, then swapped.
     assert [len(episodes) for episodes in agent.log] == [4, 4] + [1] * 8 + [4, 4]
-    plain, forgets, swapped = agent.log[0], [episodes[0] for episodes in agent.log[2:6]], agent.log[10]
+    plain, cleared, swapped = agent.log[0], [episodes[0] for episodes in agent.log[2:6]], agent.log[10]
     assert [bool(one.prev_done) for one in plain] == [False, True, True, True]
-    assert not any(one.prev_done or one.prev_action for one in forgets)
+    assert not any(one.prev_done or one.prev_action for one in cleared)
     assert [bool(one.prev_done) for one in swapped] == [False, True, True, True]
-    for one, other, third in zip(plain, forgets, swapped, strict=True):  # the same starts
+    for one, other, third in zip(plain, cleared, swapped, strict=True):  # the same starts
         np.testing.assert_array_equal(one.obs, other.obs)
         np.testing.assert_array_equal(one.obs, third.obs)
 
@@ -286,10 +286,10 @@ def test_controls_command(programs, tmp_path, monkeypatch):
     result = run("run", "--episodes", "4", "--controls")
     assert result.exit_code == 0, result.output
     assert "track teammate, memory M: " in result.output and "track teammate, partner P: " in result.output
-    for folder in ("run", "run/forgets", "run/swapped"):
+    for folder in ("run", "run/cleared", "run/swapped"):
         assert len(list((tmp_path / folder / "tasks").glob("*.json"))) == 2
     result = run("run", "--controls", "--forget")
     assert result.exit_code == 2 and "--controls: not with --forget" in result.output
-    result = run("forgets", "--episodes", "4", "--forget")
+    result = run("cleared", "--episodes", "4", "--forget")
     assert result.exit_code == 0, result.output
-    assert read_run(tmp_path / "forgets").table.equals(read_run(tmp_path / "run/forgets").table)
+    assert read_run(tmp_path / "cleared").table.equals(read_run(tmp_path / "run/cleared").table)

@@ -44,7 +44,7 @@ def folders(tmp_path_factory) -> Path:
     """Return results on the layout track: of an agent that needs its memory, and of a lower one."""
     folder = tmp_path_factory.mktemp("results")
     write_results(folder / "high", "high", HIGH, offset=1.0)
-    write_results(folder / "high" / "forgets", "high (forgets)", [5.0] * 100, offset=0.5, forget=True)
+    write_results(folder / "high" / "cleared", "high (cleared)", [5.0] * 100, offset=0.5, forget=True)
     write_results(folder / "high" / "swapped", "high (swapped)", HIGH[:80] + [20.0] * 20, offset=1.0, swapped=True)
     write_results(folder / "low", "low", LOW)
     return folder

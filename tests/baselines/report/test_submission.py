@@ -32,7 +32,7 @@ def submitted(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("submitted")
     write_results(folder / "one", "rule", CURVE)
     write_results(folder / "two", "rule", CURVE, trained_on=[{"layout": "asymm_both", "family": "H1"}])
-    write_results(folder / "two" / "forgets", "rule (forgets)", [0.0] * 100, forget=True)
+    write_results(folder / "two" / "cleared", "rule (cleared)", [0.0] * 100, forget=True)
     write_submission(folder / "rule.json", make_submission([folder / "one", folder / "two"], FACTS))
     return folder / "rule.json"
 
@@ -41,7 +41,7 @@ def test_a_file_has_all_results_of_all_folders(submitted):
     found = read_submission(submitted)
     assert (found.agent, found.tracks, found.facts.about) == ("rule", ["layout"], "a rule")
     parts = [(one.control, one.training, len(one.returns)) for one in found.evaluations]
-    assert parts == [("", 0, 40), ("", 1, 40), ("forgets", 1, 40)]
+    assert parts == [("", 0, 40), ("", 1, 40), ("cleared", 1, 40)]
     assert next(iter(found.evaluations[0].returns.values())) == [CURVE] * 3
 
 
@@ -69,7 +69,7 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: c.update(best_responses="99"), r"best responses of version '99', expected '0'"),
         (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
         (lambda c, one, task: one["settings"]["protocol"].update(four_recipes=True), "'four_recipes': True"),
-        (lambda c, one, task: one.update(control="swap"), "control 'swap', expected forgets or swapped"),
+        (lambda c, one, task: one.update(control="swap"), "control 'swap', expected cleared or swapped"),
         (lambda c, one, task: c["evaluations"].append(one), "results of a task twice"),
         (lambda c, one, task: one["returns"].pop(task), "1 of the 40 test tasks of layout are missing, such as layout"),
         (lambda c, one, task: rename(one, task, OTHER), f"task {OTHER} is not one of the 40 test tasks of layout"),
@@ -78,8 +78,8 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
         (lambda c, one, task: one["returns"][task].pop(), r"has 2 lists of \[100\] returns, expected 3 of 100"),
         (lambda c, one, task: one["settings"]["protocol"].update(name="published"), "protocol {'name': 'published'"),
         (lambda c, one, task: c.update(evaluations=c["evaluations"][2:]), "only controls"),
-        (lambda c, one, task: one["settings"]["details"].update(forget=True), "of forgets, expected no control"),
-        (lambda c, one, task: c["evaluations"][2]["settings"]["details"].clear(), "of no control, expected forgets"),
+        (lambda c, one, task: one["settings"]["details"].update(forget=True), "of cleared, expected no control"),
+        (lambda c, one, task: c["evaluations"][2]["settings"]["details"].clear(), "of no control, expected cleared"),
         (lambda c, one, task: c["facts"].update(data=""), "Expected `str` of length >= 1 - at `\\$.facts.data`"),
     ],
 )  # fmt: skip
@@ -138,7 +138,7 @@ def test_another_way_of_playing_is_added(tmp_path):
     own, drawn = (
         write_results(tmp_path / name, name, CURVE, sampled=name != "mine") for name in ("mine", "mine (sampled)")
     )
-    write_results(drawn / "forgets", "mine (sampled) (forgets)", CURVE, sampled=True, forget=True)
+    write_results(drawn / "cleared", "mine (sampled) (cleared)", CURVE, sampled=True, forget=True)
     both = make_submission([drawn, own], FACTS)
     assert (both.agent, [one.control for one in both.evaluations]) == ("mine", ["sampled", ""])
     stored = comparison.add_submission(comparison.StoredResults(), make_submission([own], FACTS))

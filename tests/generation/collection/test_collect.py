@@ -40,14 +40,14 @@ def report(update, metrics):
     time.sleep(0.1)
 
 profile = load_profile(sys.argv[1])
-run_task(*profile.works(), profile, Path(sys.argv[2]), report, save_seconds=float(sys.argv[3]))
+run_task(*profile.units(), profile, Path(sys.argv[2]), report, save_seconds=float(sys.argv[3]))
 """
 
 
 @pytest.fixture
 def task(built):
     profile = load_profile(str(built / "tiny.toml"))
-    return profile.works()[0], profile
+    return profile.units()[0], profile
 
 
 def run_task(task: tuple[Work, Profile], *arguments, **options) -> bool:

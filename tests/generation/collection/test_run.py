@@ -32,7 +32,7 @@ from tests.helpers.tiny import artefact, start
 @pytest.fixture
 def tasks(built):
     profile = load_profile(str(built / "pair.toml"))
-    return profile.works(), profile
+    return profile.units(), profile
 
 
 def failures(out: Path) -> list[dict]:

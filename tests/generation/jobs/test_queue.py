@@ -61,7 +61,7 @@ def test_a_stopped_training_can_be_passed_between_processes():
 def test_jobs_of_a_rebuild_have_names_and_updates(tmp_path):
     profile = load_profile("smoke")
     populations = population_runs(profile, {"demo_wide": ["fcp"]}, 0)
-    jobs = [CollectionJob(work, profile, tmp_path) for work in profile.works()]
+    jobs = [CollectionJob(work, profile, tmp_path) for work in profile.units()]
     jobs += [PopulationJob(run, tmp_path, profile.xla_threads) for run in populations]  # type: ignore[arg-type]
     assert len({job.name for job in jobs}) == len(jobs)
     assert jobs[-1].name == "demo_wide/fcp"

@@ -147,7 +147,7 @@ def test_cards_say_what_a_checkpoint_is(trained, algorithm):
         assert (card["algorithm"], card["layout"], card["seed"]) == (algorithm, "cramped_up", 0)
         assert (card["member"], card["checkpoint"]) == (member, checkpoint)
         assert card["step"] == 2048 * (checkpoint + 2)
-        assert card["seats"] == ([1] if algorithm in ("brdiv", "lbrdiv") else [0, 1])
+        assert card["agents"] == ([1] if algorithm in ("brdiv", "lbrdiv") else [0, 1])
         assert card["shapes"]["params/actor/kernel"] == [16, 6]
         assert card["widths"] == json.loads(json.dumps(asdict(WIDTHS)))
         assert isinstance(card["return"], float)

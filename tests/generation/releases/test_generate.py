@@ -75,12 +75,12 @@ def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
     shutil.copytree(folder, tmp_path / "copy")
     shutil.copy(tmp_path / "copy/checkpoints/c1/policy.json", tmp_path / "copy/checkpoints/c0/policy.json")
     profile = load_profile(str(built / "tiny.toml"))
-    assert not artefacts.is_task_finished(tmp_path / "copy", profile.works()[0], profile)
+    assert not artefacts.is_task_finished(tmp_path / "copy", profile.units()[0], profile)
 
 
 def test_damaged_or_different_artefacts_are_unfinished(built, tmp_path):
     profile = load_profile(str(built / "tiny.toml"))
-    (work,) = profile.works()
+    (work,) = profile.units()
     folder = tmp_path / "copy"
     shutil.copytree(artefact(built / "a"), folder)
     assert artefacts.is_task_finished(folder, work, profile)

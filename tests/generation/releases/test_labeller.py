@@ -71,7 +71,7 @@ def task(built, tmp_path):
     shutil.copytree(artefact(built / "a"), folder)
     for kept in artefact(built / "a").parent.glob(".*.teammates.json"):  # facts about the teammate
         shutil.copy(kept, folder.parent)
-    return profile.works()[0].task, profile, folder
+    return profile.units()[0].task, profile, folder
 
 
 def with_returns(folder: Path, greedy: list[float]) -> None:

@@ -76,7 +76,7 @@ def make_noise(built: Path, work: Work, artefacts: Path) -> None:
 
 
 def make_tasks(profile: Profile, count: int) -> list[Task]:
-    (first,) = {work.task.task_id: work.task for work in profile.works()}.values()
+    (first,) = {work.task.task_id: work.task for work in profile.units()}.values()
     presets = ("default", "high_inertia")
     entries = [heuristic_teammate("utility_greedy", preset, number) for number, preset in enumerate(presets[:count])]
     return [first, *(make_task("teammate", "train", "demo_wide", entry, 7) for entry in entries[1:])]

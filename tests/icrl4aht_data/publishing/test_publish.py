@@ -61,7 +61,7 @@ def with_learned(tmp_path_factory) -> Path:
         "step": 4000,
         "seed": 0,
         "code_version": "0.1.0",
-        "seats": [0, 1],
+        "agents": [0, 1],
         "return": 40.0,
         "teammate_return": 35.5,
         "return_of": "16 episodes",
