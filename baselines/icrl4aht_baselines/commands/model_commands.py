@@ -265,7 +265,7 @@ def submit_command(
 def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: bool) -> None:
     """Compare models on the benchmark's tasks.
 
-    Writes a page with three tables and a figure, results.md and results.png, and every number, results.csv and
+    Writes a page with tables and a figure, results.md and results.png, and every number, results.csv and
     results.parquet, from the package's stored results and those of FILEs that `submit` made. Every
     agent needs a name of its own.
     """
