@@ -27,6 +27,7 @@ from icrl4aht_data.commands.options import (
     overwrite_option,
 )
 from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
+from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, check_output
@@ -125,7 +126,7 @@ def generate(
         raise click.UsageError("--bundle needs --kind lite")
     options = read_queue_options(queue)
     profile = _profile_with_threads(profile_name, xla_threads).with_ego(ego)
-    tasks = read_tasks(task_file) if task_file else None
+    tasks = read_tasks_and_layouts(task_file) if task_file else None
     sources = recorded_sources(task_file.parent.parent) if task_file else {}
     built = build_releases(profile, out, kind, console, options, suite, seed, tasks, sources)
     releases = dict(zip(kind, built, strict=True))

@@ -41,14 +41,19 @@ def has_headroom(references: Mapping[str, float]) -> bool:
     return references["oracle"] - references["stay"] > _NO_HEADROOM
 
 
+def cells_without_headroom(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str]) -> list[Cell]:
+    """Return the cells of some layouts in which `oracle` earns no more than `stay`, by layout and family."""
+    known = [(layout, family) for layout in layouts for family in HEURISTICS if (layout, family) in cells]
+    return [cell for cell in known if not has_headroom(cells[cell])]
+
+
 def headroom_table(cells: Mapping[Cell, Mapping[str, float]], layouts: Sequence[str]) -> str:
     """Return a Markdown table of `stay / random / oracle`, and a line that lists the cells without headroom.
 
     One row per family, one column per layout; cells with headroom are bold.
     """
     rows = [[family, *(_cell_text(cells.get((layout, family))) for layout in layouts)] for family in HEURISTICS]
-    known = [(layout, family) for layout in layouts for family in HEURISTICS if (layout, family) in cells]
-    flat = ["/".join(cell) for cell in known if not has_headroom(cells[cell])]
+    flat = ["/".join(cell) for cell in cells_without_headroom(cells, layouts)]
     return f"{markdown_table(['family', *layouts], rows)}\n\nNo headroom: {', '.join(flat) or 'none'}."
 
 

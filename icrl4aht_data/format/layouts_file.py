@@ -16,11 +16,15 @@ from typing import Any
 
 import msgspec
 
+from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, UnknownNameError
 from icrl4aht_data.format.schema import LAYOUTS_FILE, check_name
 from icrl4aht_data.overcooked.cells import GOAL, PLATES, POT
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, LayoutLine, add_layouts, get_layout
 from icrl4aht_data.utils.files import read_lines, resolve_inside
+
+LAYOUTS_NAME = LAYOUTS_FILE.rpartition("/")[2]
+"""Name of a file of layouts, next to a file of tasks on them."""
 
 PUBLISHED = "published"
 """Family of the layouts of the benchmark, which every copy of this package has."""
@@ -62,7 +66,11 @@ def read_layouts(root: Path) -> ReleaseLayouts:
         IndexFormatError: if a line is malformed, a name occurs twice or stands for another map elsewhere, or no dish
             can be made on a map; with the file and the line number.
     """
-    path = resolve_inside(root, LAYOUTS_FILE)
+    return _read_layouts_file(resolve_inside(root, LAYOUTS_FILE))
+
+
+def _read_layouts_file(path: Path) -> ReleaseLayouts:
+    """Read a file of layouts, see `read_layouts`; there are none without the file."""
     families: dict[str, str] = {}
     layouts = []
     for number, line in enumerate(read_lines(path) if path.is_file() else (), start=1):
@@ -83,11 +91,29 @@ def read_layouts(root: Path) -> ReleaseLayouts:
     return ReleaseLayouts(families, tuple(layouts))
 
 
+def read_tasks_and_layouts(path: Path) -> list[Task]:
+    """Return the tasks of a JSONL file; the layouts in a file `layouts.jsonl` next to it become known to `get_layout`.
+
+    So `meta/tasks.jsonl` of a release is read without opening the release.
+
+    Raises:
+        TaskFormatError: names the file and the line.
+        IndexFormatError: if the file of layouts is malformed, see `read_layouts`.
+    """
+    _read_layouts_file(path.with_name(LAYOUTS_NAME))
+    return read_tasks(path)
+
+
 def write_layouts(root: Path, layouts: Iterable[Layout]) -> None:
-    """Write the layouts that the benchmark does not have; no file if there are none."""
+    """Write the layouts that the benchmark does not have to a release; no file if there are none."""
+    write_layouts_file(root / LAYOUTS_FILE, layouts)
+
+
+def write_layouts_file(path: Path, layouts: Iterable[Layout]) -> None:
+    """Write the layouts that the benchmark does not have to a file; no file if there are none."""
     lines = [_line(layout) for layout in dict.fromkeys(layouts) if layout.name not in LAYOUTS]
     if lines:
-        (root / LAYOUTS_FILE).write_bytes(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
+        path.write_bytes(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
 
 
 def layout_title(name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,6 +17,8 @@ from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
+    HEURISTIC_KINDS,
+    LAYOUT_NAMES,
     LEAST_HEADROOM,
     PAPER_EGO_STEPS,
     PAPER_TEAMMATE_STEPS,
@@ -23,16 +26,17 @@ from icrl4aht_data.benchmark.facts import (
     SAME_BEHAVIOUR,
     SOURCES,
     SPLITS,
+    TESTED_ON,
     TRACKS,
     family_order,
     track_of,
 )
-from icrl4aht_data.benchmark.reference_returns import headroom_table, read_headroom
+from icrl4aht_data.benchmark.reference_returns import cells_without_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.layouts_file import layout_title
-from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.provenance import NearestTest, Provenance, read_provenance
 from icrl4aht_data.format.schema import (
     CARD_TABLES,
     FIELDS,
@@ -59,6 +63,7 @@ CURVES_FIGURE, LAYOUTS_FIGURE = (f"figures/{name}.png" for name in ("learning_cu
 """Paths of the figures of a release built for publication."""
 
 _LEAST_RISE = 5.0  # a quarter of a delivery
+_MIXED, _WATCHING = "heuristic mixed with random actions", "heuristic that never acts"
 _SCHEDULE = {"histories", "episodes", "start", "end", "begin", "finish", "power"}
 
 
@@ -173,19 +178,20 @@ def facts(root: Path) -> dict[str, Any]:
         "kinds": dict(sorted({(e.teammate_family, e.teammate_kind) for e in entries if e.teammate_family != "rl"})),
         "algorithms": [name for name in ALGORITHMS if name in {entry.teammate_kind for entry in entries}],
         "labelled": {name: sum(e.has(FIELDS[f"{name}_actions"]) for e in entries) for name in ("expert", "oracle")},
-        "views": Counter(entry.label_view for entry in entries if entry.label_view),
+        "views": _views(entries),
         "swapped": sum(entry.teammate_of_episode is not None for entry in entries),
         "example": {"split": first.split, "layout": first.layout, "length": length},
         "layouts": _layouts(info, titles, matters),
         "learning": learning,
         "curves": _curves(learning, sources),
         "teammates": teammates,
+        "teammate_kinds": _kinds_table(tasks, info.layouts),
         **_behaviours(teammates),
         "weak": Counter((titles[task.first.layout], task.first.source) for task in tasks if task.has_weak_labels),
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,
         "proof": read_proof(root),
-        "test_headroom": headroom_table(read_headroom(HEADROOM_PROTOCOL), tested),
+        "flat_cells": ["/".join(cell) for cell in cells_without_headroom(read_headroom(HEADROOM_PROTOCOL), tested)],
         "arrays": [name for name, array in FIELDS.items() if info.kind not in array.absent or name == "obs"],
         **_known_families(tasks),
         "suites": _distinct(tasks, "suite"),
@@ -195,6 +201,15 @@ def facts(root: Path) -> dict[str, Any]:
         "paper": {"ego": PAPER_EGO_STEPS, "teammate": PAPER_TEAMMATE_STEPS, "teammates": PAPER_TEAMMATES * 4},
         "citation": card_file("citation.bib").read_text(encoding="utf-8").strip(),
     }
+
+
+def _views(entries: Iterable[Entry]) -> dict[str, Counter[str]]:
+    """Return label view -> source -> number of histories."""
+    found = defaultdict[str, Counter[str]](Counter)
+    for entry in entries:
+        if entry.label_view:
+            found[entry.label_view][entry.source] += 1
+    return dict(found)
 
 
 def _mean(values: Iterable[float]) -> float:
@@ -312,7 +327,6 @@ def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str,
         rows.append(
             [
                 title if title in own else f"{title} ({len(own)} generated layouts)",
-                f"{_span(one.width for one in layouts)} x {_span(one.height for one in layouts)}",
                 _span(one.obs_shape[-1] for one in layouts),
                 f"{sum(histories):,}",
                 f"{sum(found.transitions for found in own.values()):,}",
@@ -323,17 +337,33 @@ def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str,
     return rows
 
 
-def _known_families(tasks: Iterable[_TaskFacts]) -> dict[str, list[str]]:
-    """Return the families of heuristic training teammates, by their similarity to test teammates.
+def _nearest_tests(tasks: Iterable[_TaskFacts]) -> dict[tuple[str, str], NearestTest]:
+    """Return key of a teammate -> its nearest test instance, where one of its tasks has it."""
+    return {
+        one.task.teammate_key: one.made.nearest_test
+        for one in tasks
+        if one.task is not None and one.made.nearest_test is not None
+    }
+
+
+def _known_families(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
+    """Return the families of heuristic training and validation teammates, by their similarity to test teammates.
 
     Returns:
-        `tested`: families whose teammates are test teammates, or act like one of the same family; `drawn`: families
-        with other teammates; `alike`: teammates of these that act like a test teammate of another family.
+        `tested`: families whose teammates are test teammates, act like one of the same family, or were not compared
+        with those of their layout; `drawn`: families with other teammates; `drawn_distance`: the least distance of
+        these to a test teammate, rounded down to two digits; `alike`: teammates of these that act like a test teammate
+        of another family; `untested`: whether some play on layouts without test teammates to compare with.
     """
-    tested, drawn, alike = set(), set(), set()
+    tested, drawn, alike, distances, untested = set(), set(), set(), [], False
+    nearest = _nearest_tests(tasks)
     for task in tasks:
-        family, near = task.first.teammate_family, task.made.nearest_test
+        family, layout = task.first.teammate_family, task.first.layout
+        near = task.made.nearest_test or (nearest.get(task.task.teammate_key) if task.task else None)
         if task.first.split == "test" or family == "rl":
+            continue
+        if near is None and layout not in LAYOUT_NAMES:
+            untested = True
             continue
         is_same = near is not None and near.distance < SAME_BEHAVIOUR
         if near is None or (is_same and near.teammate.split("/")[0] == family):
@@ -341,8 +371,49 @@ def _known_families(tasks: Iterable[_TaskFacts]) -> dict[str, list[str]]:
             continue
         drawn.add(family)
         if is_same:
-            alike.add(f"{family} on {task.first.layout} like {near.teammate}")
-    return {"tested": sorted(tested), "drawn": sorted(drawn), "alike": sorted(alike)}
+            alike.add(f"{family} on {layout} like {near.teammate}")
+        else:
+            distances.append(near.distance)
+    return {
+        "tested": sorted(tested),
+        "drawn": sorted(drawn),
+        "drawn_distance": math.floor(100 * min(distances)) / 100 if distances else None,
+        "alike": sorted(alike),
+        "untested": untested,
+    }
+
+
+def _kind_of_teammate(task: Task) -> str:
+    theta = task.teammate.get("theta", {})
+    if task.teammate_family == "rl":
+        return f"learned by {task.teammate_kind}"
+    if theta.get("action_probability") == 0.0:
+        return _WATCHING
+    return _MIXED if theta.get("random_actions") else task.teammate_family
+
+
+def _kinds_table(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[list[str]]:
+    """Return the rows of the card's table of teammates by kind, which shows what is missing.
+
+    The columns are the kind, its numbers of different teammates in training and in validation, on the benchmark's
+    training layouts and on others, and those training layouts in the release on which it does not train. A teammate
+    counts once: as one that never acts, as a mixture, or else as a member of its family. No rows without tasks.
+    """
+    published = [name for name in layouts if name in TESTED_ON]
+    found = defaultdict[tuple[str, str, bool], set[tuple[str, str]]](set)
+    for task in (one.task for one in tasks if one.task is not None):
+        name = task.layout.name
+        key = name, json.dumps(task.teammate, sort_keys=True)  # not `teammate_key`, which has the wanted dish
+        found[_kind_of_teammate(task), task.split, name in TESTED_ON].add(key)
+    named = [*HEURISTIC_KINDS.values(), _MIXED, _WATCHING, *(f"learned by {name}" for name in ALGORITHMS)]
+    if not found:
+        return []
+    rows, names = [], {family: f"{family} (`{kind}`)" for kind, family in HEURISTIC_KINDS.items()}
+    for kind in dict.fromkeys([*named, *(kind for kind, _, _ in found)]):
+        absent = [name for name in published if name not in {layout for layout, _ in found[kind, "train", True]}]
+        counts = [str(len(found[kind, split, known])) for known in (True, False) for split in ("train", "validation")]
+        rows.append([names.get(kind, kind), *counts, "all" if absent == published else ", ".join(absent)])
+    return rows
 
 
 def _distinct(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
@@ -357,16 +428,17 @@ def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
     noise = {json.dumps([task.made.source, task.made.noise]): task.made for task in tasks if task.made.noise}
     labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
     versions = {label: ", ".join(map(str, _distinct(tasks, name))) for name, label in labels.items()}
+    streams = defaultdict[tuple[int, int, float | None], list[str]](list)  # the filter's rule -> layouts
+    for task in tasks:
+        made = task.made
+        if made.filter and made.streams_kept:
+            names = streams[made.streams_recorded or 0, made.streams_kept, made.filter.least_improvement]
+            names += [task.first.layout] * (task.first.layout not in names)
     return {
         "egos": _distinct(tasks, "ego"),
         "learners": [task.made.learners or 1 for task in tasks if task.made.ego],
-        "streams": {
-            (made.streams_recorded or 0, made.streams_kept, made.filter.least_improvement): None
-            for made in (task.made for task in tasks)
-            if made.filter and made.streams_kept
-        },
+        "streams": streams,
         "schedules": [made for made in noise.values() if (made.noise or {}).keys() >= _SCHEDULE],
-        "has_policies": any(task.made.expert and task.made.expert.policy_sha256 for task in tasks),
         "versions": "; ".join(f"{label} {values}" for label, values in versions.items() if values),
     }
 

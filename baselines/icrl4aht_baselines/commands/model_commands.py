@@ -11,7 +11,6 @@ import click
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.dataclass_options import OptionValue
 from icrl4aht_data.commands.options import (
     COUNT,
@@ -23,6 +22,7 @@ from icrl4aht_data.commands.options import (
 )
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.options import Share
@@ -116,7 +116,7 @@ def collect_command(
     other = find_ego("--labeller", labeller, greedy=True) if labeller else None
     names = [get_layout(name).name for name in layouts] or None
     dataset = filter_histories(load_icrl4aht(root, layout=names), filters)
-    tasks = [task for manifest in manifests for task in read_tasks(manifest)]
+    tasks = [task for manifest in manifests for task in read_tasks_and_layouts(manifest)]
     teammates = release_teammates(dataset, tasks=tasks)
     if swap is not None and (alone := len(teammates.tasks) - len(plan_swaps(teammates.tasks, config.episodes, swap))):
         click.echo(f"{counted_noun(alone, 'task')} without another teammate of its kind, split and layout: not swapped")
@@ -265,7 +265,7 @@ def submit_command(
 def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: bool) -> None:
     """Compare models on the benchmark's tasks.
 
-    Writes a page with three tables and a figure, results.md and results.png, and every number, results.csv and
+    Writes a page with tables and a figure, results.md and results.png, and every number, results.csv and
     results.parquet, from the package's stored results and those of FILEs that `submit` made. Every
     agent needs a name of its own.
     """

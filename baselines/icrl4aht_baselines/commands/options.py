@@ -20,13 +20,14 @@ from icrl4aht_baselines.training.options import (
     TrainOptions,
 )
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.benchmark.tasks import Task, read_tasks
+from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.commands.dataclass_options import dataclass_options, topic
 from icrl4aht_data.commands.options import (
     COUNT,
     COUNT_OR_NONE,
     FAMILY,
     LAYOUT,
+    RELEASE_LAYOUT,
     SEED,
     TRACK,
     Folder,
@@ -35,6 +36,7 @@ from icrl4aht_data.commands.options import (
     checked_later,
 )
 from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
+from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.overcooked.layouts import get_layout
 
 
@@ -96,9 +98,8 @@ greedy_option = click.option(
     show_default="greedy; a bundled model's own, see `models`",
 )
 EVALUATION_SPLIT = Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS"))
-only_layouts_option = click.option(
-    "--layout", "layouts", type=LAYOUT, multiple=True, help="Only on this layout; repeat for several."
-)
+_ONLY_LAYOUTS: Any = {"multiple": True, "help": "Only on this layout; repeat for several."}
+only_layouts_option = click.option("--layout", "layouts", type=LAYOUT, **_ONLY_LAYOUTS)
 _MANIFEST: Any = {"type": click.Path(path_type=Path, exists=True, dir_okay=False), "metavar": "FILE"}
 tasks_options = (
     click.option(
@@ -115,7 +116,7 @@ tasks_options = (
         default=("test",),
         help="Which tasks: test, or validation and diverse, by which models are chosen; repeat for several.",
     ),
-    only_layouts_option,
+    click.option("--layout", "layouts", type=RELEASE_LAYOUT, **_ONLY_LAYOUTS),  # perhaps one of the manifest's
     click.option(
         "--family", "families", type=FAMILY, multiple=True, help="Only with teammates of this family; repeat."
     ),
@@ -169,8 +170,12 @@ def chosen_tasks(
     if manifest:
         check_alone("--manifest", "split")
     bundled = ((name, of_split) for of_split in split for name in track)
-    given = read_tasks(manifest) if manifest else [task for each in bundled for task in bundled_tasks(*each)]
-    names = {get_layout(name).name for name in layouts}
+    own = read_tasks_and_layouts(manifest) if manifest else []
+    given = own if manifest else [task for each in bundled for task in bundled_tasks(*each)]
+    try:
+        names = {get_layout(name).name for name in layouts}
+    except UnknownNameError as error:
+        raise click.BadParameter(str(error), param_hint="'--layout'") from error
     chosen = [task for task in given if not names or task.layout.name in names]
     chosen = [task for task in chosen if not families or task.teammate_family in families]
     if not chosen:
@@ -264,7 +269,7 @@ def prepare_training(
             raise click.UsageError(f"{_flags(unused)}: not with {method}, which learns by playing")
         sized = ModelOptions(**RL2_SETTINGS["model"] | model)
         options = TrainOptions(**RL2_SETTINGS["train"] | train)
-        tasks = [task for manifest in manifests for task in read_tasks(manifest)]
+        tasks = [task for manifest in manifests for task in read_tasks_and_layouts(manifest)]
         job = prepare_play(method, sized, options, PlayOptions(**play), histories, tasks)
         played = job.about["histories"]
         text = (

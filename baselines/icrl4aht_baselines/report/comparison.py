@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gzip
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,7 +39,7 @@ from icrl4aht_baselines.report.statistics import MeanInterval, holm
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission, submitted_runs
 from icrl4aht_baselines.report.tables import mean_of
 from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
-from icrl4aht_data.benchmark.best_responses import read_best_responses
+from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_headroom
 from icrl4aht_data.errors import OptionError
@@ -208,6 +208,7 @@ def render_comparison(stored: StoredResults) -> str:
         difference=describe_lead(results, scales),
         controls=controls_table(stored, shown, scales),
         layouts=layouts_table(shown, scales),
+        best_responses=best_responses_table(scales),
         adaptation=adaptation_table(results_file().parent, layouts=False),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
         earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
@@ -299,6 +300,18 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
     return markdown_table(["model", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))
 
 
+def mean_best(layout: str, scales: CellScales) -> float | None:
+    """Return the mean return of the best responses over the families of a layout; None if it has none.
+
+    A cell without a best response has the return of `stay`: there the oracle earns no more than `stay`, see
+    `scores.cell_scales`.
+    """
+    cells = {ResultCell(*cell): egos for cell, egos in read_headroom(SUBMITTED_PROTOCOL).items() if cell[0] == layout}
+    if not cells.keys() & scales.keys():
+        return None
+    return float(np.mean([scales[cell].best if cell in scales else egos["stay"] for cell, egos in cells.items()]))
+
+
 def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return table 3: mean return on each layout, with N in parentheses, the worst teammate and the regret.
 
@@ -309,12 +322,8 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
     for ego in REFERENCES:
         means = (np.mean([egos[ego] for cell, egos in headroom.items() if cell[0] == name]) for name in TEST_LAYOUTS)
         body.append([f"`{ego}`", *(f"{mean:z.1f}" for mean in means), "", ""])
-    bests = []
-    for name in TEST_LAYOUTS:
-        of_layout = [scale.best for cell, scale in scales.items() if (cell.layout, cell.kind) == (name, "test")]
-        families = [cell for cell in headroom if cell[0] == name]
-        bests.append(f"{np.mean(of_layout):z.1f}" if len(of_layout) == len(families) else "–")
-    body.append(["best response", *bests, "", ""])
+    bests = [mean_best(name, scales) for name in TEST_LAYOUTS]
+    body.append(["best response", *("–" if best is None else f"{best:z.1f}" for best in bests), "", ""])
     for agent, cells in results.items():
         texts = []
         for name in TEST_LAYOUTS:
@@ -326,6 +335,42 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
         worst = f"{score.worst[1]:z.2f}, {score.worst[0]}" if score else "–"
         body.append([f"`{agent}`", *texts, worst, f"{score.regret:z.1f}" if score else "–"])
     return markdown_table(["model", *TEST_LAYOUTS, "worst teammate", "regret"], body, right=len(TEST_LAYOUTS) + 2)
+
+
+def best_responses_table(scales: CellScales) -> str:
+    """Return table 5: a row for each test cell with best responses.
+
+    S and B are means over the tasks of a cell; the spread is the difference of the highest and the lowest return of the
+    trainings with one teammate, mean over the behaviours with several trainings.
+    """
+    by_cell: dict[ResultCell, list[BestResponse]] = defaultdict(list)
+    for one in read_best_responses().behaviours:
+        by_cell[ResultCell(one.layout, one.family, one.split)].append(one)
+    body = []
+    for cell in (cell for cell in scales if cell in by_cell and cell.kind == "test"):
+        own, scale = by_cell[cell], scales[cell]
+        trained = [training for one in own for training in one.seeds]
+        spreads = [np.ptp([training.mean_return for training in one.seeds]) for one in own if len(one.seeds) > 1]
+        body.append([
+            cell.layout,
+            cell.family,
+            str(len(own)),
+            f"{scale.stay:z.1f}",
+            f"{scale.best:z.1f}",
+            _span([one.best for one in own], "z.1f"),
+            str(sum(not one.agent.startswith("best response") for one in own)),
+            _span([len(one.seeds) for one in own], "d"),
+            _span([training.steps for training in trained], ",d"),
+            _span([training.width for training in trained], "d"),
+            f"{np.mean(spreads):.1f}" if spreads else "–",
+        ])  # fmt: skip
+    numbers = ["behaviours", "S", "B", "B by behaviour", "of a model", "trainings", "steps", "width", "spread"]
+    return markdown_table(["layout", "family", *numbers], body, right=len(numbers))
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    low, high = (format(limit, form) for limit in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
 
 
 def figure_layouts() -> list[str]:
@@ -359,8 +404,8 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
                 axes.plot([1], [mean_of(first)], "o", color=color, markersize=4, label=f"{agent}, first episode")
         cells = [ResultCell(*cell) for cell in headroom if cell[0] == layout]
         axes.axhline(np.mean([headroom[cell[:2]]["stay"] for cell in cells]), color="gray", linestyle=":", label="stay")
-        if all(cell in scales for cell in cells):
-            axes.axhline(np.mean([scales[cell].best for cell in cells]), color="black", label="best response")
+        if (best := mean_best(layout, scales)) is not None:
+            axes.axhline(best, color="black", label="best response")
         axes.set_ylim(*return_limits(value for line in axes.lines for value in np.ravel(line.get_ydata())))
         axes.set_xscale("log")
         axes.set_xlim(0.9, 110)

@@ -34,8 +34,10 @@ from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
 from icrl4aht_baselines.training.seen import OVERLAPS, TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE, TRACKS, family_order, layout_order, track_of
-from icrl4aht_data.benchmark.tasks import Task, read_tasks, write_tasks
+from icrl4aht_data.benchmark.tasks import Task, write_tasks
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_tasks_and_layouts, write_layouts_file
+from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.text import counted_noun
@@ -293,9 +295,11 @@ def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] =
     own = {task.task_id: task for task in tasks if task.task_id not in bundled_by_id("test")}
     if own:
         path = results / OWN_TASKS
-        known = {task.task_id: task for task in read_tasks(path)} if path.exists() else {}
+        known = {task.task_id: task for task in read_tasks_and_layouts(path)} if path.exists() else {}
+        noted = [*(known | own).values()]
+        write_layouts_file(results / LAYOUTS_NAME, [get_layout(task.layout_name) for task in noted])
         with atomic_write(path) as partial:
-            write_tasks(partial, (known | own).values())
+            write_tasks(partial, noted)
 
 
 def evaluate_agent(
@@ -343,7 +347,7 @@ def read_run(folder: Path) -> EvaluationRun:
         OptionError: if there are none, if they mix settings, or if the task of one is unknown.
     """
     results, trained = read_results(folder)
-    own = read_tasks(folder / OWN_TASKS) if (folder / OWN_TASKS).exists() else []
+    own = read_tasks_and_layouts(folder / OWN_TASKS) if (folder / OWN_TASKS).exists() else []
     return as_run(results, str(folder), own, trained)
 
 

@@ -16,20 +16,30 @@ from icrl4aht_baselines.report.comparison import (
     add_scales,
     add_submission,
     agents_table,
+    best_responses_table,
     controls_table,
     describe_lead,
     figure_layouts,
     layouts_table,
+    mean_best,
     read_stored,
     render_comparison,
     results_file,
     write_comparison,
     write_stored,
 )
-from icrl4aht_baselines.report.scores import cell_scales
+from icrl4aht_baselines.report.results import ResultCell
+from icrl4aht_baselines.report.scores import CellScale, TaskScale, cell_scales
 from icrl4aht_baselines.report.submission import AgentFacts, make_submission
 
 from icrl4aht_data.benchmark import best_responses
+from icrl4aht_data.benchmark.best_responses import (
+    BestResponse,
+    BestResponseCard,
+    TrainedResponse,
+    write_best_responses,
+)
+from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.templates import card_file
 from tests.helpers.evaluated import write_results
@@ -117,6 +127,38 @@ def test_table_3_has_reference_egos_and_layouts(stored, measured):
     assert low[9].endswith("asymm_right H4"), "stay earns 40 there"
     none = layouts_table(stored.returns(), {})
     assert row(none, "low")[7:] == ["9.5", "9.5", "–", "–"] and "| best response | – |" in none
+
+
+def test_best_responses_of_a_layout_count_as_stay_in_cells_without_one(measured):
+    scales, stay = cell_scales("seeded"), read_headroom("seeded")
+    ring = [cell for cell in scales if cell.layout == "coord_ring"]
+    h2 = next(cell for cell in ring if cell.family == "H2")
+    others = sum(stay[cell[:2]]["stay"] for cell in ring if cell != h2)
+    assert mean_best("coord_ring", {h2: scales[h2]}) == pytest.approx((scales[h2].best + others) / 4)
+    assert mean_best("coord_ring", {cell: scales[cell] for cell in scales if cell not in ring}) is None
+
+
+def test_table_5_has_the_range_and_the_spread_of_best_responses(cards, monkeypatch):
+    by_agent = [("best response, seed 1", [1.0, 3.0]), ("some model", [4.0])]
+    h1 = [f"task_{number}" for number in range(5)]
+    behaviours = [
+        BestResponse(
+            layout="asymm_right",
+            family="H1",
+            split="test",
+            tasks=tuple(tasks),
+            seeds=tuple(TrainedResponse(seed, 100, value) for seed, value in enumerate(returns)),
+            best=max(returns),
+            agent=agent,
+        )
+        for tasks, (agent, returns) in zip((h1[:2], h1[2:]), by_agent, strict=True)
+    ]
+    write_best_responses(cards / "two.json", BestResponseCard("0", "seeded", "Two.", tuple(behaviours)))
+    monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "two.json")
+    scale = CellScale({task: TaskScale(0.0, 3.5, task) for task in h1})
+    table = best_responses_table({ResultCell("asymm_right", "H1", "test"): scale})
+    texts = ["2", "0.0", "3.5", "3.0 to 4.0", "1", "1 to 2", "100", "128", "2.0"]
+    assert table.splitlines()[-1] == f"| asymm_right | H1 | {' | '.join(texts)} |"
 
 
 def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monkeypatch):

@@ -19,6 +19,7 @@ from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import LAYOUT
 from icrl4aht_data.errors import IndexFormatError, OptionError, TaskFormatError, UnknownNameError
+from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_tasks_and_layouts, write_layouts_file
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import FORMAT_VERSION, LAYOUTS_FILE, TASKS
 from icrl4aht_data.overcooked import layouts as known_layouts
@@ -46,6 +47,25 @@ def root(tmp_path, fresh, monkeypatch) -> Path:
     with pytest.raises(UnknownNameError):
         get_layout("mine-3-5")
     return tmp_path / "release"
+
+
+def test_tasks_of_a_release_are_read_with_its_layouts(root):
+    with pytest.raises(TaskFormatError, match="unknown layout 'mine-3-5'"):
+        read_tasks(root / TASKS)
+    tasks = read_tasks_and_layouts(root / TASKS)
+    assert {task.layout.name for task in tasks} == {"coord_simple", "mine-3-5"}
+    assert get_layout("mine-3-5").rows == ROWS
+    (root / LAYOUTS_FILE).write_text("{}\n")
+    with pytest.raises(IndexFormatError, match=r"layouts\.jsonl, line 1"):
+        read_tasks_and_layouts(root / TASKS)
+
+
+def test_layouts_of_a_file_of_tasks(tmp_path, monkeypatch):
+    add_layouts([MINE])
+    write_layouts_file(tmp_path / LAYOUTS_NAME, [MINE, get_layout("coord_simple")])
+    monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+    write_tasks(tmp_path / "tasks.jsonl", [])
+    assert read_tasks_and_layouts(tmp_path / "tasks.jsonl") == [] and get_layout("mine-3-5") == MINE
 
 
 def rewritten(root: Path, lines: list[Any]) -> Path:

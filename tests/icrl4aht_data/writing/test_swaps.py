@@ -34,9 +34,9 @@ def swapped(tmp_path_factory) -> Path:
 
 def test_the_card_says_so(swapped):
     content = facts(swapped)
-    assert (content["views"], content["swapped"]) == ({"ego": 4}, 4)
+    assert (content["views"], content["swapped"]) == ({"ego": {"ppo": 4}}, 4)
     card = render_card(content)
-    assert "In 4 histories the teammate changes" in card and "what an ego sees in 4 histories (`ego`)" in card
+    assert "In 4 histories the teammate changes" in card and "(`ego`) in 4 histories of `ppo`" in card
 
 
 def test_entries_say_who_plays(swapped):
