@@ -346,6 +346,18 @@ def test_a_silent_server_times_out(what, tmp_path, monkeypatch):
     assert time.monotonic() - began < 5, "by default 15 s instead of 0.5 s"
 
 
+def test_retries_and_other_requests_of_the_hub_client_do_not_add_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(clients, "_TIMEOUT", 2.0)
+    # Before its first request in a process, the client asks the server for a list of programs that may run it.
+    monkeypatch.setattr("huggingface_hub.utils._detect_agent._registry", None, raising=False)
+    with silent_server() as server:
+        endpoint = f"http://127.0.0.1:{server.getsockname()[1]}"
+        began = time.monotonic()
+        with hub_settings(hub_environment(endpoint, tmp_path, "token")), pytest.raises(RemoteError, match=MANIFEST):
+            load_icrl4aht(HUB)
+    assert time.monotonic() - began < 1.5 * 2
+
+
 @pytest.mark.parametrize("kind", ["http", "hub"])
 @pytest.mark.parametrize("path", ["*.h5", "*/api/*", f"*{INFO}"])
 def test_a_server_that_stops_answering(kind, path, lite, tmp_path, monkeypatch):
