@@ -31,7 +31,7 @@ $(STAMP): pyproject.toml
 demo: install ## load, sample, verify, train, show what a model earns by its memory (at most 7 minutes)
 	$(BIN)/icrl4aht-data demo
 
-generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|noise|search|small|mini|cpu|paper, OUT=folder, OPTIONS=...
+generate: install ## rebuild a dataset, or resume a rebuild: PROFILE=smoke|noise|search|bundle|teach|..., OUT=folder, OPTIONS=...
 	$(BIN)/icrl4aht-data generate --profile $(PROFILE) --out $(OUT) $(OPTIONS)
 
 teammates: install ## train the suite of learned teammates: PROFILE=smoke|small|mini|cpu|paper

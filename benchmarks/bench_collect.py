@@ -80,7 +80,7 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
 
 def _first_heuristic(profile: Profile) -> Work:
     """Return the work of the profile's last task with heuristic teammates."""
-    return replace(profile, presets=("default",)).works()[-1]
+    return replace(profile, presets=("default",)).units()[-1]
 
 
 def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:

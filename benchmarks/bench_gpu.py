@@ -54,8 +54,7 @@ from jax.extend.backend import get_backend
 from jaxlib import version as jaxlib_version
 
 from benchmarks.bench_learn import heuristic_learner, size_options
-from benchmarks.harness import compile_measured, print_line
-from benchmarks.isolated import run_isolated
+from benchmarks.harness import compile_measured, print_line, run_isolated
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.overcooked.layouts import Layout, get_layout

@@ -44,8 +44,8 @@ from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.teammates.instances import published_tasks
 from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
+from benchmarks.bench_loader import published_reader
 from benchmarks.harness import compared, compiled_call, elapsed, print_line, rates_in_turn
-from benchmarks.published import published_reader
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task

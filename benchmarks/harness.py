@@ -1,4 +1,4 @@
-"""Helpers of the benchmarks: JSON lines, comparison with a peer in rounds, and FLOP counts.
+"""Helpers of the benchmarks: JSON lines, comparison with a peer in rounds, child processes, and FLOP counts.
 
 Implementations take turns, round by round, so the load of the machine is similar for all. A ratio is the
 median over rounds of the ratio within a round.
@@ -10,9 +10,11 @@ import json
 import math
 import resource
 import statistics
+import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from threading import Timer
 from typing import Any, NamedTuple
 
 import click
@@ -127,6 +129,62 @@ def _inner_programs(params: dict[str, Any]) -> Iterator[Any]:
         for part in value if isinstance(value, (tuple, list)) else (value,):
             if hasattr(part, "eqns") or hasattr(getattr(part, "jaxpr", None), "eqns"):
                 yield part
+
+
+PrintFacts = Callable[[str, Mapping[str, Any]], None]
+"""Called with the name of a case and the facts of its line."""
+
+
+def run_isolated(
+    cases: Sequence[str],
+    command: Callable[[Sequence[str]], list[str]],
+    print_facts: PrintFacts,
+    *,
+    until: float,
+    case_seconds: float,
+    environment: Mapping[str, str] | None = None,
+) -> int:
+    """Run cases in a child process, and in a new one after each failure, and return the number of failures.
+
+    So a crash or full memory affects one case only.
+
+    A child runs its cases in order and prints one JSON object for each to stdout, with the name as "case"; it ends
+    after one with "error". A case without a result (child crashed, stopped or never started) gets a line, too.
+
+    Args:
+        cases: names of the cases.
+        command: names -> command line of a child that runs them.
+        print_facts: prints one line.
+        until: `time.monotonic()` at which the running child is killed and no other is started.
+        case_seconds: limit of a single case, the start of its process included.
+        environment: environment variables of the children; inherited by default.
+    """
+    pending, failures = list(cases), 0
+    while pending and time.monotonic() < until:
+        failed, stopped, line, left = False, False, " ", 0.0
+        with subprocess.Popen(command(pending), stdout=subprocess.PIPE, text=True, env=environment) as child:
+            assert child.stdout is not None
+            while line:
+                left = until - time.monotonic()
+                timer = Timer(max(0.0, min(left, case_seconds)), child.kill)
+                timer.start()
+                line = child.stdout.readline()
+                stopped = not timer.is_alive()
+                timer.cancel()
+                if line.startswith("{"):  # other output is dropped
+                    facts = json.loads(line)
+                    failed = "error" in facts
+                    print_facts(pending.pop(0), {name: value for name, value in facts.items() if name != "case"})
+        if pending and not failed:
+            why = f"the process ended with code {child.returncode}"
+            if stopped:
+                why = "stopped: no time left" if left < case_seconds else f"stopped after {case_seconds:.0f} s"
+            print_facts(pending.pop(0), {"error": why})
+            failed = True
+        failures += failed
+    for case in pending:
+        print_facts(case, {"skipped": "no time left"})
+    return failures
 
 
 def folder_size(folder: Path) -> int:

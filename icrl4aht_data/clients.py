@@ -74,7 +74,7 @@ class HubClient:
 
     @contextmanager
     def connect(self) -> Iterator[None]:
-        """Open a context for requests that fail after `_TIMEOUT` seconds without a response.
+        """Open a context for requests that fail after `_TIMEOUT` seconds without a response, retries included.
 
         Without the two hooks, huggingface_hub waits for some responses without a limit and for others five times 60 s.
         """
@@ -83,13 +83,22 @@ class HubClient:
         unanswered: dict[str, float] = {}
 
         def before(request: Any) -> None:
-            first = unanswered.setdefault(str(request.url), time.monotonic())
-            if time.monotonic() - first >= 0.9 * _TIMEOUT:
+            # Per address, as a server may answer other requests; per host, for the client's requests of its own.
+            now, keys = time.monotonic(), (str(request.url), request.url.host)
+            first = min(unanswered.setdefault(key, now) for key in keys)
+            left = first + _TIMEOUT - now
+            if left < 0.1 * _TIMEOUT:
                 raise TimeoutError(f"no answer for {_TIMEOUT:g} s")
-            request.extensions["timeout"] = dict.fromkeys(("connect", "read", "write", "pool"), _TIMEOUT)
+            # A shorter limit of the client stays: it gives up soon on requests that it can do without.
+            given = request.extensions.get("timeout") or {}
+            limits = {name: given.get(name) for name in ("connect", "read", "write", "pool")}
+            request.extensions["timeout"] = {
+                name: left if limit is None else min(left, limit) for name, limit in limits.items()
+            }
 
         def after(response: Any) -> None:
             unanswered.pop(str(response.request.url), None)
+            unanswered.pop(response.request.url.host, None)
 
         hooks = get_session().event_hooks
         hooks["request"].append(before)

@@ -237,14 +237,14 @@ class Dataset(Selection):
         return chosen
 
     def plot(self) -> Picture:
-        """Return learning curves by layout and source as a picture, which notebooks show.
+        """Return returns by episode, source and layout as a picture, which notebooks show.
 
         Reads the rewards of all selected histories.
 
         Raises:
             OptionError: if matplotlib is not installed.
         """
-        return Picture(f"Returns of {counted_histories(len(self))} by layout and source", plot_learning_curves(self))
+        return Picture(f"Returns of {counted_histories(len(self))} by episode", plot_learning_curves(self))
 
     @cached_property
     def _tasks(self) -> dict[str, Task]:

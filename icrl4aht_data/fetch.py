@@ -336,15 +336,22 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
         OptionError: if the folder has files of something else, unless it is one of `system.data_folder`.
     """
     path = folder / MANIFEST
-    if path.is_file() and path.stat().st_size == len(text) and path.read_bytes() == text:
+
+    def is_there() -> bool:
+        return path.is_file() and path.stat().st_size == len(text) and path.read_bytes() == text
+
+    if is_there():
         return
-    if path.exists() and not is_ours:
-        raise OptionError(f"{folder}: holds another release or version than {url} has now; give another folder")
-    if folder.exists() and any(folder.iterdir()) and not is_ours:
-        raise OptionError(f"{folder}: not empty, and not a release; give a new or an empty folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    with disk.process_lock(disk.lock_path(folder)), disk.atomic_write(path) as partial:
-        partial.write_bytes(text)
+    with disk.process_lock(disk.lock_path(folder)):  # another process may be writing the manifest
+        if is_there():
+            return
+        if path.exists() and not is_ours:
+            raise OptionError(f"{folder}: holds another release or version than {url} has now; give another folder")
+        if folder.exists() and any(folder.iterdir()) and not is_ours:
+            raise OptionError(f"{folder}: not empty, and not a release; give a new or an empty folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        with disk.atomic_write(path) as partial:
+            partial.write_bytes(text)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from html import escape
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.install_hints import import_optional, install_command
+from icrl4aht_data.utils.text import counted_histories
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -153,9 +153,9 @@ def animate_episode(
 
 
 def plot_learning_curves(dataset: Iterable[Any], path: Path | None = None) -> Figure:
-    """Plot the return over the course of a history on every layout in a selection, see `plot_source_curves`.
+    """Plot the return by episode for every source of a selection, see `plot_source_curves`.
 
-    The generated layouts of a family share a panel. The figure is written to a file if a path is given.
+    The generated layouts of a family share a curve. The figure is written to a file if a path is given.
 
     Raises:
         OptionError: if matplotlib is not installed, or the path does not end in .png, .svg or .pdf.
@@ -163,61 +163,74 @@ def plot_learning_curves(dataset: Iterable[Any], path: Path | None = None) -> Fi
     curves: SourceCurves = {}
     for history in dataset:
         entry = history.entry
-        add_curve(curves, layout_title(entry.layout), entry.source, entry.split, history.returns())
+        add_curve(curves, entry.source, layout_title(entry.layout), entry.split, history.returns())
     figure = plot_source_curves(curves)
     if path is not None:
         save_figure(figure, path, dpi=80)
     return figure
 
 
-def _curve_order(label: str) -> tuple[int, str]:
-    source = label.partition(",")[0]
-    return SOURCES.index(source) if source in SOURCES else len(SOURCES), label
+_SPLIT_LINES = {"train": "-", "validation": "--"}
+
+SourceCurves = dict[str, dict[tuple[str, str], list[np.ndarray]]]
+"""source -> layout and split -> returns of each history's episodes, (E,)."""
 
 
-SourceCurves = dict[str, dict[str, list[np.ndarray]]]
-"""layout -> label of a curve -> returns of each history's episodes, (E,)."""
-
-
-def add_curve(curves: SourceCurves, layout: str, source: str, split: str, returns: np.ndarray) -> None:
-    """Add a history's episode returns (E,) to the curve of its layout, source and split."""
-    curves.setdefault(layout, {}).setdefault(source if split == "train" else f"{source}, {split}", []).append(returns)
+def add_curve(curves: SourceCurves, source: str, layout: str, split: str, returns: np.ndarray) -> None:
+    """Add a history's episode returns (E,) to those of its source, layout and split."""
+    curves.setdefault(source, {}).setdefault((layout, split), []).append(returns)
 
 
 def plot_source_curves(curves: SourceCurves) -> Figure:
-    """Plot mean returns over the course of a history, one panel per layout, with bands from 10th to 90th percentile.
+    """Plot mean returns by episode, on a logarithmic axis, with one panel for each source.
 
-    Each history is divided into at most 25 equal parts, and returns are averaged in each part. Panels have equal
-    limits, and a label has one colour in all of them.
+    A thin line is the mean of a layout's training histories, the thick one that of all training histories with a band
+    from the 10th to the 90th percentile, dashed ones those of other splits. A mean goes as far as the
+    shortest of its histories. Episodes are averaged in at most 25 blocks of equal length on the axis.
 
     Raises:
         OptionError: if matplotlib is not installed.
     """
-    size = (2.6, 1.9) if len(curves) > 2 else (4.2, 2.8)
-    figure, grid = _panels(len(curves), size, columns=min(4, len(curves)))
-    labels = sorted({label for of_layout in curves.values() for label in of_layout}, key=_curve_order)
+    sources = sorted(curves, key=lambda source: (*SOURCES, source).index(source))
+    figure, grid = _panels(len(sources), (5.0, 3.2), columns=min(2, len(sources)))
+    titles = list(dict.fromkeys(layout for of_source in curves.values() for layout, split in of_source))
     ends: list[float] = []
-    for axes, (layout, of_layout) in zip(grid, curves.items(), strict=True):
-        for label in sorted(of_layout, key=_curve_order):
-            parts = min(_CURVE_PARTS, *map(len, of_layout[label]))
-            means = np.stack([[part.mean() for part in np.array_split(own, parts)] for own in of_layout[label]])
-            low, high = np.percentile(means, (10, 90), axis=0)
-            ends += [float(low.min()), float(high.max())]
-            x, color = (np.arange(parts) + 0.5) / parts, f"C{labels.index(label)}"
-            axes.plot(x, means.mean(axis=0), label=label, color=color, linewidth=1.3)
-            axes.fill_between(x, low, high, alpha=0.2, linewidth=0, color=color)
-        axes.set_title(layout, fontsize=8)
+    for axes, source in zip(grid, sources, strict=True):
+        by_split: dict[str, list[np.ndarray]] = {}
+        for (layout, split), histories in curves[source].items():
+            by_split.setdefault(split, []).extend(histories)
+            if split == "train":
+                number = titles.index(layout)
+                style = {"color": f"C{number % 10}", "linestyle": "-" if number < 10 else "-.", "linewidth": 0.9}
+                axes.plot(*_mean_by_episode(histories)[:2], label=layout, **style)
+        for split, histories in by_split.items():
+            episodes, mean, low, high = _mean_by_episode(histories)
+            style = _SPLIT_LINES.get(split, ":")
+            axes.plot(episodes, mean, style, label=f"all of split {split}", color="black", linewidth=2)
+            if split == "train":
+                axes.fill_between(episodes, low, high, alpha=0.15, linewidth=0, color="black")
+        ends += list(axes.dataLim.intervaly)
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.set_title(f"source {source}, {counted_histories(sum(map(len, by_split.values())))}", fontsize=9)
+        axes.set_xlabel("episode", fontsize=8)
         axes.tick_params(labelsize=7)
-        axes.margins(x=0.02)
         axes.grid(alpha=0.3)
     for axes in grid:
         axes.set_ylim(*return_limits(ends))
-    caption = (
-        "Return of the kept steps over the course of a history, 0 to 1 (band: 10th to 90th percentile of histories)"
-    )
-    figure.suptitle(fill(caption, int(15 * figure.get_figwidth())), fontsize=8)
+    figure.suptitle("Return of the kept steps by episode (band: 10th to 90th percentile of histories)", fontsize=9)
     legend_below(figure)
     return figure
+
+
+def _mean_by_episode(histories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return numbers of episodes, and mean, 10th and 90th percentile of the returns there, each float64 (blocks,)."""
+    length = min(map(len, histories))
+    starts = np.unique(np.geomspace(1, length + 1, _CURVE_PARTS + 1).round().astype(int))
+    sizes = np.diff(starts)
+    means = np.stack([np.add.reduceat(own[:length], starts[:-1] - 1) / sizes for own in histories])
+    low, high = np.percentile(means, (10, 90), axis=0)
+    return np.sqrt(starts[:-1] * (starts[1:] - 1.0)), means.mean(axis=0), low, high
 
 
 def plot_layouts(layouts: Sequence[Layout]) -> Figure:

@@ -34,16 +34,16 @@ from icrl4aht_data.format.schema import HISTORIES
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash
 
-TEAMMATE = "teammate"
+TEAMMATE_TRACK = "teammate"
 
-PROTOCOL = get_protocol("seeded", 20)
+PROOF_PROTOCOL = get_protocol("seeded", 20)
 """Protocol of the evaluations: as many episodes as the longest block that the proof reports."""
 
-REFERENCES = {PREFERENCE: ("stay", "search"), TEAMMATE: ("stay", "rl2-reference")}
+COMPARED_EGOS = {PREFERENCE: ("stay", "search"), TEAMMATE_TRACK: ("stay", "rl2-reference")}
 """Set of tasks -> the egos that models are compared with."""
 
 
-class Learner(NamedTuple):
+class ProofLearner(NamedTuple):
     """A method and what it learns.
 
     Attributes:
@@ -58,9 +58,9 @@ class Learner(NamedTuple):
 
 
 LEARNERS = {
-    "ad": Learner("ad", None, "AD, own actions"),
-    "ad-expert": Learner("ad", "expert", "AD, expert labels"),
-    "dpt-expert": Learner("dpt", "expert", "DPT, expert labels"),
+    "ad": ProofLearner("ad", None, "AD, own actions"),
+    "ad-expert": ProofLearner("ad", "expert", "AD, expert labels"),
+    "dpt-expert": ProofLearner("dpt", "expert", "DPT, expert labels"),
 }
 """Name of a folder -> what is trained."""
 
@@ -89,8 +89,11 @@ class ProofOptions:
         """The tasks of each set."""
         if self.tasks is not None:
             return self.tasks
-        played = [*bundled_tasks(TEAMMATE, "validation"), *bundled_tasks(TEAMMATE, "diverse")]
-        return {PREFERENCE: tuple(bundled_tasks(PREFERENCE, "validation")), TEAMMATE: tuple(with_headroom(played))}
+        played = [*bundled_tasks(TEAMMATE_TRACK, "validation"), *bundled_tasks(TEAMMATE_TRACK, "diverse")]
+        return {
+            PREFERENCE: tuple(bundled_tasks(PREFERENCE, "validation")),
+            TEAMMATE_TRACK: tuple(with_headroom(played)),
+        }
 
 
 @dataclass(frozen=True)
@@ -212,7 +215,7 @@ def play(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = Tru
     for control in (None, "cleared")[: 1 + controls]:
         for name, tasks in options.task_sets.items():
             folder = out / f"{name}{' cleared' if control else ''}"
-            run = evaluate_agent(agent, tasks, PROTOCOL, folder, control=control, show=lambda *shown: None)
+            run = evaluate_agent(agent, tasks, PROOF_PROTOCOL, folder, control=control, show=lambda *shown: None)
             means = run.table.groupby("block")["return"].mean()
             found[folder.name] = {str(block): round(float(mean), 3) for block, mean in means.items()}
     return found
@@ -230,7 +233,7 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
     for job in jobs:
         if job.is_finished():
             entries[job.source, job.learner].append(job.result() | {"seed": job.seed})
-    stay, expert = (references[name][TEAMMATE]["all"] for name in REFERENCES[TEAMMATE])
+    stay, expert = (references[name][TEAMMATE_TRACK]["all"] for name in COMPARED_EGOS[TEAMMATE_TRACK])
     models = [
         {
             "histories": source,
@@ -246,7 +249,7 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
                     ("late_cleared", f"{PREFERENCE} cleared", "6-20"),
                 )
             },
-            "share": [round((one["returns"][TEAMMATE]["all"] - stay) / (expert - stay), 3) for one in own],
+            "share": [round((one["returns"][TEAMMATE_TRACK]["all"] - stay) / (expert - stay), 3) for one in own],
         }
         for (source, learner), own in entries.items()
     ]
@@ -256,7 +259,7 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
         "data_version": dataset.info.data_version,
         "training": {"steps": options.steps, "batch_size": options.batch_size, "context": options.context},
         "tasks": {name: len(tasks) for name, tasks in options.task_sets.items()},
-        "references": {name: references[name][PREFERENCE] for name in REFERENCES[PREFERENCE]},
+        "references": {name: references[name][PREFERENCE] for name in COMPARED_EGOS[PREFERENCE]},
         "models": models,
     }
     with atomic_write(path) as partial:
@@ -265,6 +268,6 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
 
 
 def run_references(options: ProofOptions, out: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Evaluate the egos of `REFERENCES`, or read what they earned. Return ego -> what `play` returns."""
-    names = dict.fromkeys(name for of_set in REFERENCES.values() for name in of_set)
+    """Evaluate the egos of `COMPARED_EGOS`, or read what they earned. Return ego -> what `play` returns."""
+    names = dict.fromkeys(name for of_set in COMPARED_EGOS.values() for name in of_set)
     return {name: play(find_agent(name), options, out / "references" / name, controls=False) for name in names}

@@ -48,7 +48,7 @@ _profile_option = click.option(
     "profile_name",
     default="smoke",
     metavar="PROFILE",
-    help="smoke, noise, search, small, mini, cpu or paper, or a TOML file.",
+    help="smoke, noise, search, bundle, teach, billion, small, mini, cpu or paper, or a TOML file.",
 )
 
 _ego_options = dataclass_options(

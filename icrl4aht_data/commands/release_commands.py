@@ -98,7 +98,7 @@ def list_(root: str | Path | None, as_json: bool, **filters: Any) -> None:
     "--plot",
     type=NewFile(*PICTURES),
     metavar="FILE",
-    help="Also draw learning curves by layout and source: .png, .svg or .pdf.",
+    help="Also draw returns by episode and source: .png, .svg or .pdf.",
 )
 @overwrite_option
 @json_option

@@ -12,7 +12,7 @@ from msgspec import Meta
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task, check_teammate, teammate_id
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
-from icrl4aht_data.format.schema import Count, FiniteNumber, StreamCount, check_name
+from icrl4aht_data.format.schema import FiniteNumber, StoredCount, StreamCount, check_name
 from icrl4aht_data.utils.files import parse_json, read_text
 from icrl4aht_data.utils.options import Share
 from icrl4aht_data.utils.text import counted_noun
@@ -71,10 +71,10 @@ class ExpertLabels:
 
     policy_sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")] | None
     action: str
-    step: Count | None = None
+    step: StoredCount | None = None
     return_greedy: FiniteNumber | None = None
     return_sampled: FiniteNumber | None = None
-    episodes: Count | None = None
+    episodes: StoredCount | None = None
     last_return_greedy: FiniteNumber | None = None
     view: LabelView | None = None
 
@@ -170,7 +170,7 @@ class NearestTest:
 
     teammate: str
     distance: Share
-    behaviour: Count | None = None
+    behaviour: StoredCount | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -151,10 +151,10 @@ _NAME_LENGTH = 512  # characters; limited because a name column is as wide as it
 _FINITE = 1e15  # sums of numbers below this stay finite
 
 _Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+StoredCount = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 StreamCount = Annotated[int, Meta(ge=0, lt=2**31)]
 _Name = Annotated[str, Meta(max_length=_NAME_LENGTH)]
-_Spans = Annotated[tuple[tuple[Count, _Name], ...], Meta(min_length=1)]
+_Spans = Annotated[tuple[tuple[StoredCount, _Name], ...], Meta(min_length=1)]
 FiniteNumber = Annotated[float, Meta(gt=-_FINITE, lt=_FINITE)]
 
 
@@ -198,7 +198,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
 
     history_id: _Int
     task_id: _Name
-    env_idx: Count
+    env_idx: StoredCount
     T: Annotated[int, Meta(gt=0, lt=LONGEST)]
     obs_shape: tuple[int, int, int]
     action_dim: _Int
@@ -210,7 +210,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     h5_group: _Name
     has_teammate_actions: bool
     has_expert_actions: bool
-    h5_row: Count | None
+    h5_row: StoredCount | None
     shard: _Name
     seed: _Int
     episodes: Annotated[int, Meta(gt=0, lt=LONGEST)]
@@ -221,8 +221,8 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     source: _Name = "ppo"
     expert_return: FiniteNumber | None = None
     expert_return_sampled: FiniteNumber | None = None
-    expert_step: Count | None = None
-    learner: Count = 0
+    expert_step: StoredCount | None = None
+    learner: StoredCount = 0
     has_oracle_actions: bool = False
     label_view: _Name | None = None
     teammate_of_episode: _Spans | None = None

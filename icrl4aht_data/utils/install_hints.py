@@ -12,7 +12,7 @@ PACKAGE = "icrl4aht-data"
 
 EXTRAS = {
     **dict.fromkeys(("jax", "flax", "optax", "jaxtyping", "safetensors"), "baselines"),
-    **dict.fromkeys(("matplotlib", "pillow", "pil"), "plot"),
+    **dict.fromkeys(("matplotlib", "pillow"), "plot"),
     **dict.fromkeys(("datasets", "pyarrow", "mlcroissant"), "hf"),
     **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari")},
     "tensorboardx": "tensorboard",
@@ -21,6 +21,8 @@ EXTRAS = {
     "gymnasium": "gym",
 }
 """Optional package -> the extra that installs it."""
+
+_DISTRIBUTIONS = {"pil": "pillow"}  # module -> distribution, where their names differ
 
 RESTORE = f"pip install --force-reinstall --no-deps {PACKAGE}, or in a checkout git checkout ."
 """Command that restores missing files of this package."""
@@ -44,12 +46,17 @@ def import_optional(module: str, purpose: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        package = module.partition(".")[0]
-        raise OptionError(f"{purpose} needs {package}: {install_command(EXTRAS[package.lower()])}") from error
+        raise OptionError(f"{purpose} needs {module.partition('.')[0]}: {install_command(_extra(module))}") from error
 
 
 def missing_library(module: str) -> str | None:
     """Return a message that says how to install a missing module; None if no extra installs it."""
+    extra = _extra(module)
     top = module.partition(".")[0]
-    extra = EXTRAS.get(top.lower())
     return f"this needs {top}, which is not installed: {install_command(extra)}" if extra else None
+
+
+def _extra(module: str) -> str:
+    """Return the extra that installs a module; empty if there is none."""
+    top = module.partition(".")[0].lower()
+    return EXTRAS.get(_DISTRIBUTIONS.get(top, top), "")

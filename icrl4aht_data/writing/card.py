@@ -31,7 +31,6 @@ from icrl4aht_data.benchmark.facts import (
     family_order,
     track_of,
 )
-from icrl4aht_data.benchmark.proof import proof_table, read_proof
 from icrl4aht_data.benchmark.reference_returns import cells_without_headroom, read_headroom
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
@@ -55,6 +54,7 @@ from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import files_below, write_json
 from icrl4aht_data.utils.templates import card_file, markdown_table
 from icrl4aht_data.utils.text import counted_noun
+from icrl4aht_data.writing.proof import proof_table, read_proof
 
 HEADROOM_PROTOCOL = "published"
 """Evaluation protocol of the headroom shown in cards, which is the paper's."""

@@ -10,11 +10,11 @@ import pytest
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof
 
-from icrl4aht_data.benchmark import proof
-from icrl4aht_data.benchmark.proof import proof_table, read_proof
 from icrl4aht_data.format.schema import HISTORIES
 from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.writing import proof
 from icrl4aht_data.writing.card import facts, render_card
+from icrl4aht_data.writing.proof import proof_table, read_proof
 from tests.helpers.random_releases import random_release
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -220,6 +221,18 @@ def test_spread_teammates_of_both_sources(changed, listed):
     seeds = [work.task.seed for work in units + load_profile("mini").units()]
     assert len({*seeds}) == len(seeds)
     assert not {*seeds[: len(units)]} & {work.task.seed for work in sampled}
+
+
+def test_a_profile_says_what_differs_from_its_base(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('base = "search"\n[search]\nepisodes = 12\n[search.layouts.asymm_both_plain]\nhistories = 3\n')
+    mine, base = load_profile(str(path)), load_profile("search")
+    assert mine.search == replace(base.search, episodes=12)
+    assert mine.scripted_on("asymm_both_plain", "search") == replace(base.search, episodes=12, histories=3)
+    assert mine.units() == base.units()
+    path.write_text('base = "serach"\n')
+    with pytest.raises(OptionError, match=r"mine.toml: unknown base 'serach'.*Did you mean 'search'"):
+        load_profile(str(path))
 
 
 def test_sampled_and_spread_teammates_on_other_layouts(changed, listed):

@@ -12,12 +12,12 @@ from icrl4aht_generation.jobs.command_line import queue_options, read_queue_opti
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_data.benchmark.facts import SOURCES
-from icrl4aht_data.benchmark.proof import PROOF_FILE, proof_table
 from icrl4aht_data.commands.dataclass_options import TopicCommand, topic
 from icrl4aht_data.commands.options import COUNT, Folder, Names, examples
 from icrl4aht_data.utils.files import check_output, parse_json, read_text
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
+from icrl4aht_data.writing.proof import PROOF_FILE, proof_table
 
 
 def _experiment_command(name: str, text: str, *own: Callable[[Any], Any], usage: Sequence[str] = ()) -> click.Command:

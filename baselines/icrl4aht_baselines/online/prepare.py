@@ -53,7 +53,7 @@ class _Teammate(NamedTuple):
 
 
 _Teammates = dict[tuple[Layout, str], dict[str, _Teammate]]
-"""(layout, kind of the teammates) -> task id -> teammate."""
+"""(layout, kind of the teammates) -> task id -> teammate. A task with a dish of its own has a layout with that dish."""
 
 
 def prepare_play(
@@ -88,7 +88,8 @@ def prepare_play(
     method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
     hidden = [get_layout(one).name for one in histories.hide_recipe]
     groups, played = _groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
-    labels: Labels | None = "oracle" if play.imitation else None
+    teachers: dict[str, Labels] = {"oracle": "oracle", "search": "expert"}  # as histories have labels of these scripts
+    labels = teachers[play.teacher] if play.imitation else None
     about = {
         "model": asdict(model),
         "play": asdict(play),
@@ -136,7 +137,8 @@ def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple
 def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
     """Return the tasks on some layouts."""
     check_heuristics(tasks)
-    found = [task for task in tasks if task.layout in layouts]
+    names = {layout.name for layout in layouts}
+    found = [task for task in tasks if task.layout.name in names]
     if tasks and not found:
         on = ", ".join(sorted({task.layout.name for task in tasks}))
         raise OptionError(f"none of the {len(tasks)} tasks is on {', '.join(one.name for one in layouts)}, but on {on}")
@@ -151,7 +153,7 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
         # Histories of one task have one teammate: any of them recovers it.
         history_of = dict(zip(dataset.column("task_id").tolist(), dataset.ids.tolist(), strict=True))
         for task_id, history_id in history_of.items():
-            layout, teammate = get_layout(dataset.index.entry(history_id).layout), dataset.recover_teammate(history_id)
+            layout, teammate = dataset.history_task(history_id).layout, dataset.recover_teammate(history_id)
             if teammate["kind"] == "rl":
                 mate = _Teammate(teammate, recover_teammate(dataset, history_id))
                 found.setdefault((layout, teammate["family"]), {})[task_id] = mate
@@ -166,7 +168,8 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
 
 def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
     """Check that every chosen layout has teammates."""
-    missing = [layout.name for layout in layouts if layout not in {layout for layout, _ in teammates}]
+    known = {layout.name for layout, _ in teammates}
+    missing = [layout.name for layout in layouts if layout.name not in known]
     if missing:
         raise OptionError(
             f"{', '.join(missing)}: neither a chosen history nor a task of a manifest is on this layout; leave it out, "

@@ -112,7 +112,7 @@ def scripted_pieces(source: str, config: NoiseConfig) -> list[Piece]:
 def play_scripted_histories(
     layout: Layout, teammate: Policy, seed: int, source: str, pieces: Sequence[Piece], schedules: np.ndarray
 ) -> Iterator[tuple[Piece, ScriptedEpisodes]]:
-    """Play the pieces of a task; compiled once for all heuristics of one family on all layouts of a process.
+    """Play the pieces of a task; compiled once for all heuristics of one family on all layouts of a size.
 
     A piece is played while its predecessor is used.
 
@@ -127,7 +127,8 @@ def play_scripted_histories(
     Yields:
         The piece, and its episodes.
     """
-    tables, expert, own = (padded_layout if teammate.sees == "situation" else own_layout)(layout)
+    padded = padded_layout(layout, by_size=True) if teammate.sees == "situation" else own_layout(layout)
+    tables, expert, own = padded
     searches = source == "search"
     params = {"oracle": expert, "dishes": padded_dishes([layout])} if searches else expert
     play, last = _program(teammate._replace(params=()), searches), None

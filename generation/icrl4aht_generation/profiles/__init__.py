@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, HEURISTIC_KINDS, PREFERENCE_LAYOUTS, REBUILT_SOURCES
 from icrl4aht_data.benchmark.tasks import teammate_id
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, check_choice, unknown
 from icrl4aht_data.format.info import check_version
 from icrl4aht_data.overcooked.layouts import add_layouts, get_layout
 from icrl4aht_data.utils.options import Count, Natural, replace_options
@@ -110,7 +110,7 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     if not path.is_file():
         raise unknown("profile", name, profile_names())
     with _named_errors(path):
-        profile = _profile(path.stem, msgspec.toml.decode(path.read_bytes(), type=_ProfileFile))
+        profile = _profile(path.stem, msgspec.convert(_content(path), _ProfileFile))
     prepare(profile)
     with _named_errors(path):
         units = profile.units()  # raises for unknown presets, and for more sampled teammates than there are
@@ -120,6 +120,22 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
             )
         _check_splits(units, profile.sampled, profile.spread)
     return profile
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """Return the content of a profile's file; one with a `base` has what it says over the shipped profile's content."""
+    content = msgspec.toml.decode(path.read_bytes())
+    base = content.pop("base", None)
+    if base is None:
+        return content
+    check_choice("base", base, profile_names())
+    return _merged(_content(FOLDER / f"{base}.toml"), content)
+
+
+def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested tables with the values of `own` over those of `base`."""
+    both = {key: _merged(base[key], own[key]) for key in base.keys() & own.keys() if isinstance(own[key], dict)}
+    return {**base, **own, **both}
 
 
 @contextmanager

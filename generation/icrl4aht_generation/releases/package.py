@@ -94,7 +94,7 @@ def package_release(
         else:
             new.append(_new_task(found, profile, suite, facts[task_id], recorded))
             for returns in found.kept:
-                add_curve(curves, layout_title(task.layout.name), found.source, task.split, returns)
+                add_curve(curves, found.source, layout_title(task.layout.name), task.split, returns)
         advance(0)
     if not new:
         reasons = "; ".join(one.reason for one in omitted) or "there is no task"

@@ -317,6 +317,18 @@ class TestPreparing:
         assert {cell["layout"] for cell in job.about["trained_on"]} == {"cramped_down"}
         assert job.about["histories"]["layouts"] == ["cramped_down"]
 
+    def test_tasks_keep_the_dish_that_their_teammate_wants(self):
+        """Both those of histories and those of a manifest."""
+        name = "asymm_both_plain"
+        tasks = [one for one in read_tasks(manifest_path("preference", "train")) if one.layout.name == name]
+        of_histories = self.prepare(PlayOptions(), (), HistoryOptions((name,), source=("search",)), 256)
+        of_tasks = self.prepare(PlayOptions(), tasks, HistoryOptions((name,)), 256)
+        for job in (of_histories, of_tasks):
+            groups = [group for player in job.trainer.players for group in player.groups]
+            dishes = {layout.recipes for group in groups for layout in group.layouts}
+            assert dishes == {task.layout.recipes for task in tasks}
+            assert all(len(of_task) == 1 for of_task in dishes)
+
     @pytest.mark.slow
     def test_teammates_on_rearranged_layouts_are_recorded(self):
         """With few tasks, some teammates appear only on rearranged layouts."""

@@ -10,15 +10,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from icrl4aht_generation.collection import scripted_rollout
-from icrl4aht_generation.collection.curate import oracle_labels
+from icrl4aht_generation.collection.curate import follow_script, oracle_labels
 from icrl4aht_generation.collection.job import run_task
 from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules, play_scripted_histories
 from icrl4aht_generation.collection.task_folder import METADATA, TIMING, last_timing, partial_folder
+from icrl4aht_generation.experts.search import searcher
 from icrl4aht_generation.profiles import Profile, load_profile
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.profiles.work import Work
@@ -227,6 +229,28 @@ def test_a_searcher_finds_the_dish_and_remembers_it(profile, tmp_path):
     for history, step_ in enumerate(delivered):
         np.testing.assert_array_equal(one["actions"][history, :step_], other["actions"][history, :step_])
     assert any(not np.array_equal(a, b) for a, b in zip(one["actions"], other["actions"], strict=True))
+    _check_followed(one)
+
+
+def _check_followed(found: dict[str, np.ndarray]) -> None:
+    """A searcher that follows episodes of another ego learns the dish by its deliveries, and keeps what it learned."""
+    layout = make_task("preference", "train", "asymm_both_plain", WATCHER, 5, [(0, 0, 0)]).layout
+    script = searcher(layout)
+
+    @jax.jit
+    def follow(records, taken, memory):
+        return follow_script(script, layout, records, taken, memory=memory)
+
+    states, actions = found["state"].reshape(8, 10, 100, -1), found["actions"].reshape(8, 10, 100)
+    memory = jax.vmap(script.init, in_axes=(None, 0))(script.params, jax.random.split(jax.random.key(9), 8))
+    fresh, agrees = memory, []
+    for episode in range(10):
+        steps = states[:, episode].swapaxes(0, 1), actions[:, episode].T
+        wanted, memory = follow(*steps, memory)
+        agrees.append(float(np.mean(np.asarray(wanted) == steps[1])))
+    assert agrees[5:] == [1.0] * 5  # the dish was paid in all histories
+    assert agrees[0] < 1.0, "in the first episode another searcher tries other dishes"
+    assert float(np.mean(np.asarray(follow(*steps, fresh)[0]) == steps[1])) < 1.0, "without memory it tries again"
 
 
 def test_a_search_history_has_one_chance_until_its_end(profile, tmp_path):

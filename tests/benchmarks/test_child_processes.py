@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 
-from benchmarks.isolated import run_isolated
+from benchmarks.harness import run_isolated
 
 CHILD = """
 import json, os, sys, time

@@ -1,0 +1,30 @@
+"""The figure of returns by episode."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves
+
+
+def test_a_source_has_a_panel_with_means_of_layouts_and_of_all_histories():
+    curves = SourceCurves()
+    add_curve(curves, "search", "demo_wide", "train", np.array([0.0, 20, 40, 40]))
+    add_curve(curves, "search", "coord_ring", "train", np.array([0.0, 0, 0]))
+    add_curve(curves, "search", "demo_wide", "validation", np.array([-20.0, 20]))
+    add_curve(curves, "noise", "demo_wide", "train", np.arange(1000.0))
+    figure = plot_source_curves(curves)
+    noise, search = figure.axes
+    assert [axes.get_title() for axes in (noise, search)] == ["source noise, 1 history", "source search, 3 histories"]
+    assert noise.get_xscale() == search.get_xscale() == "log"
+    assert noise.get_ylim() == search.get_ylim()
+    drawn = {line.get_label(): np.asarray(line.get_xydata()) for line in search.lines}
+    np.testing.assert_allclose(drawn["demo_wide"], [[1, 0], [2, 20], [3, 40], [4, 40]])
+    np.testing.assert_allclose(drawn["all of split train"], [[1, 0], [2, 10], [3, 20]])  # as far as both histories go
+    np.testing.assert_allclose(drawn["all of split validation"], [[1, -20], [2, 20]])
+    first = np.asarray(noise.lines[0].get_xydata())
+    assert len(first) <= 25
+    np.testing.assert_allclose(first[0], [1, 0])
+    # A block's mean is that of its episodes, and all episodes are in one block.
+    assert first[-1, 1] > 800
+    assert np.all(np.diff(first[:, 1]) > 0)
