@@ -95,9 +95,11 @@ def read_best_responses(path: Path | None = None) -> BestResponseCard:
     """Return the content of a file of best responses, by default the package's.
 
     Raises:
-        OptionError: if the file is damaged, or a task has two best responses.
+        OptionError: if the file does not exist or is damaged, or a task has two best responses.
     """
     path = path or best_responses_file()
+    if not path.is_file():
+        raise OptionError(f"{path}: no such file, expected best responses; restore it: `{RESTORE}`")
     return _read(path, path.stat().st_mtime_ns)
 
 

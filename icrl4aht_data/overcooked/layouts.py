@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError, unknown
-from icrl4aht_data.overcooked.actions import ACTIONS
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.cells import (
     BUTTON,
     EMPTY,
@@ -164,6 +164,15 @@ class Layout:
             # A step off the map's edge would end in another row; maps whose edge can be reached are refused.
             edge = {cell + dy * self.width + dx for cell in edge for dx, dy in STEP.values()} & floor - room
         return np.array(sorted(room), np.uint8)
+
+    @cached_property
+    def shows_recipe(self) -> bool:
+        """Whether the ego can see an indicator or a button, which show the current recipe, from a cell of its room."""
+        shown = ((self.kinds == INDICATOR) | (self.kinds == BUTTON)).nonzero()[0]
+        own = self.rooms[EGO].astype(int)
+        (rows, columns), (own_rows, own_columns) = (divmod(cells, self.width) for cells in (shown, own))
+        away = np.maximum(abs(own_rows[:, None] - rows), abs(own_columns[:, None] - columns))
+        return bool((away <= WINDOW // 2).any())
 
     @cached_property
     def walkable(self) -> np.ndarray:

@@ -29,6 +29,7 @@ from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED, Draw, find_draw,
 from icrl4aht_generation.teammates.heuristics.territory import TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES
 
+from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import (
     KEPT_STEPS,
     LABEL_EPISODES,
@@ -102,6 +103,20 @@ def least_rise_of_the_bundle() -> float:
     flat = {own[0].layout for own in histories_by_task("ppo").values() if rise(own) < least}
     assert flat <= {"coord_simple", "test_simple"}
     return least
+
+
+def heuristics_on_coord_ring() -> int:
+    own = [entry for entry in histories() if entry.layout == "coord_ring" and entry.teammate_family != "rl"]
+    references = [provenance()[entry.task_id].references for entry in own]
+    assert {entry.split for entry in own} == {"train"} and all(found and found.matters for found in references)
+    return len({entry.task_id for entry in own})
+
+
+def best_responses_by_split() -> tuple[int, int]:
+    found = read_best_responses().behaviours
+    assert {(len(one.seeds), one.split) for one in found} == {(1, "test")}
+    assert {training.width for one in found for training in one.seeds} == {64}
+    return len(found), len({one.layout for one in found})
 
 
 def teammate_steps_of_the_bundle() -> float:
@@ -207,6 +222,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("README", "more than `stay` in {} of the {} cells", cells_without_headroom),
     ("docs/index", "the benchmark's {} test tasks", lambda: len(tasks("test"))),
     ("docs/index", "and {} history in a task of source `noise`", noise_histories_of_a_task),
+    ("docs/index", "On coord_ring, {} heuristics give the ego headroom", heuristics_on_coord_ring),
     ("docs/index", "rise by less than {} on average are left out", least_rise_of_the_bundle),
     ("docs/index", "with {} million steps a member", teammate_steps_of_the_bundle),
     ("docs/evaluating", "There are {} published test tasks", lambda: len(tasks("test"))),
@@ -266,6 +282,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         "tasks {} learners 640 environment steps {} recorded transitions {} kept transitions {}",
         plan_of_the_paper,
     ),
+    ("docs/choices", "{} behaviours on {} layouts have one so far", best_responses_by_split),
     ("docs/choices", "the teammates of {} of the {} validation tasks", validation_without_headroom),
     ("docs/choices", "also plays with {} recipes", lambda: 4 * settings_of_rl2("four_recipes")),
     ("docs/choices", "plays on {} rearranged versions", lambda: reference.TRACK_PLAY["layout"]["rearranged"]),

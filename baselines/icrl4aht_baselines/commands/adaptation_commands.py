@@ -62,7 +62,10 @@ def _run_trainings(
 
 
 def _model_returns() -> dict[str, dict[str, float]]:
-    """Return model -> task id -> mean return, of the stored results of models on test tasks."""
+    """Return model -> task id -> mean return, of the stored results of models on test tasks.
+
+    Results of controls do not count, in which an ego's memory is cleared or another teammate plays.
+    """
     from icrl4aht_baselines.report.comparison import read_stored, results_file
     from icrl4aht_baselines.report.results import bundled_by_id, task_label
 

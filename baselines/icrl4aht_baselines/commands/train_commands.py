@@ -75,7 +75,7 @@ def evaluate_command(
     from icrl4aht_baselines.evaluate.controls import evaluate_controls
     from icrl4aht_baselines.evaluate.evaluator import evaluate
     from icrl4aht_baselines.evaluate.programs import Programs
-    from icrl4aht_baselines.evaluate.protocols import get_protocol, limit_tasks
+    from icrl4aht_baselines.evaluate.protocols import get_protocol, hidden_recipe_note, limit_tasks
     from icrl4aht_baselines.evaluate.segments import CONTROLS
     from icrl4aht_baselines.report.page import summary_lines
     from icrl4aht_baselines.report.results import note_results, read_run
@@ -88,6 +88,8 @@ def evaluate_command(
     if chosen_seeds:
         shared.check_alone("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
+    if note := hidden_recipe_note(chosen):
+        click.echo(note, err=True)
     programs = Programs()
     options: Any = {"seeds": seeds_of_tasks, "suite": suite, "out": out, "details": ego.details, "programs": programs}
     lines = []

@@ -123,6 +123,20 @@ def get_protocol(name: str, episodes: int | None = None) -> Protocol:
     return replace(PROTOCOLS[name], episodes=episodes)
 
 
+def hidden_recipe_note(tasks: Sequence[Task]) -> str:
+    """Return a sentence that names the layouts on which no observation shows the ego the wanted dish; empty if none.
+
+    Layouts with a single recipe do not count, unless the tasks fix one of several.
+    """
+    hidden = [task for task in tasks if not task.layout.shows_recipe]
+    hidden = [task for task in hidden if len(task.layout.recipes) > 1 or task.recipes is not None]
+    if not hidden:
+        return ""
+    names = ", ".join(dict.fromkeys(task.layout.name for task in hidden))
+    fixed = " In tasks with one dish throughout, it can remember what was paid." if hidden[0].recipes else ""
+    return f"no observation shows the wanted dish on {names}: an ego has to find it out from what is paid.{fixed}"
+
+
 def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
     """Return the first `count` tasks of each cell, a layout with a teammate kind, in order; all tasks for None.
 

@@ -118,15 +118,25 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
 
 
 def add_scales(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of results with columns `stay` and `best`, the returns that scores are relative to."""
-    rows = [
-        (protocol, *cell[:2], cell.kind, task, scale.stay, scale.best)
-        for protocol in table["protocol"].unique()
-        for cell, of_cell in cell_scales(protocol).items()
-        for task, scale in of_cell.tasks.items()
-    ]
+    """Return a table of results with columns `stay` and `best`: S and B of each task, where they are known.
+
+    Under the control `swapped` they are of the teammate of the last episodes alone, and under a protocol that swaps
+    teammates there are none.
+    """
+    rows = []
+    for protocol in table["protocol"].unique():
+        stays, bests = stay_returns(protocol), best_responses(protocol)
+        for cell, tasks in bundled_cells().items():
+            for task in tasks:
+                if task in stays or task in bests:
+                    best = bests[task].best if task in bests else None
+                    rows.append((protocol, *cell[:2], cell.kind, task_label(task), stays.get(task), best))
     keys = ["protocol", *CELL_COLUMNS, "task"]
-    return table.merge(pd.DataFrame(rows, columns=[*keys, "stay", "best"]), how="left", on=keys)
+    scaled = table.merge(pd.DataFrame(rows, columns=[*keys, "stay", "best"]), how="left", on=keys)
+    if "control" in scaled:
+        others = (scaled["control"] == "swapped") & (scaled["block"] != "last 20")
+        scaled.loc[others, ["stay", "best"]] = np.nan
+    return scaled
 
 
 def open_cells(scales: CellScales) -> list[ResultCell]:

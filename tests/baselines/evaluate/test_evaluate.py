@@ -13,7 +13,13 @@ from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import find_agent, random, stay
 from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
-from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol, limit_tasks
+from icrl4aht_baselines.evaluate.protocols import (
+    PROTOCOLS,
+    bundled_tasks,
+    get_protocol,
+    hidden_recipe_note,
+    limit_tasks,
+)
 from icrl4aht_baselines.evaluate.results import read_result
 from icrl4aht_baselines.report.results import read_run
 from icrl4aht_generation.policy import Policy
@@ -248,6 +254,15 @@ def test_tasks_and_episodes_are_limited():
         limit_tasks(SIMPLE, 0)
     with pytest.raises(OptionError, match="episodes = 0: expected at least 1"):
         get_protocol("seeded", 0)
+
+
+def test_layouts_that_do_not_show_the_dish_are_named():
+    simple, right = ([task for task in ALL if task.layout.name == name] for name in ("demo_simple", "asymm_right"))
+    assert hidden_recipe_note(simple) == ""
+    note = hidden_recipe_note([*simple, *right])
+    assert " on asymm_right: " in note and "throughout" not in note
+    preference = hidden_recipe_note(bundled_tasks("preference", "validation"))
+    assert "asymm_both_plain, test_wide_plain, rooms-0-46" in preference and "throughout" in preference
 
 
 def test_commands(tmp_path):

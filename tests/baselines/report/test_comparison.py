@@ -174,7 +174,9 @@ def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monke
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")
     table = add_scales(stored.table)
     down = table[table["layout"] == "cramped_down"]
-    assert len(table) == len(stored.table) and set(down["best"] - down["stay"]) == {20}
+    assert len(table) == len(stored.table) and set((down["best"] - down["stay"]).dropna()) == {20}
+    mixed = table[table["control"] == "swapped"]
+    assert set(mixed.loc[mixed["best"].notna(), "block"]) == {"last 20"}, "others are of another teammate"
     assert "20 of 32 cells" in render_comparison(some)
     with pytest.raises(OptionError, match="no stored results: give files that"):
         write_comparison(StoredResults(), tmp_path / "empty")

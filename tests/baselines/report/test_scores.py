@@ -121,6 +121,8 @@ def test_scales_have_the_tasks_with_a_best_response(measured):
 
 
 def test_damaged_best_responses(tmp_path):
+    with pytest.raises(OptionError, match=r"none\.json: no such file, expected best responses"):
+        read_best_responses(tmp_path / "none.json")
     card = read_best_responses(write_measured(tmp_path / "b.json"))
     assert card.version == "7" and isinstance(card.behaviours[0], BestResponse)
     text = (tmp_path / "b.json").read_text()

@@ -336,3 +336,11 @@ def test_an_impossible_button_timer_and_several_faults_are_found():
     assert faults(RING, record) == ["a button timer above its limit"]
     record[:, columns(RING).facings] = 7
     assert faults(RING, record) == ["an unknown facing", "a button timer above its limit"]
+
+
+@each_layout
+def test_layouts_know_whether_the_ego_can_see_the_recipe(layout):
+    views = observe(layout, random_records(layout, 500, np.random.default_rng(0)), 0)
+    names = channel_names(layout.ingredient_types, layout.indicates_delivery)
+    shown = [number for number, name in enumerate(names) if name.startswith("recipe")]
+    assert layout.shows_recipe == bool(views[..., shown].any())
