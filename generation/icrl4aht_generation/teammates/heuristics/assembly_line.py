@@ -12,7 +12,14 @@ from jaxtyping import Array, Bool, Int, Key
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
 from icrl4aht_data.overcooked.cells import POT
 from icrl4aht_generation.paths import Rule, Scene, is_ingredient
-from icrl4aht_generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
+from icrl4aht_generation.teammates.heuristics.heuristic import (
+    SHARES,
+    Heuristic,
+    Sampling,
+    draw,
+    extra_split,
+    parameters,
+)
 
 RUNNER, PLATER, FLEX = range(3)
 AT_POTS, CENTRAL, NEAR_PARTNER = range(3)
@@ -163,33 +170,21 @@ ASSEMBLY_LINE = Heuristic(
     kind="assembly_line",
     begin=begin_assembly_line,
     act=act_assembly_line,
-    defaults={
-        "role_mode": FLEX,
-        "handoff_style": AT_POTS,
-        "plate_urgency": 0.5,
-        "prestage_bias": 0.3,  # a published parameter that no rule reads
-        "start_cook_bias": 0.7,  # a published parameter without effect, since pots start by themselves
-        "hesitation_prob": 0.0,
-        "wrong_action_prob": 0.0,
-        "task_abandon_prob": 0.0,
-        "stubbornness": 0.0,
-        "timing_mismatch": 0.0,
-    },
-    presets={
-        "default": {},
-        "ingredient_runner": {
-            "role_mode": RUNNER,
-            "plate_urgency": 0.0,
-            "prestage_bias": 0.5,
-            "start_cook_bias": 0.8,
+    **parameters(
+        ("default", "ingredient_runner", "plater_deliverer"),
+        {
+            "role_mode": (None, FLEX, RUNNER, PLATER),
+            "handoff_style": (None, AT_POTS, AT_POTS, AT_POTS),
+            "plate_urgency": ((0.0, 1.0), 0.5, 0.0, 0.8),
+            "prestage_bias": ((0.0, 1.0), 0.3, 0.5, 0.0),  # no effect: no rule reads it
+            "start_cook_bias": ((0.0, 1.0), 0.7, 0.8, 0.3),  # no effect: pots start by themselves
+            "hesitation_prob": (None, 0.0, 0.0, 0.0),
+            "wrong_action_prob": (None, 0.0, 0.0, 0.0),
+            "task_abandon_prob": (None, 0.0, 0.0, 0.0),
+            "stubbornness": (None, 0.0, 0.0, 0.0),
+            "timing_mismatch": (None, 0.0, 0.0, 0.0),
         },
-        "plater_deliverer": {
-            "role_mode": PLATER,
-            "plate_urgency": 0.8,
-            "prestage_bias": 0.0,
-            "start_cook_bias": 0.3,
-        },
-    },
+    ),
     train=Sampling(
         ("default", "ingredient_runner"),
         {"role_mode": [0, 2], "plate_urgency": (0.0, 0.6), "prestage_bias": (0.2, 0.6)},
@@ -211,11 +206,6 @@ ASSEMBLY_LINE = Heuristic(
             "timing_mismatch": SHARES,
         },
     ),
-    spans={
-        "plate_urgency": (0.0, 1.0),
-        "prestage_bias": (0.0, 1.0),
-        "start_cook_bias": (0.0, 1.0),
-    },
     choices={"role_mode": 3, "handoff_style": 3},
 )
 """The family H3; its parameters' order is that of the published manifests."""

@@ -13,7 +13,14 @@ from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.cells import GOAL, NOWHERE, PLATE, POT
 from icrl4aht_data.overcooked.state import POT_STEPS
 from icrl4aht_generation.paths import UNREACHABLE, Rule, Scene, is_dish, is_ingredient
-from icrl4aht_generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
+from icrl4aht_generation.teammates.heuristics.heuristic import (
+    SHARES,
+    Heuristic,
+    Sampling,
+    draw,
+    extra_split,
+    parameters,
+)
 
 _CRAMPED_CELLS = 8
 """Largest number of floor cells of a cramped layout."""
@@ -266,54 +273,24 @@ RECIPE_AWARE_BUTTON = Heuristic(
     kind="recipe_aware_button",
     begin=begin_recipe_aware_button,
     act=act_recipe_aware_button,
-    defaults={
-        "press_L_when_unknown": 0.8,
-        "refresh_interval": 100,
-        "cost_sensitivity": 0.2,
-        "strict_recipe": 0.9,
-        "exploration_bias": 0.1,  # a published parameter that no rule reads
-        "plate_timing": 0.5,
-        "dist_weight": 0.3,  # a published parameter without effect: the nearest target wins, unweighted
-        "inertia": 0.4,  # a published parameter without effect: no rule looks at the last intent
-        "task_specialization": 0.0,
-        "stubbornness": 0.0,  # a published parameter without effect: it is read and not used
-        "wrong_ingredient_prob": 0.0,
-        "idle_prob": 0.0,
-        "path_blocking": 0.0,
-    },
-    presets={
-        "default": {},
-        "high_L_priority": {
-            "press_L_when_unknown": 1.0,
-            "refresh_interval": 50,
-            "cost_sensitivity": 0.0,
-            "strict_recipe": 1.0,
-            "exploration_bias": 0.0,
-            "plate_timing": 0.6,
-            "dist_weight": 0.3,
-            "inertia": 0.3,
+    **parameters(
+        ("default", "high_L_priority", "lazy_learner", "strict_adherent"),
+        {
+            "press_L_when_unknown": ((0.0, 1.0), 0.8, 1.0, 0.3, 0.9),
+            "refresh_interval": (None, 100, 50, 200, 80),
+            "cost_sensitivity": ((0.0, 1.0), 0.2, 0.0, 0.8, 0.1),
+            "strict_recipe": ((0.0, 1.0), 0.9, 1.0, 0.3, 1.0),
+            "exploration_bias": ((0.0, 1.0), 0.1, 0.0, 0.5, 0.0),  # no effect: no rule reads it
+            "plate_timing": ((0.0, 1.0), 0.5, 0.6, 0.4, 0.7),
+            "dist_weight": ((0.1, 1.0), 0.3, 0.3, 0.4, 0.25),  # no effect: the nearest target wins, unweighted
+            "inertia": ((0.0, 1.0), 0.4, 0.3, 0.5, 0.5),  # no effect: no rule looks at the last intent
+            "task_specialization": (None, 0.0, 0.0, 0.0, 0.0),
+            "stubbornness": (None, 0.0, 0.0, 0.0, 0.0),  # no effect: it is read and not used
+            "wrong_ingredient_prob": (None, 0.0, 0.0, 0.0, 0.0),
+            "idle_prob": (None, 0.0, 0.0, 0.0, 0.0),
+            "path_blocking": (None, 0.0, 0.0, 0.0, 0.0),
         },
-        "lazy_learner": {
-            "press_L_when_unknown": 0.3,
-            "refresh_interval": 200,
-            "cost_sensitivity": 0.8,
-            "strict_recipe": 0.3,
-            "exploration_bias": 0.5,
-            "plate_timing": 0.4,
-            "dist_weight": 0.4,
-            "inertia": 0.5,
-        },
-        "strict_adherent": {
-            "press_L_when_unknown": 0.9,
-            "refresh_interval": 80,
-            "cost_sensitivity": 0.1,
-            "strict_recipe": 1.0,
-            "exploration_bias": 0.0,
-            "plate_timing": 0.7,
-            "dist_weight": 0.25,
-            "inertia": 0.5,
-        },
-    },
+    ),
     train=Sampling(
         ("default", "high_L_priority"),
         {
@@ -346,15 +323,6 @@ RECIPE_AWARE_BUTTON = Heuristic(
             "path_blocking": SHARES,
         },
     ),
-    spans={
-        "press_L_when_unknown": (0.0, 1.0),
-        "cost_sensitivity": (0.0, 1.0),
-        "strict_recipe": (0.0, 1.0),
-        "exploration_bias": (0.0, 1.0),
-        "plate_timing": (0.0, 1.0),
-        "dist_weight": (0.1, 1.0),
-        "inertia": (0.0, 1.0),
-    },
     unbounded=frozenset({"refresh_interval"}),
 )
 """The family H1; its parameters' order is that of the published manifests.

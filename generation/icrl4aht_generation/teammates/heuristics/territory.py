@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
 from icrl4aht_generation.paths import Rule, Scene
-from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw
+from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw, parameters
 
 VERTICAL, HORIZONTAL, STATIONS = range(3)
 NORMAL, BLOCKER, HOARDER, LAZY, COUNTER, INVADER = range(6)
@@ -184,28 +184,18 @@ TERRITORY = Heuristic(
     kind="territory",
     begin=begin_territory,
     act=act_territory,
-    defaults={
-        "split_mode": VERTICAL,
-        "strictness": 0.7,
-        "shared_margin": 1,
-        "rescue_threshold": 0.6,
-        "yield_bias": 0.3,
-        "behavior_mode": NORMAL,
-        "action_probability": 1.0,
-    },
-    presets={
-        "default": {},
-        "strict_vertical": {"strictness": 1.0, "shared_margin": 0, "rescue_threshold": 0.8, "yield_bias": 0.5},
-        "strict_horizontal": {
-            "split_mode": HORIZONTAL,
-            "strictness": 1.0,
-            "shared_margin": 0,
-            "rescue_threshold": 0.8,
-            "yield_bias": 0.5,
+    **parameters(
+        ("default", "strict_vertical", "strict_horizontal", "object_stations", "flexible"),
+        {
+            "split_mode": (None, VERTICAL, VERTICAL, HORIZONTAL, STATIONS, VERTICAL),
+            "strictness": ((0.0, 1.0), 0.7, 1.0, 1.0, 0.8, 0.3),
+            "shared_margin": (None, 1, 0, 0, 1, 2),
+            "rescue_threshold": ((0.0, 1.0), 0.6, 0.8, 0.8, 0.5, 0.3),
+            "yield_bias": ((0.0, 1.0), 0.3, 0.5, 0.5, 0.4, 0.2),
+            "behavior_mode": (None, NORMAL, NORMAL, NORMAL, NORMAL, NORMAL),
+            "action_probability": (None, 1.0, 1.0, 1.0, 1.0, 1.0),
         },
-        "object_stations": {"split_mode": STATIONS, "strictness": 0.8, "rescue_threshold": 0.5, "yield_bias": 0.4},
-        "flexible": {"strictness": 0.3, "shared_margin": 2, "rescue_threshold": 0.3, "yield_bias": 0.2},
-    },
+    ),
     train=Sampling(
         ("default", "flexible"),
         {"split_mode": [0, 1], "strictness": (0.0, 0.3), "shared_margin": [1, 2, 3], "rescue_threshold": (0.2, 0.4)},
@@ -226,11 +216,6 @@ TERRITORY = Heuristic(
             "action_probability": [1.0, 1.0, 0.75, 0.5, 0.25],
         },
     ),
-    spans={
-        "strictness": (0.0, 1.0),
-        "rescue_threshold": (0.0, 1.0),
-        "yield_bias": (0.0, 1.0),
-    },
     choices={"split_mode": 3, "behavior_mode": 6},
     unbounded=frozenset({"shared_margin"}),
 )
