@@ -322,9 +322,9 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     and oracle earn with it. With --spread, chooses widely different teammates for the profiles' tasks.spread. Layouts
     that the table has are kept, so that a stopped command resumes.
     """
-    from icrl4aht_generation.teammates.draws import DRAWS_TABLE
-    from icrl4aht_generation.teammates.measuring import fill_draws_table, fill_spread_table
-    from icrl4aht_generation.teammates.spread import SPREAD_TABLE, read_spread_table, spread_rows
+    from icrl4aht_generation.teammates.draws import DRAWS_TABLE, read_table
+    from icrl4aht_generation.teammates.measuring import fill_table
+    from icrl4aht_generation.teammates.spread import SPREAD_TABLE, LayoutSpread, spread_rows
 
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or list(TESTED_ON)
     for name in names:
@@ -332,10 +332,9 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
             raise unknown("training layout", name, TESTED_ON)
     path = out or (SPREAD_TABLE if spread else DRAWS_TABLE)
     with progress_bars(unit="layouts") as show:
-        fill = fill_spread_table if spread else fill_draws_table
-        fill(path, names, lambda done, name: show("draws", done, len(names), name), overwrite)
+        fill_table(path, names, lambda done, name: show("draws", done, len(names), name), overwrite, spread=spread)
     if spread:
-        rows = spread_rows(read_spread_table(path))
+        rows = spread_rows(read_table(path, LayoutSpread))
         from rich.table import Table
 
         table = Table(*(name.replace("_", " ") for name in rows[0]))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,23 +41,8 @@ _EPISODES = 10
 _SEED = 5
 
 
-class CommonStates(NamedTuple):
-    """States on which teammates of a layout are compared.
-
-    Attributes:
-        records: state records, uint8 (T, families x episodes, S).
-        instances: names of the test instances.
-        actions: actions of each test instance on the states of its own family, int8 (instances, T, episodes).
-    """
-
-    records: UInt8[Array, "T N S"]
-    instances: tuple[str, ...]
-    actions: np.ndarray
-
-    def family_states(self, actions: np.ndarray, instance: int) -> np.ndarray:
-        """Return the part (..., T, episodes) of actions (..., T, N) on the states of an instance's family."""
-        episodes, family = self.actions.shape[-1], instance // INSTANCES
-        return actions[..., family * episodes : (family + 1) * episodes]
+INSTANCE_NAMES = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
+"""Names of the test instances, such as "H3/t1", by family and number."""
 
 
 def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest]:
@@ -68,36 +53,28 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
     Raises:
         UnknownNameError: if the layout is not one of the benchmark.
     """
-    common = common_states(layout)
-    actions = act_along(layout, policies, common.records)
-    distances = distances_to_tests(common, actions)
+    records, tested = common_states(layout)
+    actions = act_along(layout, policies, records)
+    distances = distances_to_tests(tested, actions)
     nearest = distances.argmin(axis=1)
     return [
-        NearestTest(common.instances[k], float(distances[number, k]), behaviour)
+        NearestTest(INSTANCE_NAMES[k], float(distances[number, k]), behaviour)
         for number, (k, behaviour) in enumerate(zip(nearest, group_behaviours(actions), strict=True))
     ]
 
 
 @lru_cache(maxsize=2)
-def common_states(layout: Layout) -> CommonStates:
-    """Return the states of a layout on which teammates are compared.
+def common_states(layout: Layout) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
+    """Return the states of a layout on which teammates are compared, and what the test instances do there.
+
+    Returns:
+        State records, see `common_records`, and the actions of the test instances, int8 (instances, T, N).
 
     Raises:
         UnknownNameError: if the layout is not one of the benchmark.
     """
     records = common_records(layout)
-    return join_states(records, act_along(layout, instance_policies(layout), records))
-
-
-def join_states(records: Array, actions: np.ndarray) -> CommonStates:
-    """Return common states: records, and the actions of `instance_policies` on them, int8 (instances, T, N)."""
-    each = records.shape[1] // len(TESTED_FAMILIES)
-    # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
-    parts = [
-        actions[k * INSTANCES : (k + 1) * INSTANCES, :, k * each : (k + 1) * each] for k in range(len(TESTED_FAMILIES))
-    ]
-    names = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
-    return CommonStates(records, names, np.concatenate(parts))
+    return records, act_along(layout, instance_policies(layout), records)
 
 
 def instance_policies(layout: Layout) -> list[Policy]:
@@ -214,15 +191,20 @@ def _actions(family: Policy, see: Callable[[Array], Any], params: Any, records: 
     return jax.lax.map(one, params)
 
 
-def distances_to_tests(common: CommonStates, actions: np.ndarray) -> np.ndarray:
-    """Return distances of teammates to the test instances: int8 (teammates, T, N) -> float64 (teammates, instances)."""
-    return np.stack(
-        [
-            (common.family_states(actions, number) != tested).mean(axis=(1, 2))
-            for number, tested in enumerate(common.actions)
-        ],
-        axis=1,
-    )
+def distances_to_tests(tested: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Return distances of teammates to the test instances, each on the states of the instance's family.
+
+    Args:
+        tested: actions of the test instances on the common states, int8 (instances, T, N).
+        actions: actions of teammates on the same states, int8 (teammates, T, N).
+
+    Returns:
+        float64 (teammates, instances).
+    """
+    families = len(tested) // INSTANCES
+    tested, actions = (array.reshape(*array.shape[:2], families, -1) for array in (tested, actions))
+    pairs = [(own[:, number // INSTANCES], number // INSTANCES) for number, own in enumerate(tested)]
+    return np.stack([(actions[:, :, family] != own).mean(axis=(1, 2)) for own, family in pairs], axis=1)
 
 
 def hamming_distances(actions: np.ndarray) -> np.ndarray:

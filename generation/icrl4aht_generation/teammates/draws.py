@@ -11,15 +11,17 @@ farther from every test instance.
 
 from __future__ import annotations
 
-import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Protocol, TypeVar
 
-from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS
+import msgspec
+from msgspec import Struct
+
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS, layout_order
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -54,7 +56,7 @@ def _least_distance(base_seed: int) -> float:
     return DIVERSE_DISTANCE if base_seed in _DIVERSE_SEEDS.values() else SAME_BEHAVIOUR
 
 
-class Draw(NamedTuple):
+class Draw(Struct, frozen=True, forbid_unknown_fields=True):
     """One draw on one layout: `sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)`.
 
     Attributes:
@@ -85,6 +87,11 @@ class Draw(NamedTuple):
     oracle: float
     other: str = ""
     other_distance: float = 1.0
+
+    @property
+    def order(self) -> tuple[Any, ...]:
+        """Sort key in the table: by layout, family, seed and theta_id."""
+        return layout_order(self.layout), list(HEURISTIC_FAMILIES).index(self.family), self.base_seed, self.theta_id
 
     @property
     def admissible(self) -> bool:
@@ -281,33 +288,40 @@ def _hosted_text(layout: str, base_seed: int) -> str:
 @lru_cache(maxsize=1)
 def _bundled_draws() -> dict[tuple[str, str, int], tuple[Draw, ...]]:
     draws: dict[tuple[str, str, int], list[Draw]] = defaultdict(list)
-    for draw in read_draws_table(DRAWS_TABLE):
+    for draw in read_table(DRAWS_TABLE, Draw):
         draws[draw.layout, draw.family, draw.base_seed].append(draw)
     return {key: tuple(found) for key, found in draws.items()}
 
 
-def read_draws_table(path: Path) -> list[Draw]:
-    """Return the draws of a table, in its order.
+class Row(Protocol):
+    """A line of a table of measured teammates."""
+
+    @property
+    def order(self) -> tuple[Any, ...]:
+        """Sort key in the table."""
+        ...
+
+
+AnyRow = TypeVar("AnyRow", bound=Row)
+
+
+def read_table(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
+    """Return the lines of a table of measured teammates, in its order.
 
     Raises:
         TaskFormatError: names the file and the line.
     """
-    draws = []
+    found = []
     for number, line in enumerate(read_lines(path), start=1):
         try:
-            draws.append(Draw(**parse_json(line)))
-        except (TypeError, Icrl4ahtError) as error:
-            raise TaskFormatError(f"{path}, line {number}: expected the fields {', '.join(Draw._fields)}") from error
-    return draws
+            found.append(msgspec.convert(parse_json(line), kind))
+        except (msgspec.ValidationError, Icrl4ahtError) as error:
+            raise TaskFormatError(f"{path}, line {number}: {error}") from error
+    return found
 
 
-def write_draws_table(path: Path, draws: Iterable[Draw]) -> None:
-    """Write draws, one JSON line each, by layout, family, seed and theta_id."""
-    layouts, families = list(TESTED_ON), list(HEURISTIC_FAMILIES)
-
-    def order(draw: Draw) -> tuple[int, ...]:
-        return layouts.index(draw.layout), families.index(draw.family), draw.base_seed, draw.theta_id
-
-    lines = (json.dumps(draw._asdict(), separators=(",", ":")) for draw in sorted(draws, key=order))
+def write_table(path: Path, rows: Iterable[Row]) -> None:
+    """Write one JSON line per row, sorted."""
+    lines = [msgspec.json.encode(row) + b"\n" for row in sorted(rows, key=lambda row: row.order)]
     with atomic_write(path) as partial:
-        partial.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+        partial.write_bytes(b"".join(lines))
