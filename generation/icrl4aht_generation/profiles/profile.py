@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import takewhile
-from typing import Annotated, Any
+from typing import Any
 
 from icrl4aht_data.benchmark.facts import (
     HEURISTIC_KINDS,
@@ -21,7 +21,7 @@ from icrl4aht_data.benchmark.tasks import Task, make_task, manifest_path, read_t
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import json_hash
-from icrl4aht_data.utils.options import Count, Natural, Option, check_options, replace_options
+from icrl4aht_data.utils.options import Count, Natural, check_options, replace_options
 from icrl4aht_generation.layouts.families import split_of
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
@@ -56,9 +56,9 @@ class TeammateConfig:
         ppo: hyper-parameters of every policy.
     """
 
-    members: Annotated[Count, Option("Policies of each population.")] = 10
-    train: Annotated[Count, Option("Teammates of each algorithm for training tasks.")] = PAPER_TEAMMATES
-    heldout: Annotated[Natural, Option("Held-out teammates of each algorithm.")] = 5
+    members: Count = 10
+    train: Count = PAPER_TEAMMATES
+    heldout: Natural = 5
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             total_steps=PAPER_TEAMMATE_STEPS, environments=256, warmup=0.05, shaping_horizon=15_000_000
