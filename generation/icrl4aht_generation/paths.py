@@ -345,10 +345,6 @@ class Scene:
         adjacent, action = self._turn_or(target, jnp.where(waits, STAY, INTERACT))
         return jnp.where(adjacent, action, self.approach(target)[0] if step is None else step)
 
-    def hover(self, target: Int[Array, ""]) -> Int[Array, ""]:
-        """Walk to the target; next to it, turn and wait."""
-        return self.go_to(target, waits=True)
-
     @cached_property
     def ways(self) -> Int[Array, " 4"]:
         """The cells to the right, below, left and above; the own cell where the way is blocked."""

@@ -13,10 +13,8 @@ times are in steps. Arrays of pots have entries for pots that the ego does not r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
@@ -25,9 +23,9 @@ from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.cells import COOKED, FACING_OF, NOWHERE, PLATE, POT, WALL
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack
-from icrl4aht_generation.experts.layout_facts import FAR, NEVER, LayoutFacts, stack_facts, study_layout
+from icrl4aht_generation.experts.layout_facts import FAR, NEVER, LayoutFacts, stack_facts
 from icrl4aht_generation.paths import Scene
-from icrl4aht_generation.policy import Policy, Situation
+from icrl4aht_generation.policy import Policy, Situation, on_layout
 
 WAIT_LIMIT = 10
 """Steps without a change in the pots after which the ego stops waiting for the teammate."""
@@ -63,11 +61,10 @@ def oracle(layout: Layout | Sequence[Layout]) -> Policy:
     """Return the scripted ego.
 
     Args:
-        layout: the layout whose state records it sees, a policy without parameters; or several, for a policy that sees
-            a `Situation` of one of them.
+        layout: the layout whose state records it sees; or several, for a policy that sees a `Situation` of one of them.
     """
     if isinstance(layout, Layout):
-        return Policy((), *_on_layout(layout), "state")
+        return on_layout(SITUATION_ORACLE._replace(params=oracle_params([layout])), layout)
     return SITUATION_ORACLE._replace(params=oracle_params(layout))
 
 
@@ -76,39 +73,22 @@ def oracle_params(layouts: Sequence[Layout]) -> Any:
     return stack_facts(layouts), np.zeros(record_size(*layouts), np.uint8)
 
 
-@lru_cache(maxsize=64)
-def _on_layout(layout: Layout) -> tuple[Any, Any]:
-    """Return `init` and `act` of the oracle on one layout."""
-    facts, blank = study_layout(layout), np.zeros(record_size(layout), np.uint8)
-
-    def act(params, memory: OracleMemory, record: UInt8[Array, " S"], key: Key[Array, ""]):
-        return _act(facts, memory, Scene(layout.tables, record, EGO))
-
-    return lambda params, key: _begin(blank), act
-
-
-def _begin_in_situation(params: Any, key: Key[Array, ""]) -> OracleMemory:
-    return _begin(params[1])
-
-
-def _act_in_situation(params: Any, memory: OracleMemory, view: Situation, key: Key[Array, ""]):
-    facts = jax.tree.map(lambda leaf: jnp.asarray(leaf)[view.layout], params[0])
-    return _act(facts, memory, Scene(view.tables, view.record, EGO))
-
-
-SITUATION_ORACLE = Policy((), _begin_in_situation, _act_in_situation, "situation")
-"""The ego for any layouts; its parameters are `oracle_params` of these."""
-
-
-def _begin(blank: Any) -> OracleMemory:
+def _begin(params: Any, key: Key[Array, ""]) -> OracleMemory:
     zero, no = jnp.int32(0), jnp.asarray(False)
-    return OracleMemory(jnp.asarray(blank), zero + STAY, zero, zero, zero, no, no, no)
+    return OracleMemory(jnp.asarray(params[1]), zero + STAY, zero, zero, zero, no, no, no)
 
 
-def _act(facts: LayoutFacts, memory: OracleMemory, scene: Scene) -> tuple[Int[Array, ""], OracleMemory]:
+def _act(params: Any, memory: OracleMemory, view: Situation, key: Key[Array, ""]):
+    # The facts of all layouts are stacked, so that one program plays any of them.
+    facts = LayoutFacts(*(jnp.asarray(leaf)[view.layout] for leaf in params[0]))
+    scene = Scene(view.tables, view.record, EGO)
     memory = _remember(scene, memory)
     action = jnp.where(facts.matters, _decide(_view_state(facts, scene, memory)), STAY).astype(jnp.int32)
     return action, memory._replace(action=action)
+
+
+SITUATION_ORACLE = Policy((), _begin, _act, "situation")
+"""The ego for any layouts; its parameters are `oracle_params` of these."""
 
 
 def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
@@ -329,14 +309,10 @@ class Subgoal(NamedTuple):
     reason: str
 
 
-def _subgoals(view: OracleView) -> list[Subgoal]:
-    """Return the table of decisions; the first row that applies and has a cell that can be reached decides."""
-    return _with_dish(view) + _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
-
-
 def _decide(view: OracleView) -> Int[Array, ""]:
-    """Return the action towards the first possible subgoal; it does not depend on rows below that one."""
-    facts, rows = view.facts, _subgoals(view)
+    """Return the action towards the first subgoal that applies and has a cell that can be reached."""
+    facts = view.facts
+    rows = _with_dish(view) + _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
     possible = jnp.stack([row.when & (jnp.min(row.cost) < NEVER) for row in rows])
     target = jnp.argmin(jnp.stack([row.cost for row in rows])[jnp.argmax(possible)])
     action = _way(view, view.obstacle, target)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,24 +26,9 @@ _MOVES_BY_DRAW = (RIGHT, DOWN, LEFT, UP)
 _OFF_BEATS = (np.arange(10) / 10).astype(np.float32)
 
 
-class AssemblyMemory(NamedTuple):
-    """Memory of an H3 teammate.
-
-    Attributes:
-        key: typed key, scalar, the next of its chain.
-    """
-
-    key: Key[Array, ""]
-
-
-def begin_assembly_line(key: Key[Array, ""]) -> AssemblyMemory:
-    """Return the memory at the start of an episode."""
-    return AssemblyMemory(key)
-
-
-def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int[Array, ""], AssemblyMemory]:
-    """Take one step of an H3 teammate."""
-    following, u = draw(memory.key)
+def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int[Array, ""], Key[Array, ""]]:
+    """Take one step of an H3 teammate, whose memory is the next key of its chain."""
+    following, u = draw(memory)
     idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
     makes_room = _makes_room(scene)
     # Deliveries and emergency moves are exempt from slips: no published teammate loses a dish by accident.
@@ -53,7 +36,7 @@ def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int
     slips = ~(idles | makes_room | final)
     action, following = _slip(scene, params, action, slips, u[1], following)
     action = jnp.where(makes_room, _step_aside(scene), action)
-    return jnp.where(idles, STAY, action), AssemblyMemory(following)
+    return jnp.where(idles, STAY, action), following
 
 
 def _off_beat(scene: Scene) -> Array:
@@ -168,7 +151,7 @@ def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], 
 
 ASSEMBLY_LINE = Heuristic(
     kind="assembly_line",
-    begin=begin_assembly_line,
+    begin=lambda key: key,
     act=act_assembly_line,
     **parameters(
         ("default", "ingredient_runner", "plater_deliverer"),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.cells import GOAL, NOWHERE, PLATE, POT
@@ -46,54 +46,17 @@ class ButtonMemory(NamedTuple):
     seen: Int[Array, ""]
 
 
-class Role(NamedTuple):
-    """Restrictions of a specialist: agent 0 only cooks, agent 1 only delivers.
-
-    Attributes:
-        cooks_only: bool scalar.
-        delivers_only: bool scalar.
-    """
-
-    cooks_only: Bool[Array, ""]
-    delivers_only: Bool[Array, ""]
-
-
-class Noises(NamedTuple):
-    """Decisions of the step's draws, bool scalars.
-
-    Attributes:
-        idles: whether it does nothing.
-        presses: whether it presses the button, if it considers that.
-        errs: whether it fetches the wrong ingredient.
-        blocks: whether it walks to a busy cell instead of fetching an ingredient.
-    """
-
-    idles: Bool[Array, ""]
-    presses: Bool[Array, ""]
-    errs: Bool[Array, ""]
-    blocks: Bool[Array, ""]
-
-
-def begin_recipe_aware_button(key: Key[Array, ""]) -> ButtonMemory:
-    """Return the memory at the start of an episode."""
-    return ButtonMemory(key, jnp.int32(0), jnp.uint8(0), jnp.int32(_NEVER))
-
-
 def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple[Int[Array, ""], ButtonMemory]:
     """Take one step of an H1 teammate."""
     memory = _look(scene, memory)
     following, u = draw(memory.key)
     unsure = (memory.recipe == 0) | (memory.clock - memory.seen > params["refresh_interval"])
-    # The roll for the button splits the step's own key once more, which draws u1 again.
-    presses = u[0] < params["press_L_when_unknown"] * (1 - params["cost_sensitivity"])
-    noises = Noises(
-        u[0] < params["idle_prob"], presses, u[1] < params["wrong_ingredient_prob"], u[2] < params["path_blocking"]
-    )
-    action, considered, pressed, erred = _decide(scene, params, memory.recipe, unsure, noises)
+    idles = u[0] < params["idle_prob"]
+    action, considered, pressed, erred = _decide(scene, params, memory.recipe, unsure, u)
     # Published quirk: where the roll for the button fails, the key stays.
-    key = jnp.where(considered & ~pressed & ~noises.idles, memory.key, following)
-    key, _ = extra_split(key, erred & ~noises.idles)
-    action = jnp.where(noises.idles, STAY, action)
+    key = jnp.where(considered & ~pressed & ~idles, memory.key, following)
+    key, _ = extra_split(key, erred & ~idles)
+    action = jnp.where(idles, STAY, action)
     return action, memory._replace(key=key, clock=memory.clock + 1)
 
 
@@ -106,12 +69,22 @@ def _look(scene: Scene, memory: ButtonMemory) -> ButtonMemory:
     )
 
 
-def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], noises: Noises):
-    """The action of a step without idling; whether pressing the button was considered, whether it was chosen, and
-    whether the branch of the wrong ingredient was entered: all three decide how the key chain proceeds."""
+def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], u: Float[Array, " 4"]):
+    """Return the action of a step without idling, and three facts that decide how the key chain proceeds.
+
+    They are whether pressing the button was considered, whether it was chosen, and whether the branch of the wrong
+    ingredient was entered.
+
+    Args:
+        scene: the state.
+        params: the teammate's parameters.
+        recipe: item byte of the last recipe that it knew; 0 for none.
+        unsure: whether it does not know the recipe, or has not seen it for long.
+        u: the step's uniform draws.
+    """
     # One parameter makes specialists of both agents: agent 0 cooks and agent 1 delivers.
     specialist = params["task_specialization"] > 0.5
-    role = Role(specialist & (scene.slot == 0), specialist & (scene.slot == 1))
+    cooks_only, delivers_only = specialist & (scene.slot == 0), specialist & (scene.slot == 1)
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
     cramped = is_cramped(scene)
     # In a cramped layout agent 1 is the one that gives way.
@@ -119,19 +92,21 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
     ids = jnp.asarray(scene.tables.ingredients)
 
     considered = empty & unsure & ~scene.button_lit & jnp.any(scene.buttons)
-    fetches_plate = empty & _wants_plate(scene, params, role)
+    # The roll for the button splits the step's own key once more, which draws u1 again.
+    presses = u[0] < params["press_L_when_unknown"] * (1 - params["cost_sensitivity"])
+    fetches_plate = empty & ((_plate_is_urgent(scene, params) & ~cooks_only) | delivers_only)
     fetches_plate &= ~(second & _leaves_plates(scene))
-    cooks = empty & ~role.delivers_only
-    errs = cooks & noises.errs & (jnp.max(ids) > 0)
+    cooks = empty & ~delivers_only
+    errs = cooks & (u[1] < params["wrong_ingredient_prob"]) & (jnp.max(ids) > 0)
     right = _right_ingredient(scene, params, recipe, second)
     first_rules = [
-        Rule(dish & role.cooks_only, scene.empty_counters),
-        Rule(dish & ~role.cooks_only, scene.goals),
+        Rule(dish & cooks_only, scene.empty_counters),
+        Rule(dish & ~cooks_only, scene.goals),
         Rule(plate, scene.cooked),
         Rule(plate, scene.pots_in_use, waits=True),
         Rule(ingredient, _pots_for(scene, recipe)),
         Rule(ingredient, scene.empty_counters),
-        Rule(considered & noises.presses, scene.buttons),
+        Rule(considered & presses, scene.buttons),
         Rule(fetches_plate, scene.plate_piles),
     ]
     pot_rule, press_rule = 4, 6
@@ -150,7 +125,7 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
     action = jnp.where(second & chosen.found & (chosen.number == pot_rule) & gives_way, aside, action)
     action = jnp.where(chosen.found, action, scene.wander())
     blocks, step = _block(scene)
-    blocks &= cooks & noises.blocks & ~settled
+    blocks &= cooks & (u[2] < params["path_blocking"]) & ~settled
     action = jnp.where(blocks, step, action)
     clears = cramped & plate & is_dish(scene.partner_hand) & ~jnp.any(scene.reach(scene.cooked))
     action = jnp.where(clears, _clear_the_way(scene), action)
@@ -158,12 +133,12 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
     return action, considered, pressed, errs & ~settled & ~blocks
 
 
-def _wants_plate(scene: Scene, params, role: Role) -> Bool[Array, ""]:
+def _plate_is_urgent(scene: Scene, params) -> Bool[Array, ""]:
     timers = scene.state.pot_timers
     # A soup becomes urgent as it cooks, so that the plate arrives when it is done.
     cooking = jnp.max(jnp.where(timers > 0, jnp.asarray(_URGENCY)[timers.astype(jnp.int32)], 0))
     urgency = jnp.where(jnp.any(scene.cooked), 1, cooking)
-    return ((urgency >= 1 - params["plate_timing"]) & ~role.cooks_only) | role.delivers_only
+    return urgency >= 1 - params["plate_timing"]
 
 
 def _decoded(scene: Scene) -> Bool[Array, " 3"]:
@@ -271,7 +246,7 @@ def _clear_the_way(scene: Scene) -> Int[Array, ""]:
 
 RECIPE_AWARE_BUTTON = Heuristic(
     kind="recipe_aware_button",
-    begin=begin_recipe_aware_button,
+    begin=lambda key: ButtonMemory(key, jnp.int32(0), jnp.uint8(0), jnp.int32(_NEVER)),
     act=act_recipe_aware_button,
     **parameters(
         ("default", "high_L_priority", "lazy_learner", "strict_adherent"),

@@ -34,23 +34,6 @@ class TerritoryMemory(NamedTuple):
     stuck: Int[Array, ""]
 
 
-class Areas(NamedTuple):
-    """Parts of the layout, as masks over cells.
-
-    Attributes:
-        strict: bool (cells,), the teammate's own territory.
-        relaxed: bool (cells,), the territory and the margin that it shares.
-    """
-
-    strict: Bool[Array, " cells"]
-    relaxed: Bool[Array, " cells"]
-
-
-def begin_territory(key: Key[Array, ""]) -> TerritoryMemory:
-    """Return the memory at the start of an episode."""
-    return TerritoryMemory(key, jnp.int32(_NOWHERE), jnp.int32(0))
-
-
 def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Array, ""], TerritoryMemory]:
     """Take one step of an H2 teammate."""
     following, u = draw(memory.key)
@@ -147,9 +130,8 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
     # Two finished soups are as urgent as it gets: then even strict teammates help outside their territory.
     urgency = jnp.minimum(jnp.sum(scene.cooked) / 2, 1)
     anywhere = (urgency > params["rescue_threshold"]) | (params["strictness"] <= 0.5)
-    mine = areas(scene, params)
     reach = scene.reach(jnp.stack([mask for mask, _ in masks]))
-    strict, relaxed = reach & mine.strict, reach & mine.relaxed
+    strict, relaxed = (reach & area for area in areas(scene, params))
     fallback = jnp.asarray(np.array([[fallback] for _, fallback in masks]))
     found = jnp.where(
         jnp.any(strict, axis=1, keepdims=True),
@@ -159,8 +141,11 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
     return jnp.where(anywhere, reach, found)
 
 
-def areas(scene: Scene, params) -> Areas:
-    """Return the areas of the scene's agent, or of its partner for the mode INVADER."""
+def areas(scene: Scene, params) -> tuple[Bool[Array, " cells"], Bool[Array, " cells"]]:
+    """Return the agent's own territory, and the territory with the margin that it shares.
+
+    For the mode INVADER both are its partner's.
+    """
     # The split by stations can leave one agent without floor, in small rooms; such layouts are split vertically.
     tables = scene.tables
     stations, floor = jnp.asarray(tables.stations), jnp.asarray(tables.walkable)
@@ -177,12 +162,12 @@ def areas(scene: Scene, params) -> Areas:
     near = beyond + margin
     # As published: cells exactly at the margin are shared, but not in the split by stations.
     shared = jnp.where(kind == STATIONS, near > 0, near >= 0)
-    return Areas(strict, jnp.where(second, shared, beyond < margin))
+    return strict, jnp.where(second, shared, beyond < margin)
 
 
 TERRITORY = Heuristic(
     kind="territory",
-    begin=begin_territory,
+    begin=lambda key: TerritoryMemory(key, jnp.int32(_NOWHERE), jnp.int32(0)),
     act=act_territory,
     **parameters(
         ("default", "strict_vertical", "strict_horizontal", "object_stations", "flexible"),

@@ -31,11 +31,6 @@ class GreedyMemory(NamedTuple):
     wait: Int[Array, ""]
 
 
-def begin_utility_greedy(key: Key[Array, ""]) -> GreedyMemory:
-    """Return the memory at the start of an episode."""
-    return GreedyMemory(key, jnp.int32(-1), jnp.int32(0))
-
-
 def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[Array, ""], GreedyMemory]:
     """Take one step of an H4 teammate."""
     intent, action = _decide(scene, params, memory.intent)
@@ -77,7 +72,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
     scores = jnp.where(feasible, values - params["dist_weight"] * distance + bonus, -jnp.inf)
     best = jnp.argmax(scores)
     target = scene.closest(targets[best])
-    action = jnp.where(waits & (best == PICK_UP), scene.hover(target), scene.go_to(target))
+    action = scene.go_to(target, waits=waits & (best == PICK_UP))
     # `argmax` over nothing but -inf returns 0, so whether anything is feasible decides separately.
     some = jnp.any(feasible)
     return jnp.where(some, best, -1), jnp.where(some, action, scene.wander())
@@ -147,7 +142,7 @@ _SPANS = _TABLE["spans"]
 
 UTILITY_GREEDY = Heuristic(
     kind="utility_greedy",
-    begin=begin_utility_greedy,
+    begin=lambda key: GreedyMemory(key, jnp.int32(-1), jnp.int32(0)),
     act=act_utility_greedy,
     **_TABLE,
     train=Sampling(
