@@ -30,9 +30,8 @@ from icrl4aht_generation.collection.job import run_task
 from icrl4aht_generation.collection.task import make_learner
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.learners.config import Widths
-from icrl4aht_generation.profiles import Profile, load_profile
+from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
-from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
 from benchmarks.harness import elapsed, folder_size, peak_memory, print_line
@@ -80,7 +79,7 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
 
 def _first_heuristic(profile: Profile) -> Work:
     """Return the work of the profile's last task with heuristic teammates."""
-    return replace(profile, presets=("default",)).works()[-1]
+    return replace(profile, presets=("default",)).units()[-1]
 
 
 def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:

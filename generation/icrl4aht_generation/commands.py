@@ -31,7 +31,7 @@ from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, check_output
 from icrl4aht_data.utils.progress import progress_bars
-from icrl4aht_generation.jobs.command_line import queue_options, read_queue_options
+from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
 from icrl4aht_generation.layouts.sheet import save_sheet
 from icrl4aht_generation.learners.config import EncoderKind

@@ -34,9 +34,8 @@ from icrl4aht_generation.collection.scripted_rollout import (
 )
 from icrl4aht_generation.collection.task import TEAMMATE_NOISE, UpdateCallback, readable_disk_errors
 from icrl4aht_generation.collection.task_folder import ArrayWriter, check_room, finish_artefact
-from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
-from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.registry import build_teammate
 
 _LINE_BYTES = 100  # line of a history in metrics, and of a piece in timing

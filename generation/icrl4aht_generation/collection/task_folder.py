@@ -37,8 +37,7 @@ from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS,
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, last_line, xla_threads
-from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Profile, Work
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
 LABELLER_RETURNS = "labeller_returns.json"

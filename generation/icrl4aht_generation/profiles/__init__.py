@@ -19,8 +19,7 @@ from icrl4aht_data.utils.options import Count, Natural, replace_options
 from icrl4aht_generation.layouts.families import generate_layouts
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
-from icrl4aht_generation.profiles.profile import Profile, SampledConfig, SpreadConfig, TeammateConfig
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles.profile import Profile, SampledConfig, SpreadConfig, TeammateConfig, Work
 
 FOLDER = Path(__file__).parent
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import takewhile
-from typing import Any
+from typing import Any, NamedTuple
 
 from icrl4aht_data.benchmark.facts import (
     HEURISTIC_KINDS,
@@ -25,7 +25,6 @@ from icrl4aht_data.utils.options import Count, Natural, check_options, replace_o
 from icrl4aht_generation.layouts.families import split_of
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
-from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.draws import drawn_teammates
 from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_generation.teammates.spread import SPREAD_SEED, spread_teammates
@@ -43,6 +42,25 @@ _GENERATED_SEEDS, _LAYOUT_TEAMMATES = 700_000, 16
 
 _GENERATED_DRAWS = {"train": 4, "validation": 5, "test": 6}
 """Split of a generated layout -> the base seed of its teammates, of the wide ranges `Heuristic.diverse`."""
+
+
+class Work(NamedTuple):
+    """One artefact to make.
+
+    Attributes:
+        task: the task.
+        source: how its histories are made: "ppo", by an ego that learns, "noise" or "search", by a script.
+        learner: number of the learner among the independent ones of the task.
+    """
+
+    task: Task
+    source: str = "ppo"
+    learner: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the artefact's folder."""
+        return f"{self.task.task_id}-l{self.learner}" if self.learner else self.task.task_id
 
 
 @dataclass(frozen=True)

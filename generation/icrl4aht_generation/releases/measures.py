@@ -6,28 +6,34 @@ Others are measured once; the measurements are kept next to the artefacts, in hi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON
 from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
 from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.utils.files import atomic_write, read_text
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.populations.headroom import learned_headroom
-from icrl4aht_generation.releases.remembered import measured_once
 from icrl4aht_generation.teammates.distances import nearest_test
 from icrl4aht_generation.teammates.draws import Draw, hosted_families, read_draws
-from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_returns
+from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_egos, reference_returns
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
 from icrl4aht_generation.teammates.spread import find_measured
 
 _DIGITS = 4
+
+T = TypeVar("T")
 
 
 class TeammateFacts(NamedTuple):
@@ -94,6 +100,27 @@ def teammate_facts(
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
 
 
+def measured_once(path: Path, settings: dict[str, Any], kind: type[T], measure: Callable[[], T]) -> T:
+    """Return the measurements cached in a JSON file; measure and write them if its settings differ.
+
+    Args:
+        path: the file.
+        settings: what the measurements depend on.
+        kind: their type, which msgspec checks.
+        measure: function that measures them.
+    """
+    try:
+        content = msgspec.json.decode(read_text(path))  # unlike `json`, it refuses NaN
+        if content["settings"] == json.loads(json.dumps(settings)):
+            return msgspec.convert(content["measured"], kind)
+    except (IndexFormatError, KeyError, TypeError, msgspec.MsgspecError):
+        pass  # damaged, or written by another version
+    measured = measure()
+    with atomic_write(path) as partial:
+        partial.write_bytes(msgspec.json.encode({"settings": settings, "measured": measured}))
+    return measured
+
+
 def release_provenance(root: Path) -> dict[str, Provenance]:
     """Return the provenance of a release by task id; empty if the folder is not a release."""
     path = root / PROVENANCE
@@ -118,8 +145,7 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     returns |= learned_headroom(missing, suite) if missing else {}
     for task in heuristics:  # one at a time: tasks may want dishes of their own, and all of a family share a program
         egos = reference_returns(task.layout, [build_teammate(None, task.teammate)])
-        stay, random, oracle = (float(egos[ego][0]) for ego in ("stay", "random", "oracle"))
-        returns[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES)
+        returns[task.task_id] = reference_egos(egos, 0)
     nearest: dict[str, NearestTest] = {}
     layout = tasks[0].layout
     if learned and layout.name in TESTED_ON:  # other layouts have no test teammates

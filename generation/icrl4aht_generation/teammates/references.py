@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.tables import Tables
@@ -54,6 +55,18 @@ def reference_returns(
     earned = np.asarray(play(tables, expert, [family.params for _, family in families]), np.float64)
     means = earned.reshape(len(REFERENCE_EGOS), len(teammates), episodes).mean(axis=-1)
     return dict(zip(REFERENCE_EGOS, means, strict=True))
+
+
+def reference_egos(returns: Mapping[str, np.ndarray], number: int, self_play: float | None = None) -> ReferenceEgos:
+    """Return the record of one teammate's measurements.
+
+    Args:
+        returns: from `reference_returns`.
+        number: number of the teammate.
+        self_play: mean return of a learned teammate with the policy that it was trained with.
+    """
+    stay, random, oracle = (float(returns[ego][number]) for ego in REFERENCE_EGOS)
+    return ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES, self_play)
 
 
 @lru_cache(maxsize=16)
