@@ -199,10 +199,8 @@ def network_player(
         apply: Any = jax.vmap(forward) if agent_slots.ndim == 2 else forward
         results = apply(params, hidden, seen, partner)
         hidden, logits, value = (x.reshape(flat.size, *x.shape[agent_slots.ndim :]) for x in results)
-        if isinstance(greedy, bool):
-            action = jnp.argmax(logits, axis=-1) if greedy else jax.random.categorical(key, logits)
-        else:
-            action = jnp.where(greedy, jnp.argmax(logits, axis=-1), jax.random.categorical(key, logits))
+        # Where `greedy` is a constant, the compiler drops the other way.
+        action = jnp.where(greedy, jnp.argmax(logits, axis=-1), jax.random.categorical(key, logits))
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), action[:, None], axis=-1)[:, 0]
         return Choice(action, log_prob, value), hidden
 

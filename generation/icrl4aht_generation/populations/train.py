@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -70,9 +70,6 @@ POPULATION = "population.json"
 """The record of a finished population."""
 
 _RESUME = "resume.safetensors"
-
-PopulationCallback = Callable[[int, int, dict[str, float]], None]
-"""Called after each update with its number, the number of all updates, and the metrics."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +168,7 @@ def is_population_finished(folder: Path, run: PopulationRun) -> bool:
 def train_population(
     run: PopulationRun,
     folder: Path,
-    on_update: PopulationCallback = lambda update, updates, metrics: None,
+    on_update: OnUpdate = lambda updates, speed: None,
     *,
     wait: bool = False,
     save_seconds: float = POPULATION_SAVE_SECONDS,
@@ -181,7 +178,7 @@ def train_population(
     Args:
         run: the population.
         folder: its folder.
-        on_update: called after each update.
+        on_update: called after each update with the number of updates and steps per second.
         wait: whether to wait for another process that trains it.
         save_seconds: least time between two saves.
 
@@ -242,11 +239,7 @@ class PopulationJob:
 
     def run(self, on_update: OnUpdate, wait: bool) -> None:
         """Train the population."""
-
-        def on_metrics(update: int, updates: int, metrics: dict[str, float]) -> None:
-            on_update(update, metrics["steps_per_second"])
-
-        train_population(self.population, self.suite / self.name, on_metrics, wait=wait)
+        train_population(self.population, self.suite / self.name, on_update, wait=wait)
 
     def finished_text(self) -> str:
         """Return the text on the finished population: steps, speed and the last return in self-play."""
@@ -262,7 +255,7 @@ class PopulationJob:
 class _PopulationTraining:
     """A run in its folder, whose lock is held."""
 
-    def __init__(self, run: PopulationRun, folder: Path, on_update: PopulationCallback, save_seconds: float) -> None:
+    def __init__(self, run: PopulationRun, folder: Path, on_update: OnUpdate, save_seconds: float) -> None:
         self.run, self.folder, self.on_update = run, folder, on_update
         self.saved = StateFile(folder / _RESUME, run.settings | software_versions())
         self.interval = SaveInterval(run.updates, seconds=save_seconds)
@@ -308,10 +301,10 @@ class _PopulationTraining:
             state, metrics = update(state)
             seconds = time.perf_counter() - started
             line = self._line(stage, number, metrics)
-            speed = {"steps_per_second": round((number + 1 - first) * population.steps_per_update / seconds, 1)}
-            log.write(line, timing={"stage": stage, "update": number} | speed)
+            speed = round((number + 1 - first) * population.steps_per_update / seconds, 1)
+            log.write(line, timing={"stage": stage, "update": number, "steps_per_second": speed})
             done = stage * updates + number + 1
-            self.on_update(done, self.run.updates, line | speed)
+            self.on_update(done, speed)
             if number + 1 in moments:
                 self._save_checkpoints(stage, moments.index(number + 1), number + 1, state.params)
             if self.interval.due(done):

@@ -26,7 +26,7 @@ from icrl4aht_data.utils.files import atomic_write, read_text
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.populations.headroom import learned_headroom
 from icrl4aht_generation.teammates.distances import nearest_test
-from icrl4aht_generation.teammates.draws import Draw, hosted_families, read_draws
+from icrl4aht_generation.teammates.draws import hosted_families, unhosted_reason
 from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_egos, reference_returns
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
 from icrl4aht_generation.teammates.spread import find_measured
@@ -164,20 +164,6 @@ def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
     for layout in (layout for layout in layouts if layout in TESTED_ON):
         hosted = hosted_families(layout)
         for family in (family for family in HEURISTIC_FAMILIES if family not in hosted):
-            draws = read_draws(layout, family)
-            found.append(LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, _why_unhosted(draws)))
+            reason = unhosted_reason(layout, family)
+            found.append(LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, reason))
     return found
-
-
-def _why_unhosted(draws: Sequence[Draw]) -> str:
-    if not draws:
-        return "no draws were measured"
-    admissible = [draw for draw in draws if draw.admissible]
-    if not admissible:
-        farthest = max(draw.distance for draw in draws)
-        return f"all {len(draws)} draws act like a test teammate of the family (distance {farthest:.3f} at most)"
-    widest = max(draw.spread for draw in admissible)
-    return (
-        f"with none of the {len(admissible)} draws that act unlike those of the test does the ego matter (returns "
-        f"differ by {widest:.1f} at most)"
-    )

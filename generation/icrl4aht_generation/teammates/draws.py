@@ -242,9 +242,9 @@ def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
     """
     draws = _usable(layout, family, base_seed)
     if not draws:
+        why, hosted = unhosted_reason(layout, family, base_seed), _hosted_text(layout, base_seed)
         raise OptionError(
-            f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: {_reason(layout, family, base_seed)}; "
-            f"name other families ({_hosted_text(layout, base_seed)})"
+            f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: {why}; name other families ({hosted})"
         )
     first = {(draw.like_another_family, draw.behaviour): draw for draw in reversed(draws)}
 
@@ -266,18 +266,20 @@ def _has_headroom(layout: str, base_seed: int) -> bool:
     return any(draw.admissible and draw.headroom for draw in draws)
 
 
-def _reason(layout: str, family: str, base_seed: int) -> str:
+def unhosted_reason(layout: str, family: str, base_seed: int = 0) -> str:
     """Return why no draw of a family may be used on a layout."""
     draws = read_draws(layout, family, base_seed)
     if not draws:
-        return "it has no draws there; `icrl4aht-data research draws` measures them"
-    if not any(draw.admissible for draw in draws):
-        distance, instance = max((draw.nearest_counted for draw in draws), key=lambda found: found[0])
-        return (
-            f"all {len(draws)} draws act like a test instance (Hamming distance at most {distance:.3f}, to {instance}; "
-            f"expected at least {_least_distance(base_seed)})"
-        )
-    return f"the ego matters with none of its admissible draws (returns differ by less than {LEAST_HEADROOM:g})"
+        return "no draws were measured"
+    admissible = [draw for draw in draws if draw.admissible]
+    if not admissible:
+        farthest = max(draw.nearest_counted[0] for draw in draws)
+        return f"all {len(draws)} draws act like a test teammate of the family (distance {farthest:.3f} at most)"
+    widest = max(draw.spread for draw in admissible)
+    return (
+        f"with none of the {len(admissible)} draws that act unlike those of the test does the ego matter (returns "
+        f"differ by {widest:.1f} at most)"
+    )
 
 
 def _hosted_text(layout: str, base_seed: int) -> str:
