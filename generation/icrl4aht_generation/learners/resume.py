@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -320,17 +319,15 @@ class RunLog:
 
 def _cut(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
     lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
-    kept = list(takewhile(lambda line: _is_kept(line, keep), lines))
+    kept: list[bytes] = []
+    with suppress(ValueError):  # half a line, written by a run that was killed
+        for line in lines:
+            if not (line.endswith(b"\n") and keep(json.loads(line))):
+                break
+            kept.append(line)
     if kept != lines:
         with atomic_write(path) as partial:
             partial.write_bytes(b"".join(kept))
-
-
-def _is_kept(line: bytes, keep: Callable[[dict[str, Any]], bool]) -> bool:
-    try:
-        return line.endswith(b"\n") and keep(json.loads(line))
-    except ValueError:
-        return False
 
 
 def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -76,11 +76,9 @@ def teammate_facts(
     for key, members in groups.items():
         draw, made = find_measured(key[0], members[0].teammate), recorded.get(members[0].task_id)
         if draw is not None:
-            near = NearestTest(draw.nearest, draw.distance, draw.behaviour)
-            if draw.other_distance < draw.distance:
-                near = NearestTest(draw.other, draw.other_distance, draw.behaviour)
+            distance, _, name = min((draw.distance, 0, draw.nearest), (draw.other_distance, 1, draw.other))
             egos = ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES)
-            found[key] = TeammateFacts(egos, near)
+            found[key] = TeammateFacts(egos, NearestTest(name, distance, draw.behaviour))
         elif made is not None and made.references is not None:
             found[key] = TeammateFacts(made.references, made.nearest_test)
     unknown = [key for key in groups if key not in found]

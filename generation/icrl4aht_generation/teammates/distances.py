@@ -29,10 +29,10 @@ from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
 from icrl4aht_generation.experts.padded import padded_layout
-from icrl4aht_generation.learners.rollout import init_rollout, roll_out
+from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Policy, Situation
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_thetas
-from icrl4aht_generation.teammates.references import REFERENCE_EGOS, player_in_some, stacked_families
+from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_families
 from icrl4aht_generation.teammates.registry import build_teammate
 
 _EPISODES = 10
@@ -119,13 +119,13 @@ def _play_tests(families: tuple[Policy, ...], episodes: int) -> Callable[..., Ar
     def play(tables: Tables, expert: Any, params: Sequence[Any], key: Key[Array, ""]) -> Array:
         env = Environment(tables, KEPT_STEPS)
         players = [
-            player_in_some(env, REFERENCE_EGOS["random"], (), EGO, np.flatnonzero(~with_oracle), total),
-            player_in_some(env, SITUATION_ORACLE, expert, EGO, np.flatnonzero(with_oracle), total),
+            policy_player(env, REFERENCE_EGOS["random"], (), EGO, total, only=np.flatnonzero(~with_oracle)),
+            policy_player(env, SITUATION_ORACLE, expert, EGO, total, only=np.flatnonzero(with_oracle)),
         ]
         for k, (family, own) in enumerate(zip(families, params, strict=True)):
             envs = np.arange(k * each, (k + 1) * each)
             repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2 * episodes, axis=0), own)
-            players.append(player_in_some(env, family, repeated, TEAMMATE, envs, total, own_params=True))
+            players.append(policy_player(env, family, repeated, TEAMMATE, total, own_params=True, only=envs))
         carry = init_rollout(env, players, jax.random.split(key, total))
         return roll_out(env, players, carry, env.max_steps, key)[1].record
 
