@@ -245,6 +245,7 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
     state, mine = scene.state, jnp.asarray(facts.mine)
     # Obstacle 0 is none, also if the teammate stands where it is in nobody's way.
     obstacle = jnp.asarray(facts.obstacle)[scene.partner].astype(jnp.int32)
+    faced = jnp.asarray(scene.tables.ahead)[scene.me, state.facings[EGO].astype(jnp.int32)]
     items = scene.at(WALL, state.counters)
     lying = items == jnp.array([[4], [16], [64]], jnp.uint8)
     contents = state.pot_items & np.uint8(0xFF - COOKED)
@@ -258,7 +259,7 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
         scene,
         memory,
         obstacle,
-        time=_times(facts, scene, obstacle),
+        time=jnp.where(scene.cell == faced, 0, _steps(jnp.asarray(facts.ways)[obstacle, scene.me])),
         items=items,
         sources=(jnp.asarray(facts.piles) | lying) & mine,
         contents=contents,
@@ -276,12 +277,6 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
 
 def _steps(stored: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
     return jnp.where(stored < NOWHERE, stored.astype(jnp.int32), FAR)
-
-
-def _times(facts: LayoutFacts, scene: Scene, obstacle: Int[Array, ""]) -> Int[Array, " cells"]:
-    """Return the steps until the ego faces each cell."""
-    faced = jnp.asarray(scene.tables.ahead)[scene.me, scene.state.facings[EGO].astype(jnp.int32)]
-    return jnp.where(scene.cell == faced, 0, _steps(jnp.asarray(facts.ways)[obstacle, scene.me]))
 
 
 def _way(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Array, ""]) -> Int[Array, ""]:

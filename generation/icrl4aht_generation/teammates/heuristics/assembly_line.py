@@ -55,6 +55,8 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
     plates_now = soup | (cooking & (params["plate_urgency"] > 0.5))
     plater = (params["role_mode"] == PLATER) | ((params["role_mode"] == FLEX) & plates_now)
     runner = ~plater
+    # What the partner carries counts as if in the pot: otherwise both agents would fetch the last missing piece.
+    coming = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
     chosen = scene.first(
         [
             Rule(scene.holds_dish, scene.goals),
@@ -64,7 +66,7 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
             Rule((runner & plate) | (plater & ingredient), scene.empty_counters),
             Rule(runner & ingredient, scene.nonfull),
             Rule(runner & ingredient, _handoff_counters(scene, params)),
-            Rule(runner & empty, _needed_piles(scene)),
+            Rule(runner & empty, scene.piles_of(scene.needed - coming > 0)),
             Rule(plater & plate, scene.cooked),
             Rule(plater & empty, scene.plate_piles),
             # From here on nothing can be done: agents wait where their next task will be.
@@ -85,13 +87,6 @@ def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
         return step
     distance = scene.distances(scene.partner)[scene.destination(step)]
     return jnp.where((step < STAY) & (distance <= 1), STAY, step)
-
-
-def _needed_piles(scene: Scene) -> Bool[Array, " cells"]:
-    """Piles of the recipe's missing ingredients over all pots; one in the partner's hand counts as if in the pot."""
-    # Otherwise both agents would fetch the last missing piece.
-    carried = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
-    return scene.piles_of(scene.needed - carried > 0)
 
 
 def _handoff_counters(scene: Scene, params) -> Bool[Array, " cells"]:

@@ -48,25 +48,18 @@ class ButtonMemory(NamedTuple):
 
 def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple[Int[Array, ""], ButtonMemory]:
     """Take one step of an H1 teammate."""
-    memory = _look(scene, memory)
+    # It knows the recipe while the button is lit, and on layouts with an indicator, seen or not.
+    shown = jnp.any(scene.indicators) | scene.button_lit
+    recipe, seen = jnp.where(shown, scene.state.recipe, memory.recipe), jnp.where(shown, memory.clock, memory.seen)
     following, u = draw(memory.key)
-    unsure = (memory.recipe == 0) | (memory.clock - memory.seen > params["refresh_interval"])
+    unsure = (recipe == 0) | (memory.clock - seen > params["refresh_interval"])
     idles = u[0] < params["idle_prob"]
-    action, considered, pressed, erred = _decide(scene, params, memory.recipe, unsure, u)
+    action, considered, pressed, erred = _decide(scene, params, recipe, unsure, u)
     # Published quirk: where the roll for the button fails, the key stays.
     key = jnp.where(considered & ~pressed & ~idles, memory.key, following)
     key, _ = extra_split(key, erred & ~idles)
     action = jnp.where(idles, STAY, action)
-    return action, memory._replace(key=key, clock=memory.clock + 1)
-
-
-def _look(scene: Scene, memory: ButtonMemory) -> ButtonMemory:
-    """Return the memory with the recipe, if the layout has an indicator (seen or not) or the button is lit."""
-    shown = jnp.any(scene.indicators) | scene.button_lit
-    return memory._replace(
-        recipe=jnp.where(shown, scene.state.recipe, memory.recipe),
-        seen=jnp.where(shown, memory.clock, memory.seen),
-    )
+    return action, ButtonMemory(key, memory.clock + 1, recipe, seen)
 
 
 def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], u: Float[Array, " 4"]):
