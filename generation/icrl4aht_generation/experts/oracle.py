@@ -4,7 +4,7 @@ It is agent 0. It fills one pot at a time with the ingredients that the recipe s
 arrives when the soup is done, and delivers only soups of the current recipe; it puts other soups on a counter until
 its recipe comes up. With a second pot it cooks ahead. It learns what to expect of the teammate by watching: it leaves
 the work to one that cooks and delivers, and forestalls one that does only half of that. It hands nothing over, which no
-layout rewards, never presses a button, and stays in layouts where it cannot matter. It is deterministic.
+layout rewards. It never presses a button, and stays in layouts where it cannot matter. It is deterministic.
 
 Shapes: `P` pots, `Q` recipes that it may cook (the current one, then the layout's), `S` bytes of a state record. All
 times are in steps. Arrays of pots have entries for pots that the ego does not reach, which no mask selects.
@@ -253,6 +253,7 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
     recipes = jnp.concatenate([state.recipe[None], jnp.asarray(facts.recipes)])
     cooked = (full[:, None] & (contents[:, None] == recipes)).sum(axis=0)
     plated = ((items[:, None] == recipes | _DISH) & mine[:, None]).sum(axis=0) + (scene.hand == recipes | _DISH)
+    # A teammate that never held a plate takes no soups, whatever the layout allows.
     risky = memory.plates & facts.mate_serves
     return OracleView(
         facts,
@@ -312,6 +313,7 @@ def _decide(view: OracleView) -> Int[Array, ""]:
     target = jnp.argmin(jnp.stack([row.cost for row in rows])[jnp.argmax(possible)])
     action = _way(view, view.obstacle, target)
     at_pot = (jnp.asarray(view.scene.tables.pots) == target) & facts.pots
+    # An interaction too early would spoil the pot, or be lost.
     waits = jnp.any(at_pot & view.too_early) & (action == INTERACT)
     action = jnp.where(waits, STAY, action)
     alone = jnp.where(jnp.any(possible), action, STAY)
@@ -320,6 +322,7 @@ def _decide(view: OracleView) -> Int[Array, ""]:
 
 def _with_dish(view: OracleView) -> list[Subgoal]:
     scene, facts = view.scene, view.facts
+    # A dish on a counter is worth a trip only if the ego can carry it to a goal.
     wanted = (view.items == view.dish) & facts.mine & jnp.any(scene.goals & facts.mine)
     near = view.cost(scene.empty_counters & facts.shared, scene.manhattan(scene.cell, scene.partner) - view.time)
     comes = scene.holds_nothing & (scene.partner_hand == view.dish) & ~jnp.any(facts.pots)
@@ -336,6 +339,7 @@ def _with_plate(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plans) < NEVER
     right = view.right & ~view.mate_takes
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
+    # The ego waits in front of a soup that is not done, so waiting counts like walking.
     rest = jnp.maximum(view.timers - view.pot_times, 0)
     return [
         Subgoal(holds & (soon | ~building), view.at_pots(right, rest), "plate the soup of the current recipe"),
@@ -388,6 +392,7 @@ def _with_nothing(view: OracleView) -> list[Subgoal]:
     ingredients = fetch(missing > coming, to_pot[:, pot])
     quick = jnp.sum(missing * jnp.asarray(facts.trip)[pot]) <= WAIT_LIMIT - 4
 
+    # By way of the plates: the earliest step in which the ego stands in front of each pot with a plate.
     arrival = jnp.min(jnp.where(view.plates[:, None], view.time[:, None] + to_pot, NEVER), axis=0)
     due = view.timers <= arrival + 2
     right = view.right & ~view.mate_takes & facts.serves
@@ -420,6 +425,7 @@ def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Ar
     follows = found & ~reachable & ~pushed & (still < 3)
     through = _way(view, 0, target)
 
+    # What the teammate carries tells where it may be going; see `LayoutFacts.hindrance`.
     carries = jnp.where(scene.partner_hand & COOKED > 0, 0, jnp.where(scene.partner_hand > 0, 1, 2))
     ends = jnp.asarray(tables.moves)[scene.me, : STAY + 1].astype(jnp.int32)
     stays = jnp.arange(STAY + 1) == STAY

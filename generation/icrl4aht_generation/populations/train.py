@@ -305,6 +305,7 @@ class _PopulationTraining:
             log.write(line, timing={"stage": stage, "update": number, "steps_per_second": speed})
             done = stage * updates + number + 1
             self.on_update(done, speed)
+            # Before the state is saved, so that a resumed run has all checkpoints up to its start.
             if number + 1 in moments:
                 self._save_checkpoints(stage, moments.index(number + 1), number + 1, state.params)
             if self.interval.due(done):
@@ -332,6 +333,7 @@ class _PopulationTraining:
         last = POLICY_CHECKPOINTS - 1
         former = stacked([load_policy(self.folder / f"m{m}" / f"c{last}")[1] for m in range(stage)])
         new = jax.tree.map(lambda leaf: leaf[:1], params)
+        # As either agent, since layouts are not symmetric.
         returns = cross_play_returns(layout, network, new, former, seed=number)[0]
         returns = returns + cross_play_returns(layout, network, former, new, seed=number)[:, 0]
         nearest = int(np.argmax(returns))
@@ -363,12 +365,14 @@ class _PopulationTraining:
             }
             own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
             save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
+            # The suite needs only the final best responses: they show what a teammate allows.
             if run.has_best_responses and checkpoint == POLICY_CHECKPOINTS - 1:
                 response = jax.tree.map(lambda leaf, k=k: leaf[k], partners)
                 path = self.folder / RESPONSES / f"m{k}"
                 save_policy(path, population.network, response, card | {"role": "best response", "agents": [0]})
 
     def _finish(self) -> None:
+        # The record comes last and names every file: a folder without it is unfinished.
         files = {
             str(path.relative_to(self.folder)): file_hash(path)
             for name in (POLICY_WEIGHTS, POLICY_CARD)

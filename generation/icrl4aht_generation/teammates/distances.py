@@ -113,6 +113,7 @@ def _play_tests(families: tuple[Policy, ...], episodes: int) -> Callable[..., Ar
     """Return a compiled function of tables, the oracle's and the test instances' parameters and a key, to records."""
     each = INSTANCES * 2 * episodes
     total = len(families) * each
+    # Random egos visit odd states, the oracle those of good play; teammates are compared on both.
     with_oracle = np.arange(total) // episodes % 2 == 1
 
     @jax.jit
@@ -188,7 +189,7 @@ def _actions(family: Policy, see: Callable[[Array], Any], params: Any, records: 
         memories = jax.vmap(family.init, in_axes=(None, 0))(params, keys)
         return jax.lax.scan(step, memories, records)[1]
 
-    return jax.lax.map(one, params)
+    return jax.lax.map(one, params)  # one policy at a time, which bounds the memory
 
 
 def distances_to_tests(tested: np.ndarray, actions: np.ndarray) -> np.ndarray:
