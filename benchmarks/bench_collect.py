@@ -30,9 +30,8 @@ from icrl4aht_generation.collection.job import run_task
 from icrl4aht_generation.collection.task import make_learner
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.learners.config import Widths
-from icrl4aht_generation.profiles import Profile, load_profile
+from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
-from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.registry import heuristic_teammate
 
 from benchmarks.harness import elapsed, folder_size, peak_memory, print_line

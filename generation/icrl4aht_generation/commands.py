@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 from rich.console import Console
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, PREFERENCE, TESTED_ON, TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
-from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
+from icrl4aht_data.commands.dataclass_options import TopicCommand, topic
 from icrl4aht_data.commands.options import (
     COUNT,
     LAYOUT,
@@ -32,10 +32,10 @@ from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, check_output
 from icrl4aht_data.utils.progress import progress_bars
-from icrl4aht_generation.jobs.command_line import queue_options, read_queue_options
+from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
 from icrl4aht_generation.layouts.sheet import save_sheet
-from icrl4aht_generation.learners.config import PPOConfig, Widths
+from icrl4aht_generation.learners.config import EncoderKind
 from icrl4aht_generation.teammates.instances import published_tasks
 
 if TYPE_CHECKING:
@@ -50,13 +50,6 @@ _profile_option = click.option(
     metavar="PROFILE",
     help="smoke, noise, search, bundle, teach, billion, small, mini, cpu or paper, or a TOML file.",
 )
-
-_ego_options = dataclass_options(
-    PPOConfig,
-    "ego",
-    default_text={field.name: "the profile's" for kind in (PPOConfig, Widths) for field in fields(kind)},
-)
-"""One option for every hyper-parameter of the egos; those given replace the profile's."""
 
 _threads_option = click.option(
     "--xla-threads",
@@ -97,8 +90,13 @@ _threads_option = click.option(
     show_default="the profile's tasks",
 )
 @click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
+@click.option(
+    "--encoder",
+    type=click.Choice(get_args(EncoderKind)),
+    help="Encoder of the egos' network.",
+    show_default="the profile's",
+)
 @topic("Machines", _threads_option, queue_options)
-@topic("Egos, instead of the profile's values", _ego_options)
 def generate(
     profile_name: str,
     out: Path,
@@ -107,17 +105,16 @@ def generate(
     seed: int,
     task_file: Path | None,
     bundle: bool,
+    encoder: EncoderKind | None,
     xla_threads: int | None,
     queue: dict[str, Any],
-    ego: dict[str, Any],
 ) -> None:
     """Rebuild a release, or resume a rebuild.
 
     Trains the learned teammates of a profile, then collects its tasks into OUT/artefacts: egos that learn (source ppo),
     scripts (sources noise and search), or several of these. Packs the release OUT/lite or OUT/full. Unfinished work
     resumes from its last save. The executor trains the teammates and collects the tasks. Tasks that fail are listed in
-    OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1. Hyper-parameters of the egos
-    replace those of the profile.
+    OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1.
     """
     from icrl4aht_generation.releases.build import build_releases
     from icrl4aht_generation.releases.package import bundle_release, recorded_sources
@@ -125,7 +122,9 @@ def generate(
     if bundle and "lite" not in kind:
         raise click.UsageError("--bundle needs --kind lite")
     options = read_queue_options(queue)
-    profile = _profile_with_threads(profile_name, xla_threads).with_ego(ego)
+    profile = _profile_with_threads(profile_name, xla_threads)
+    if encoder:
+        profile = profile.with_ego({"widths": {"encoder": encoder}})
     tasks = read_tasks_and_layouts(task_file) if task_file else None
     sources = recorded_sources(task_file.parent.parent) if task_file else {}
     built = build_releases(profile, out, kind, console, options, suite, seed, tasks, sources)
@@ -222,15 +221,14 @@ def layouts(
 @_profile_option
 @click.option("--devices", type=COUNT, default=8, help="Also estimate the hours on this many devices.")
 @json_option
-@_ego_options
-def plan(profile_name: str, devices: int, as_json: bool, ego: dict[str, Any]) -> None:
+def plan(profile_name: str, devices: int, as_json: bool) -> None:
     """Estimate the cost of a rebuild.
 
     Prints tasks, environment steps, disk space, and hours at the speed that is measured here. Writes nothing.
     """
     from icrl4aht_generation.planning.plan import estimate_cost
 
-    cost = estimate_cost(_profile_with_threads(profile_name, None).with_ego(ego), devices)
+    cost = estimate_cost(_profile_with_threads(profile_name, None), devices)
     if as_json:
         click.echo(json.dumps(asdict(cost), indent=2))
     else:
@@ -323,9 +321,9 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     and oracle earn with it. With --spread, chooses widely different teammates for the profiles' tasks.spread. Layouts
     that the table has are kept, so that a stopped command resumes.
     """
-    from icrl4aht_generation.teammates.draws import DRAWS_TABLE
-    from icrl4aht_generation.teammates.measuring import fill_draws_table, fill_spread_table
-    from icrl4aht_generation.teammates.spread import SPREAD_TABLE, read_spread_table, spread_rows
+    from icrl4aht_generation.teammates.draws import DRAWS_TABLE, read_table
+    from icrl4aht_generation.teammates.measuring import fill_table
+    from icrl4aht_generation.teammates.spread import SPREAD_TABLE, LayoutSpread, spread_rows
 
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or list(TESTED_ON)
     for name in names:
@@ -333,10 +331,9 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
             raise unknown("training layout", name, TESTED_ON)
     path = out or (SPREAD_TABLE if spread else DRAWS_TABLE)
     with progress_bars(unit="layouts") as show:
-        fill = fill_spread_table if spread else fill_draws_table
-        fill(path, names, lambda done, name: show("draws", done, len(names), name), overwrite)
+        fill_table(path, names, lambda done, name: show("draws", done, len(names), name), overwrite, spread=spread)
     if spread:
-        rows = spread_rows(read_spread_table(path))
+        rows = spread_rows(read_table(path, LayoutSpread))
         from rich.table import Table
 
         table = Table(*(name.replace("_", " ") for name in rows[0]))

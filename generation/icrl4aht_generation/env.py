@@ -255,6 +255,7 @@ _LAYOUT_DRAW = 2**31 - 1
 
 def _first_record(tables: Tables, draw: Key[Array, "*N 5"]) -> UInt8[Array, "*N S"]:
     (ego_room, mate_room), (ego_cells, mate_cells) = jnp.asarray(tables.rooms), jnp.asarray(tables.room_sizes)
+    # In a common room the teammate draws among the cells that the ego has left; numbers behind the ego's move up.
     one_room = jnp.all(ego_room == mate_room) & (ego_cells == mate_cells)
     ego_number = _below(draw[..., 0], ego_cells)
     mate_number = _below(draw[..., 1], mate_cells - one_room)
@@ -276,5 +277,6 @@ def _below(keys: Key[Array, "*N"], n: UInt32[Array, ""] | np.uint32) -> Int[Arra
     """Return an integer in 0..n-1 per key: the high half of 32 random bits times n (bias below n / 2**32)."""
     draw = partial(jax.random.bits, shape=(), dtype=jnp.uint32)
     bits = (jax.vmap(draw) if keys.ndim else draw)(keys)
+    # In two halves, because JAX has no integers of 64 bits by default.
     high = (bits >> 16) * n + ((bits & 0xFFFF) * n >> 16)
     return (high >> 16).astype(jnp.int32)

@@ -117,11 +117,6 @@ class Scene:
         """The partner's cell."""
         return self.state.positions[1 - self.slot].astype(jnp.int32)
 
-    @cached_property
-    def facing_action(self) -> Int[Array, ""]:
-        """The move action of the own facing."""
-        return jnp.asarray(_ACTION_OF_FACING)[self.state.facings[self.slot].astype(jnp.int32)]
-
     # Items in the agents' hands
 
     @cached_property
@@ -305,13 +300,6 @@ class Scene:
         """Return the nearest cell of the mask, ties in reading order. Undefined if none is reachable."""
         return jnp.argmin(jnp.where(mask, self._target_distance, UNREACHABLE))
 
-    def _turn_or(self, target: Int[Array, ""], when_facing: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-        """Return whether the target is adjacent, and the action in that case: turn to it, or `when_facing`."""
-        # A move into a wall only turns the agent, which is how it comes to face an adjacent target.
-        adjacent = self.manhattan(self.me, target) == 1
-        direction = jnp.argmax(self.neighbours(self.me) == target)  # up, down, left, right
-        return adjacent, jnp.where(self.facing_action == direction, when_facing, direction)
-
     def first(self, rules: Sequence[Rule]) -> Chosen:
         """Return the first rule that applies, with the nearest of its targets."""
         # All rules are evaluated and one is selected: under vmap a branch would run both sides anyway.
@@ -342,12 +330,12 @@ class Scene:
         step: Int[Array, ""] | None = None,
     ) -> Int[Array, ""]:
         """Walk to the target; next to it, turn, then interact or wait. `step` replaces the step of `approach`."""
-        adjacent, action = self._turn_or(target, jnp.where(waits, STAY, INTERACT))
+        adjacent = self.manhattan(self.me, target) == 1
+        direction = jnp.argmax(self.neighbours(self.me) == target)  # up, down, left, right
+        faced = jnp.asarray(_ACTION_OF_FACING)[self.state.facings[self.slot].astype(jnp.int32)]
+        # A move into a wall only turns the agent, which is how it comes to face an adjacent target.
+        action = jnp.where(faced == direction, jnp.where(waits, STAY, INTERACT), direction)
         return jnp.where(adjacent, action, self.approach(target)[0] if step is None else step)
-
-    def hover(self, target: Int[Array, ""]) -> Int[Array, ""]:
-        """Walk to the target; next to it, turn and wait."""
-        return self.go_to(target, waits=True)
 
     @cached_property
     def ways(self) -> Int[Array, " 4"]:

@@ -59,14 +59,26 @@ def option_hints(kind: type) -> dict[str, Any]:
     return {name: hint for name, hint in hints.items() if any(isinstance(part, Option) for part in get_args(hint))}
 
 
+@cache
+def _checked_hints(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hint for name, hint in hints.items() if any(map(_is_checked, annotation_parts(hint)))}
+
+
+def _is_checked(part: Any) -> bool:
+    return isinstance(part, (Option, Meta)) or get_origin(part) is Literal
+
+
 def check_options(options: Any) -> None:
-    """Check the values of a dataclass against its annotations; lists become tuples.
+    """Check the values of a dataclass against those annotations that are options, choices or bounds.
+
+    Lists become tuples.
 
     Raises:
         OptionError: if a value has another type or is out of bounds.
         UnknownNameError: if a value is not among the choices; lists them.
     """
-    for name, hint in option_hints(type(options)).items():
+    for name, hint in _checked_hints(type(options)).items():
         value = getattr(options, name)
         converted = convert_option(name, value, hint)
         if isinstance(value, list):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from icrl4aht_generation.jobs.command_line import queue_options, read_queue_options
+from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_data.benchmark.facts import SOURCES

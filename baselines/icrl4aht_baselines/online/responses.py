@@ -89,7 +89,7 @@ def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
             found.append((own[0],))
             continue
         plain = replace(own[0], recipes=None).layout
-        actions = act_along(plain, [build_teammate(plain, task.teammate) for task in own], common_states(plain).records)
+        actions = act_along(plain, [build_teammate(plain, task.teammate) for task in own], common_states(plain)[0])
         numbers = np.array(group_behaviours(actions))
         for number in dict.fromkeys(numbers.tolist()):
             found.append(tuple(own[k] for k in np.flatnonzero(numbers == number)))

@@ -16,7 +16,7 @@ from icrl4aht_generation.collection.scripted_rollout import scripted_episode_key
 from icrl4aht_generation.collection.task import learner_key
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.ego import stream_keys
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Work
 
 
 def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[str, Any]:

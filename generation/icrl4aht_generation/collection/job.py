@@ -11,8 +11,7 @@ from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, UpdateCallbac
 from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing, partial_folder, publish_artefact
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.resume import run_lock
-from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Profile, Work
 
 _MAKERS = {"ppo": learn_histories, "noise": play_histories, "search": play_histories}
 """Source -> function that makes an artefact in its partial folder, or resumes it there."""

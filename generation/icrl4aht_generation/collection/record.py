@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +47,11 @@ def array_shapes(layout: Layout, histories: int, episodes: int) -> dict[str, tup
         "rewards": (steps, "int8"),
         "episode_end_state": ((n, episodes, size), "uint8"),
     }
+
+
+def arrays_bytes(shapes: Mapping[str, tuple[tuple[int, ...], str]]) -> int:
+    """Return the uncompressed size of arrays, given their shapes and dtypes by name."""
+    return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
 
 
 def record_rollout(histories: HistoryArrays, update: int, rollout: Rollout) -> None:

@@ -11,7 +11,6 @@ The artefact has the arrays of `task_folder`, and
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
 from pathlib import Path
@@ -24,7 +23,7 @@ from icrl4aht_data.format.schema import curve_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_generation.collection.curate import stream_returns
-from icrl4aht_generation.collection.record import SCRIPT_ARRAYS, array_shapes
+from icrl4aht_generation.collection.record import SCRIPT_ARRAYS, array_shapes, arrays_bytes
 from icrl4aht_generation.collection.scripted_rollout import (
     Piece,
     ScriptedEpisodes,
@@ -34,9 +33,8 @@ from icrl4aht_generation.collection.scripted_rollout import (
 )
 from icrl4aht_generation.collection.task import TEAMMATE_NOISE, UpdateCallback, readable_disk_errors
 from icrl4aht_generation.collection.task_folder import ArrayWriter, check_room, finish_artefact
-from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
-from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.registry import build_teammate
 
 _LINE_BYTES = 100  # line of a history in metrics, and of a piece in timing
@@ -53,9 +51,7 @@ def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[
 
 def scripted_bytes(layout: Layout, config: NoiseConfig) -> int:
     """Return the size of an artefact."""
-    shapes = _array_shapes(layout, config).values()
-    arrays = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes)
-    return arrays + (config.histories + config.episodes) * _LINE_BYTES
+    return arrays_bytes(_array_shapes(layout, config)) + (config.histories + config.episodes) * _LINE_BYTES
 
 
 def play_histories(

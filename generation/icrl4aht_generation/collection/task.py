@@ -31,8 +31,7 @@ from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.ego import Learner, compiled_update
 from icrl4aht_generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, software_versions
 from icrl4aht_generation.policy import Noise
-from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.teammates.registry import build_teammate
 
 TEAMMATE_NOISE: Noise = "seeded"

@@ -14,7 +14,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -32,13 +31,18 @@ from icrl4aht_data.errors import DiskFullError, IndexFormatError
 from icrl4aht_data.format.cached_arrays import new_mapped_array
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
-from icrl4aht_generation.collection.record import SCRIPT_ARRAYS, HistoryArrays, array_shapes, record_rollout
+from icrl4aht_generation.collection.record import (
+    SCRIPT_ARRAYS,
+    HistoryArrays,
+    array_shapes,
+    arrays_bytes,
+    record_rollout,
+)
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, last_line, xla_threads
-from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Profile, Work
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
 LABELLER_RETURNS = "labeller_returns.json"
@@ -104,10 +108,7 @@ def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
         config: the ego's hyper-parameters.
         state: the learner's state.
     """
-    histories = sum(
-        math.prod(shape) * np.dtype(dtype).itemsize
-        for shape, dtype in array_shapes(task.layout, config.environments, config.episodes).values()
-    )
+    histories = arrays_bytes(array_shapes(task.layout, config.environments, config.episodes))
     saved, params = (sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) for tree in (state, state.params))
     return histories + 2 * saved + len(checkpoint_updates(config)) * params + config.updates * _LINE_BYTES
 

@@ -4,7 +4,7 @@ It is agent 0. It fills one pot at a time with the ingredients that the recipe s
 arrives when the soup is done, and delivers only soups of the current recipe; it puts other soups on a counter until
 its recipe comes up. With a second pot it cooks ahead. It learns what to expect of the teammate by watching: it leaves
 the work to one that cooks and delivers, and forestalls one that does only half of that. It hands nothing over, which no
-layout rewards, never presses a button, and stays in layouts where it cannot matter. It is deterministic.
+layout rewards. It never presses a button, and stays in layouts where it cannot matter. It is deterministic.
 
 Shapes: `P` pots, `Q` recipes that it may cook (the current one, then the layout's), `S` bytes of a state record. All
 times are in steps. Arrays of pots have entries for pots that the ego does not reach, which no mask selects.
@@ -13,10 +13,8 @@ times are in steps. Arrays of pots have entries for pots that the ego does not r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Key, UInt8
@@ -25,9 +23,9 @@ from icrl4aht_data.overcooked.actions import EGO, INTERACT, STAY, TEAMMATE
 from icrl4aht_data.overcooked.cells import COOKED, FACING_OF, NOWHERE, PLATE, POT, WALL
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import ingredient_count, record_size, unpack
-from icrl4aht_generation.experts.layout_facts import FAR, NEVER, LayoutFacts, stack_facts, study_layout
+from icrl4aht_generation.experts.layout_facts import FAR, NEVER, LayoutFacts, stack_facts
 from icrl4aht_generation.paths import Scene
-from icrl4aht_generation.policy import Policy, Situation
+from icrl4aht_generation.policy import Policy, Situation, on_layout
 
 WAIT_LIMIT = 10
 """Steps without a change in the pots after which the ego stops waiting for the teammate."""
@@ -63,11 +61,10 @@ def oracle(layout: Layout | Sequence[Layout]) -> Policy:
     """Return the scripted ego.
 
     Args:
-        layout: the layout whose state records it sees, a policy without parameters; or several, for a policy that sees
-            a `Situation` of one of them.
+        layout: the layout whose state records it sees; or several, for a policy that sees a `Situation` of one of them.
     """
     if isinstance(layout, Layout):
-        return Policy((), *_on_layout(layout), "state")
+        return on_layout(SITUATION_ORACLE._replace(params=oracle_params([layout])), layout)
     return SITUATION_ORACLE._replace(params=oracle_params(layout))
 
 
@@ -76,39 +73,22 @@ def oracle_params(layouts: Sequence[Layout]) -> Any:
     return stack_facts(layouts), np.zeros(record_size(*layouts), np.uint8)
 
 
-@lru_cache(maxsize=64)
-def _on_layout(layout: Layout) -> tuple[Any, Any]:
-    """Return `init` and `act` of the oracle on one layout."""
-    facts, blank = study_layout(layout), np.zeros(record_size(layout), np.uint8)
-
-    def act(params, memory: OracleMemory, record: UInt8[Array, " S"], key: Key[Array, ""]):
-        return _act(facts, memory, Scene(layout.tables, record, EGO))
-
-    return lambda params, key: _begin(blank), act
-
-
-def _begin_in_situation(params: Any, key: Key[Array, ""]) -> OracleMemory:
-    return _begin(params[1])
-
-
-def _act_in_situation(params: Any, memory: OracleMemory, view: Situation, key: Key[Array, ""]):
-    facts = jax.tree.map(lambda leaf: jnp.asarray(leaf)[view.layout], params[0])
-    return _act(facts, memory, Scene(view.tables, view.record, EGO))
-
-
-SITUATION_ORACLE = Policy((), _begin_in_situation, _act_in_situation, "situation")
-"""The ego for any layouts; its parameters are `oracle_params` of these."""
-
-
-def _begin(blank: Any) -> OracleMemory:
+def _begin(params: Any, key: Key[Array, ""]) -> OracleMemory:
     zero, no = jnp.int32(0), jnp.asarray(False)
-    return OracleMemory(jnp.asarray(blank), zero + STAY, zero, zero, zero, no, no, no)
+    return OracleMemory(jnp.asarray(params[1]), zero + STAY, zero, zero, zero, no, no, no)
 
 
-def _act(facts: LayoutFacts, memory: OracleMemory, scene: Scene) -> tuple[Int[Array, ""], OracleMemory]:
+def _act(params: Any, memory: OracleMemory, view: Situation, key: Key[Array, ""]):
+    # The facts of all layouts are stacked, so that one program plays any of them.
+    facts = LayoutFacts(*(jnp.asarray(leaf)[view.layout] for leaf in params[0]))
+    scene = Scene(view.tables, view.record, EGO)
     memory = _remember(scene, memory)
     action = jnp.where(facts.matters, _decide(_view_state(facts, scene, memory)), STAY).astype(jnp.int32)
     return action, memory._replace(action=action)
+
+
+SITUATION_ORACLE = Policy((), _begin, _act, "situation")
+"""The ego for any layouts; its parameters are `oracle_params` of these."""
 
 
 def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
@@ -265,6 +245,7 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
     state, mine = scene.state, jnp.asarray(facts.mine)
     # Obstacle 0 is none, also if the teammate stands where it is in nobody's way.
     obstacle = jnp.asarray(facts.obstacle)[scene.partner].astype(jnp.int32)
+    faced = jnp.asarray(scene.tables.ahead)[scene.me, state.facings[EGO].astype(jnp.int32)]
     items = scene.at(WALL, state.counters)
     lying = items == jnp.array([[4], [16], [64]], jnp.uint8)
     contents = state.pot_items & np.uint8(0xFF - COOKED)
@@ -272,13 +253,14 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
     recipes = jnp.concatenate([state.recipe[None], jnp.asarray(facts.recipes)])
     cooked = (full[:, None] & (contents[:, None] == recipes)).sum(axis=0)
     plated = ((items[:, None] == recipes | _DISH) & mine[:, None]).sum(axis=0) + (scene.hand == recipes | _DISH)
+    # A teammate that never held a plate takes no soups, whatever the layout allows.
     risky = memory.plates & facts.mate_serves
     return OracleView(
         facts,
         scene,
         memory,
         obstacle,
-        time=_times(facts, scene, obstacle),
+        time=jnp.where(scene.cell == faced, 0, _steps(jnp.asarray(facts.ways)[obstacle, scene.me])),
         items=items,
         sources=(jnp.asarray(facts.piles) | lying) & mine,
         contents=contents,
@@ -296,12 +278,6 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
 
 def _steps(stored: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
     return jnp.where(stored < NOWHERE, stored.astype(jnp.int32), FAR)
-
-
-def _times(facts: LayoutFacts, scene: Scene, obstacle: Int[Array, ""]) -> Int[Array, " cells"]:
-    """Return the steps until the ego faces each cell."""
-    faced = jnp.asarray(scene.tables.ahead)[scene.me, scene.state.facings[EGO].astype(jnp.int32)]
-    return jnp.where(scene.cell == faced, 0, _steps(jnp.asarray(facts.ways)[obstacle, scene.me]))
 
 
 def _way(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Array, ""]) -> Int[Array, ""]:
@@ -329,18 +305,15 @@ class Subgoal(NamedTuple):
     reason: str
 
 
-def _subgoals(view: OracleView) -> list[Subgoal]:
-    """Return the table of decisions; the first row that applies and has a cell that can be reached decides."""
-    return _with_dish(view) + _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
-
-
 def _decide(view: OracleView) -> Int[Array, ""]:
-    """Return the action towards the first possible subgoal; it does not depend on rows below that one."""
-    facts, rows = view.facts, _subgoals(view)
+    """Return the action towards the first subgoal that applies and has a cell that can be reached."""
+    facts = view.facts
+    rows = _with_dish(view) + _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
     possible = jnp.stack([row.when & (jnp.min(row.cost) < NEVER) for row in rows])
     target = jnp.argmin(jnp.stack([row.cost for row in rows])[jnp.argmax(possible)])
     action = _way(view, view.obstacle, target)
     at_pot = (jnp.asarray(view.scene.tables.pots) == target) & facts.pots
+    # An interaction too early would spoil the pot, or be lost.
     waits = jnp.any(at_pot & view.too_early) & (action == INTERACT)
     action = jnp.where(waits, STAY, action)
     alone = jnp.where(jnp.any(possible), action, STAY)
@@ -349,6 +322,7 @@ def _decide(view: OracleView) -> Int[Array, ""]:
 
 def _with_dish(view: OracleView) -> list[Subgoal]:
     scene, facts = view.scene, view.facts
+    # A dish on a counter is worth a trip only if the ego can carry it to a goal.
     wanted = (view.items == view.dish) & facts.mine & jnp.any(scene.goals & facts.mine)
     near = view.cost(scene.empty_counters & facts.shared, scene.manhattan(scene.cell, scene.partner) - view.time)
     comes = scene.holds_nothing & (scene.partner_hand == view.dish) & ~jnp.any(facts.pots)
@@ -365,6 +339,7 @@ def _with_plate(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plans) < NEVER
     right = view.right & ~view.mate_takes
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
+    # The ego waits in front of a soup that is not done, so waiting counts like walking.
     rest = jnp.maximum(view.timers - view.pot_times, 0)
     return [
         Subgoal(holds & (soon | ~building), view.at_pots(right, rest), "plate the soup of the current recipe"),
@@ -417,6 +392,7 @@ def _with_nothing(view: OracleView) -> list[Subgoal]:
     ingredients = fetch(missing > coming, to_pot[:, pot])
     quick = jnp.sum(missing * jnp.asarray(facts.trip)[pot]) <= WAIT_LIMIT - 4
 
+    # By way of the plates: the earliest step in which the ego stands in front of each pot with a plate.
     arrival = jnp.min(jnp.where(view.plates[:, None], view.time[:, None] + to_pot, NEVER), axis=0)
     due = view.timers <= arrival + 2
     right = view.right & ~view.mate_takes & facts.serves
@@ -449,6 +425,7 @@ def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Ar
     follows = found & ~reachable & ~pushed & (still < 3)
     through = _way(view, 0, target)
 
+    # What the teammate carries tells where it may be going; see `LayoutFacts.hindrance`.
     carries = jnp.where(scene.partner_hand & COOKED > 0, 0, jnp.where(scene.partner_hand > 0, 1, 2))
     ends = jnp.asarray(tables.moves)[scene.me, : STAY + 1].astype(jnp.int32)
     stays = jnp.arange(STAY + 1) == STAY

@@ -1,12 +1,15 @@
-"""Options of a queue, and environment variables that JAX reads when it is first used."""
+"""Options of a queue of jobs, and environment variables that JAX reads when it is first used."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from icrl4aht_data.utils.options import Count, Natural, Option, check_options
+import click
+
+from icrl4aht_data.commands.dataclass_options import dataclass_options
+from icrl4aht_data.utils.options import Count, Natural, Option, check_options, replace_options
 
 
 @dataclass(frozen=True)
@@ -38,3 +41,22 @@ def request_determinism() -> None:
 def allocate_gpu_memory_on_demand() -> None:
     """Make JAX allocate GPU memory as needed instead of most of it at once; call before JAX is first used."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+
+queue_options = dataclass_options(QueueOptions, "queue")
+"""Decorator with the options of a queue; the command gets them as `queue`, a dict."""
+
+
+def read_queue_options(queue: dict[str, Any]) -> QueueOptions:
+    """Return the options of a queue that a command was given, and set what JAX reads when it is first used.
+
+    Raises:
+        click.UsageError: for options that only another executor has.
+    """
+    options = replace_options(QueueOptions(), queue)
+    if options.executor == "local" and options.address:
+        raise click.UsageError("--address needs --executor ray")
+    request_determinism()
+    if options.executor == "ray":
+        allocate_gpu_memory_on_demand()
+    return options

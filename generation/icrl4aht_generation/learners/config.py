@@ -1,4 +1,4 @@
-"""Hyper-parameters of the learners; no JAX, so that command lines can list them."""
+"""Hyper-parameters of the learners; no JAX, so that command lines can import them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from msgspec import Meta
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, PAPER_EGO_STEPS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.rules import WRONG_DELIVERY_REWARD
-from icrl4aht_data.utils.options import Count, NotNegative, Option, Positive, Share, check_options
+from icrl4aht_data.utils.options import Count, NotNegative, Positive, Share, check_options
 
 EncoderKind = Literal["paper", "words", "mlp"]
 """How a network encodes observations.
@@ -28,17 +28,21 @@ _Layers = Annotated[tuple[_Width, ...], Meta(max_length=16)]
 class Widths:
     """Encoder and layer widths of the network; the defaults are the paper's (273,375 parameters at C = 40).
 
-    Encoder `mlp` has no convolutions: `pointwise` and `spatial` are empty then, whatever was given.
+    Attributes:
+        pointwise: widths of the 1 x 1 convolutions. Encoder `mlp` has none, whatever was given.
+        spatial: widths of the 3 x 3 convolutions. Encoder `mlp` has none, whatever was given.
+        dense: width of the encoder's dense layer.
+        gru: width of the recurrent state.
+        head: width of the actor's and the critic's hidden layers.
+        encoder: how observations are encoded.
     """
 
-    pointwise: Annotated[_Layers, Option("Width of a 1 x 1 convolution; repeat for more layers.")] = (128, 128, 8)
-    spatial: Annotated[_Layers, Option("Width of a 3 x 3 convolution; repeat for more layers.")] = (16, 32, 32)
-    dense: Annotated[_Width, Option("Width of the encoder's dense layer.")] = 128
-    gru: Annotated[_Width, Option("Width of the recurrent state.")] = 128
-    head: Annotated[_Width, Option("Width of the actor's and the critic's hidden layers.")] = 128
-    encoder: Annotated[EncoderKind, Option("Encoder of observations: paper, words (the same, faster) or mlp.")] = (
-        "paper"
-    )
+    pointwise: _Layers = (128, 128, 8)
+    spatial: _Layers = (16, 32, 32)
+    dense: _Width = 128
+    gru: _Width = 128
+    head: _Width = 128
+    encoder: EncoderKind = "paper"
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -51,31 +55,43 @@ class Widths:
 class PPOConfig:
     """Hyper-parameters of PPO; the defaults are the paper's for egos (App. C.2.2).
 
+    Attributes:
+        total_steps: environment steps, over all environments.
+        environments: environments that are stepped in parallel.
+        rollout: steps of each environment between two updates.
+        epochs: passes over the steps of an update.
+        minibatches: minibatches of an epoch; a divisor of the environments.
+        learning_rate: peak learning rate.
+        warmup: share of the updates in which the learning rate rises.
+        discount: discount of rewards, gamma.
+        gae_lambda: decay of the advantage estimate's trace, lambda.
+        clip: largest change of the probability ratio and of the value.
+        entropy: weight of the entropy bonus.
+        value: weight of the value loss.
+        max_grad_norm: largest global norm of a gradient.
+        shaping_horizon: environment steps until shaped rewards have the weight 0.
+        forgiveness: shaped reward of a wrong delivery: with 20, its penalty grows from 0 to 20 as the shaping ends.
+        widths: encoder and layer widths of the network.
+
     Raises:
         OptionError: for a value out of bounds, or if the environments cannot be divided into the minibatches.
     """
 
-    total_steps: Annotated[Count, Option("Environment steps, over all environments.")] = PAPER_EGO_STEPS
-    environments: Annotated[Count, Option("Environments that are stepped in parallel.")] = 1024
-    rollout: Annotated[Count, Option("Steps of each environment between two updates.")] = 256
-    epochs: Annotated[Count, Option("Passes over the steps of an update.")] = 4
-    minibatches: Annotated[Count, Option("Minibatches of an epoch; a divisor of the environments.")] = 64
-    learning_rate: Annotated[Positive, Option("Peak learning rate.")] = 2.5e-4
-    warmup: Annotated[Share, Option("Share of the updates in which the learning rate rises.")] = 0.1
-    discount: Annotated[Share, Option("Discount of rewards, gamma.")] = 0.99
-    gae_lambda: Annotated[Share, Option("Decay of the advantage estimate's trace, lambda.")] = 0.95
-    clip: Annotated[Positive, Option("Largest change of the probability ratio and of the value.")] = 0.2
-    entropy: Annotated[NotNegative, Option("Weight of the entropy bonus.")] = 0.01
-    value: Annotated[NotNegative, Option("Weight of the value loss.")] = 0.5
-    max_grad_norm: Annotated[Positive, Option("Largest global norm of a gradient.")] = 0.25
-    shaping_horizon: Annotated[Count, Option("Environment steps until shaped rewards have the weight 0.")] = (
-        PAPER_EGO_STEPS
-    )
-    forgiveness: Annotated[
-        float,
-        Meta(ge=0, le=-WRONG_DELIVERY_REWARD),
-        Option("Shaped reward of a wrong delivery: with 20, its penalty grows from 0 to 20 as the shaping ends."),
-    ] = 0.0
+    total_steps: Count = PAPER_EGO_STEPS
+    environments: Count = 1024
+    rollout: Count = 256
+    epochs: Count = 4
+    minibatches: Count = 64
+    learning_rate: Positive = 2.5e-4
+    warmup: Share = 0.1
+    discount: Share = 0.99
+    gae_lambda: Share = 0.95
+    clip: Positive = 0.2
+    entropy: NotNegative = 0.01
+    value: NotNegative = 0.5
+    max_grad_norm: Positive = 0.25
+    shaping_horizon: Count = PAPER_EGO_STEPS
+    forgiveness: Annotated[float, Meta(ge=0, le=-WRONG_DELIVERY_REWARD)] = 0.0
     widths: Widths = field(default_factory=Widths)
 
     def __post_init__(self) -> None:

@@ -141,10 +141,12 @@ def group_equal(seen: Seen) -> Seen:
     shape, ids = seen.ids.shape[:-1], jnp.asarray(seen.ids).reshape(-1, VISIBLE)
     number = jnp.arange(len(ids), dtype=jnp.int32)
     *hashes, order = jax.lax.sort((*_hash_words(ids), number), num_keys=2)
+    # Rows of one hash are neighbours now; a group starts where a hash changes.
     starts = jnp.append(True, (jnp.diff(hashes[0]) != 0) | (jnp.diff(hashes[1]) != 0))
     group_of_sorted = jnp.cumsum(starts, dtype=jnp.int32) - 1
     group = jnp.zeros_like(number).at[order].set(group_of_sorted, unique_indices=True)
     first = jnp.zeros_like(number).at[jnp.where(starts, group_of_sorted, len(ids))].set(order, mode="drop")
+    # Two observations with equal hashes are next to impossible, but would be mixed up silently.
     exact = (ids[first[group]] == ids).all()
     first, group = (jnp.where(exact, found, number) for found in (first, group))
     count = jnp.where(exact, group_of_sorted[-1] + 1, len(ids))
@@ -153,6 +155,7 @@ def group_equal(seen: Seen) -> Seen:
 
 def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
     """Return two uint32 (N,) that equal rows have in common: sums of the words times random odd numbers."""
+    # Odd factors are invertible modulo 2**32, so no word's bits are lost.
     factors = np.random.default_rng(0).integers(2**31, size=(2, VISIBLE), dtype=np.uint32) * 2 + 1
     one, two = ((ids.astype(jnp.uint32) * row).sum(axis=-1, dtype=jnp.uint32) for row in factors)
     return one, two
@@ -202,6 +205,7 @@ class WindowEncoder(nn.Module):
 
     def _encode_groups(self, seen: GroupedWords) -> Float[Array, "*B F"]:
         """Encode one observation of each group."""
+        # Flax modules cannot be called inside `cond` and `scan`; an unbound clone with explicit variables can.
         encoder, variables = self.clone(parent=None), self.variables
         size = -(-len(seen.first) // _BLOCKS)
         rows = jnp.pad(seen.first, (0, _BLOCKS * size - len(seen.first))).reshape(_BLOCKS, size)
@@ -259,7 +263,7 @@ class FlatDense(nn.Module):
         return x.astype(self.dtype) @ kernel + bias
 
     def _initial_kernel(self, key: Array, shape: tuple[int, int]) -> Array:
-        kernel = nn.initializers.orthogonal(2**0.5)(key, shape)
+        kernel = nn.initializers.orthogonal(2**0.5)(key, shape)  # before the zeros: scales are those of all rows
         if self.view is None:
             return kernel
         varies = np.zeros((shape[0], 1), bool)
@@ -277,6 +281,7 @@ class Conv3x3(nn.Module):
         channels = x.shape[-1] // VISIBLE
         kernel = self.param("kernel", nn.initializers.orthogonal(2**0.5), (3, 3, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+        # The tenth tap is zero: it stands between cells that are not adjacent.
         taps = jnp.concatenate([kernel.reshape(9, channels, self.features), jnp.zeros_like(kernel[:1, 0])])
         matrix = taps[_tap_of_cells()].transpose(0, 2, 1, 3).reshape(VISIBLE * channels, VISIBLE * self.features)
         return x @ matrix + jnp.tile(bias, VISIBLE)

@@ -63,6 +63,7 @@ def _scan_states(hidden, gates, reset, recurrent, bias):
     def step(hidden, inputs):
         gates, reset = inputs
         before = jnp.where(reset[:, None], 0.0, hidden)
+        # One product for all three gates is faster than three.
         own = before @ recurrent
         r, z = jnp.split(nn.sigmoid(gates[:, : 2 * width] + own[:, : 2 * width]), 2, axis=-1)
         memory = own[:, 2 * width :] + bias
@@ -85,7 +86,7 @@ def _states_gradient(saved, to_states):
     to_candidate = (1 - z) * (1 - candidate**2)
     to_z = (before - candidate) * z * (1 - z)
     to_r = memory * r * (1 - r)
-    continues = 1.0 - reset[..., None]
+    continues = 1.0 - reset[..., None]  # no gradient reaches the episode before a reset
 
     def step_back(to_hidden, inputs):
         to_state, to_candidate, to_z, to_r, r, z, continues = inputs
@@ -151,6 +152,7 @@ class ActorCritic(nn.Module):
         )(obs)
         hidden, states = GRU(widths.gru, name="gru")(hidden, features, reset)
         actor = nn.relu(orthogonal_dense(widths.head, 2.0, "actor_hidden")(states))
+        # Small weights: an untrained policy is nearly uniform.
         logits = orthogonal_dense(len(ACTIONS), 0.01, "actor")(actor)
         if not self.critic:
             return hidden, logits, jnp.zeros(logits.shape[:2])
@@ -173,5 +175,6 @@ class ActorCritic(nn.Module):
 
 
 def _orthogonal_gates(key: Array, shape: tuple[int, int], dtype=jnp.float32) -> Array:
+    # Each gate is orthogonal by itself, as in Flax, so that returns do not depend on the fused form.
     one = nn.initializers.orthogonal()
     return jnp.concatenate([one(k, (shape[0], shape[0]), dtype) for k in jax.random.split(key, 3)], axis=1)

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -195,7 +194,7 @@ class StateFile:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(self.path) as partial:
                 partial.write_bytes(_file_bytes(arrays, metadata))
-        if jax.process_count() > 1:
+        if jax.process_count() > 1:  # no process continues before the file is complete
             multihost_utils.sync_global_devices(f"saved {self.path.name}")
 
     def load(self, like: Any, part: str = "") -> Any:
@@ -221,6 +220,7 @@ class StateFile:
             raise self._unreadable(str(error)) from error
         expected = {name: _shape_text(_data_shape(leaf)) for name, leaf in wanted.items()}
         found = {name: _shape_text(array) for name, array in saved.items()}
+        # The first difference is enough: a state of another network differs in most arrays.
         for name in sorted(expected.keys() | found.keys()):
             if expected.get(name) != found.get(name):
                 raise self._unreadable(
@@ -320,17 +320,15 @@ class RunLog:
 
 def _cut(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
     lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
-    kept = list(takewhile(lambda line: _is_kept(line, keep), lines))
+    kept: list[bytes] = []
+    with suppress(ValueError):  # half a line, written by a run that was killed
+        for line in lines:
+            if not (line.endswith(b"\n") and keep(json.loads(line))):
+                break
+            kept.append(line)
     if kept != lines:
         with atomic_write(path) as partial:
             partial.write_bytes(b"".join(kept))
-
-
-def _is_kept(line: bytes, keep: Callable[[dict[str, Any]], bool]) -> bool:
-    try:
-        return line.endswith(b"\n") and keep(json.loads(line))
-    except ValueError:
-        return False
 
 
 def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -375,6 +373,7 @@ def _shape_text(array: Any) -> str:
 
 def _host_array(leaf: Any) -> np.ndarray:
     data = jax.random.key_data(leaf) if _is_key(leaf) else leaf
+    # Parts on devices of other processes have to be gathered, by all processes together.
     if isinstance(data, jax.Array) and not (data.is_fully_addressable or data.is_fully_replicated):
         data = multihost_utils.process_allgather(data, tiled=True)
     return np.require(np.asarray(data), requirements="C")

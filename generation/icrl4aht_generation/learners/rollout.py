@@ -199,10 +199,8 @@ def network_player(
         apply: Any = jax.vmap(forward) if agent_slots.ndim == 2 else forward
         results = apply(params, hidden, seen, partner)
         hidden, logits, value = (x.reshape(flat.size, *x.shape[agent_slots.ndim :]) for x in results)
-        if isinstance(greedy, bool):
-            action = jnp.argmax(logits, axis=-1) if greedy else jax.random.categorical(key, logits)
-        else:
-            action = jnp.where(greedy, jnp.argmax(logits, axis=-1), jax.random.categorical(key, logits))
+        # Where `greedy` is a constant, the compiler drops the other way.
+        action = jnp.where(greedy, jnp.argmax(logits, axis=-1), jax.random.categorical(key, logits))
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), action[:, None], axis=-1)[:, 0]
         return Choice(action, log_prob, value), hidden
 
@@ -210,32 +208,43 @@ def network_player(
 
 
 def policy_player(
-    env: Environment, policy: Policy, params: Any, agent: int, envs: int, *, own_params: bool = False
+    env: Environment,
+    policy: Policy,
+    params: Any,
+    agent: int,
+    envs: int,
+    *,
+    own_params: bool = False,
+    only: np.ndarray | None = None,
 ) -> Player:
-    """Return a player that does not learn, as one agent of every environment.
+    """Return a player that does not learn, as one agent of every environment, or of some.
 
     Its memory is a function of the episode's own key, so that an episode does not depend on the others of the batch.
 
     Args:
         env: the environment.
         policy: the policy's functions.
-        params: parameters for all environments; with `own_params`, stacked on a leading axis, one for each.
+        params: parameters for all its environments; with `own_params`, stacked on a leading axis, one for each.
         agent: 0 or 1.
         envs: N.
         own_params: whether every environment has parameters of its own.
+        only: int (M,), numbers of its environments; all by default.
     """
-    axis = 0 if own_params else None
+    axis, played = 0 if own_params else None, np.arange(envs) if only is None else only
+
+    def own_states(state: EnvState) -> EnvState:
+        return state if only is None else jax.tree.map(lambda leaf: leaf[only], state)
 
     def init(state: EnvState) -> Any:
-        keys = jax.vmap(jax.random.fold_in)(env.episode_key(state), jnp.full(envs, agent))
+        keys = jax.vmap(jax.random.fold_in)(env.episode_key(own_states(state)), jnp.full(len(played), agent))
         return jax.vmap(policy.init, in_axes=(axis, 0))(params, keys)
 
     def act(memory, state: EnvState, key):
-        keys = jax.random.split(key, envs)
-        action, memory = env.act(policy, params, memory, state, agent, keys, own=own_params)
-        return Choice(action, jnp.zeros(envs), jnp.zeros(envs)), memory
+        keys = jax.random.split(key, len(played))
+        action, memory = env.act(policy, params, memory, own_states(state), agent, keys, own=own_params)
+        return Choice(action, jnp.zeros(len(played)), jnp.zeros(len(played))), memory
 
-    return Player(agent * envs + np.arange(envs), init, act)
+    return Player(agent * envs + played, init, act)
 
 
 def random_player(agent: int, envs: int) -> Player:

@@ -6,7 +6,6 @@ the hyper-parameters. Stored figures suffice for the speed of the environment an
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
@@ -23,7 +22,7 @@ from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.system import usable_cores
-from icrl4aht_generation.collection.record import array_shapes
+from icrl4aht_generation.collection.record import array_shapes, arrays_bytes
 from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.encoder import CompactView
@@ -209,8 +208,7 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
 
 def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
     """Return the uncompressed size of the histories of egos."""
-    shapes = (array_shapes(layout, ego.environments, ego.episodes).values() for layout, ego in egos)
-    return sum(math.prod(shape) * np.dtype(dtype).itemsize for arrays in shapes for shape, dtype in arrays)
+    return sum(arrays_bytes(array_shapes(layout, ego.environments, ego.episodes)) for layout, ego in egos)
 
 
 def _seconds(function: Any, *arguments: Any) -> float:

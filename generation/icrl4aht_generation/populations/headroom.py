@@ -22,7 +22,7 @@ from icrl4aht_generation.learners.rollout import init_rollout, policy_player, ro
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.populations.train import RESPONSES
 from icrl4aht_generation.teammates.learned import build_learned
-from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_returns
+from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_egos, reference_returns
 
 _SEED = 12
 
@@ -47,8 +47,7 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceE
         for k, (task, ego, mate) in enumerate(zip(own, partners, mates, strict=True)):
             play = _compiled(layout, ego._replace(params=()), mate._replace(params=()))
             self_play = float(np.asarray(play(ego.params, mate.params)).mean())
-            stay, random, oracle = (float(returns[name][k]) for name in ("stay", "random", "oracle"))
-            found[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES, self_play)
+            found[task.task_id] = reference_egos(returns, k, self_play)
     return found
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -70,9 +70,6 @@ POPULATION = "population.json"
 """The record of a finished population."""
 
 _RESUME = "resume.safetensors"
-
-PopulationCallback = Callable[[int, int, dict[str, float]], None]
-"""Called after each update with its number, the number of all updates, and the metrics."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +168,7 @@ def is_population_finished(folder: Path, run: PopulationRun) -> bool:
 def train_population(
     run: PopulationRun,
     folder: Path,
-    on_update: PopulationCallback = lambda update, updates, metrics: None,
+    on_update: OnUpdate = lambda updates, speed: None,
     *,
     wait: bool = False,
     save_seconds: float = POPULATION_SAVE_SECONDS,
@@ -181,7 +178,7 @@ def train_population(
     Args:
         run: the population.
         folder: its folder.
-        on_update: called after each update.
+        on_update: called after each update with the number of updates and steps per second.
         wait: whether to wait for another process that trains it.
         save_seconds: least time between two saves.
 
@@ -242,11 +239,7 @@ class PopulationJob:
 
     def run(self, on_update: OnUpdate, wait: bool) -> None:
         """Train the population."""
-
-        def on_metrics(update: int, updates: int, metrics: dict[str, float]) -> None:
-            on_update(update, metrics["steps_per_second"])
-
-        train_population(self.population, self.suite / self.name, on_metrics, wait=wait)
+        train_population(self.population, self.suite / self.name, on_update, wait=wait)
 
     def finished_text(self) -> str:
         """Return the text on the finished population: steps, speed and the last return in self-play."""
@@ -262,7 +255,7 @@ class PopulationJob:
 class _PopulationTraining:
     """A run in its folder, whose lock is held."""
 
-    def __init__(self, run: PopulationRun, folder: Path, on_update: PopulationCallback, save_seconds: float) -> None:
+    def __init__(self, run: PopulationRun, folder: Path, on_update: OnUpdate, save_seconds: float) -> None:
         self.run, self.folder, self.on_update = run, folder, on_update
         self.saved = StateFile(folder / _RESUME, run.settings | software_versions())
         self.interval = SaveInterval(run.updates, seconds=save_seconds)
@@ -308,10 +301,11 @@ class _PopulationTraining:
             state, metrics = update(state)
             seconds = time.perf_counter() - started
             line = self._line(stage, number, metrics)
-            speed = {"steps_per_second": round((number + 1 - first) * population.steps_per_update / seconds, 1)}
-            log.write(line, timing={"stage": stage, "update": number} | speed)
+            speed = round((number + 1 - first) * population.steps_per_update / seconds, 1)
+            log.write(line, timing={"stage": stage, "update": number, "steps_per_second": speed})
             done = stage * updates + number + 1
-            self.on_update(done, self.run.updates, line | speed)
+            self.on_update(done, speed)
+            # Before the state is saved, so that a resumed run has all checkpoints up to its start.
             if number + 1 in moments:
                 self._save_checkpoints(stage, moments.index(number + 1), number + 1, state.params)
             if self.interval.due(done):
@@ -339,6 +333,7 @@ class _PopulationTraining:
         last = POLICY_CHECKPOINTS - 1
         former = stacked([load_policy(self.folder / f"m{m}" / f"c{last}")[1] for m in range(stage)])
         new = jax.tree.map(lambda leaf: leaf[:1], params)
+        # As either agent, since layouts are not symmetric.
         returns = cross_play_returns(layout, network, new, former, seed=number)[0]
         returns = returns + cross_play_returns(layout, network, former, new, seed=number)[:, 0]
         nearest = int(np.argmax(returns))
@@ -370,12 +365,14 @@ class _PopulationTraining:
             }
             own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
             save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
+            # The suite needs only the final best responses: they show what a teammate allows.
             if run.has_best_responses and checkpoint == POLICY_CHECKPOINTS - 1:
                 response = jax.tree.map(lambda leaf, k=k: leaf[k], partners)
                 path = self.folder / RESPONSES / f"m{k}"
                 save_policy(path, population.network, response, card | {"role": "best response", "agents": [0]})
 
     def _finish(self) -> None:
+        # The record comes last and names every file: a folder without it is unfinished.
         files = {
             str(path.relative_to(self.folder)): file_hash(path)
             for name in (POLICY_WEIGHTS, POLICY_CARD)

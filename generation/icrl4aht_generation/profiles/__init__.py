@@ -19,8 +19,7 @@ from icrl4aht_data.utils.options import Count, Natural, replace_options
 from icrl4aht_generation.layouts.families import generate_layouts
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
-from icrl4aht_generation.profiles.profile import Profile, SampledConfig, SpreadConfig, TeammateConfig
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles.profile import Profile, SampledConfig, SpreadConfig, TeammateConfig, Work
 
 FOLDER = Path(__file__).parent
 
@@ -149,6 +148,7 @@ def _named_errors(path: Path) -> Iterator[None]:
 
 def _profile(name: str, content: _ProfileFile) -> Profile:
     release, tasks = content.release, content.tasks
+    check_version(release.data_version)
     layouts, sources = _layouts("tasks.layouts", tasks.layouts), _distinct("tasks.sources", tasks.sources)
     generated: dict[str, int] = {}
     for one in tasks.generated:
@@ -166,6 +166,8 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
             f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: expected layouts of the "
             f"track preference with the source search, and none without it"
         )
+    if "ppo" not in sources:
+        release.keep = 0
     ego = dict(content.ego)
     of_layouts = _by_layout("ego.layouts", ego.pop("layouts", {}), layouts)
     egos = replace_options(PPOConfig(), ego, "ego.")
@@ -184,8 +186,6 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         scripted_layouts={"noise": noise_layouts, "search": search_layouts},
         generated=generated,
         preference=_distinct("tasks.preference", preference),
-        data_version=check_version(release.data_version),
-        keep=release.keep if "ppo" in sources else 0,
         layouts=layouts,
         sources=sources,
         learners=tasks.learners,
@@ -193,11 +193,8 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         sampled=_sampled(tasks.sampled, layouts, sources) if tasks.sampled else None,
         spread=SpreadConfig(**_counts("tasks.spread", tasks.spread, layouts, sources)) if tasks.spread else None,
         algorithms={each: tuple(algorithms[each]) for each in layouts if algorithms.get(each)},
-        policies=release.policies,
-        oracle_actions=release.oracle_actions,
-        least_improvement=release.least_improvement,
-        least_rise=release.least_rise,
         xla_threads=content.xla_threads,
+        **msgspec.structs.asdict(release),
     )
 
 

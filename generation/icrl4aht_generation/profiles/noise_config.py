@@ -1,4 +1,4 @@
-"""Sizes and schedules of histories of the source `noise`; no JAX, so that command lines can list them."""
+"""Sizes and schedules of histories of the source `noise`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.options import Count, Option, Share, check_options
+from icrl4aht_data.utils.options import Count, Share, check_options
 
 Range = tuple[Share, Share]
 """Smallest and largest value; every history draws its own, uniformly."""
@@ -23,20 +23,26 @@ class NoiseConfig:
     A history's chance is `start` until the share `begin` of its episodes, `end` from the share `finish` on, and between
     them, at the share x of that way, `end + (start - end) * (1 - x) ** power`.
 
+    Attributes:
+        histories: histories of each task.
+        episodes: episodes of each history, of 100 steps.
+        start: chance of a random action before the fall.
+        end: chance of a random action after the fall.
+        begin: share of the history at which the fall begins.
+        finish: share of the history at which the fall ends.
+        power: exponent of the fall; 1 is linear, larger ones fall sooner.
+
     Raises:
         OptionError: for a value out of bounds.
     """
 
-    histories: Annotated[Count, Option("Histories of each task.")] = 8
-    episodes: Annotated[int, Meta(ge=10), Option("Episodes of each history, of 100 steps.")] = 60
-    start: Annotated[Range, Option("Chance of a random action before the fall.")] = (1.0, 1.0)
-    end: Annotated[Range, Option("Chance of a random action after the fall.")] = (0.0, 0.0)
-    begin: Annotated[Range, Option("Share of the history at which the fall begins.")] = (0.0, 0.0)
-    finish: Annotated[Range, Option("Share of the history at which the fall ends.")] = (1.0, 1.0)
-    power: Annotated[tuple[_Power, _Power], Option("Exponent of the fall; 1 is linear, larger ones fall sooner.")] = (
-        1.0,
-        1.0,
-    )
+    histories: Count = 8
+    episodes: Annotated[int, Meta(ge=10)] = 60
+    start: Range = (1.0, 1.0)
+    end: Range = (0.0, 0.0)
+    begin: Range = (0.0, 0.0)
+    finish: Range = (1.0, 1.0)
+    power: tuple[_Power, _Power] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
         for name in ("start", "end", "begin", "finish", "power"):

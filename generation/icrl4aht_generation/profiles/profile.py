@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import takewhile
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
 from icrl4aht_data.benchmark.facts import (
     HEURISTIC_KINDS,
@@ -21,11 +21,10 @@ from icrl4aht_data.benchmark.tasks import Task, make_task, manifest_path, read_t
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import json_hash
-from icrl4aht_data.utils.options import Count, Natural, Option, check_options, replace_options
+from icrl4aht_data.utils.options import Count, Natural, check_options, replace_options
 from icrl4aht_generation.layouts.families import split_of
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
-from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.teammates.draws import drawn_teammates
 from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
 from icrl4aht_generation.teammates.spread import SPREAD_SEED, spread_teammates
@@ -45,6 +44,25 @@ _GENERATED_DRAWS = {"train": 4, "validation": 5, "test": 6}
 """Split of a generated layout -> the base seed of its teammates, of the wide ranges `Heuristic.diverse`."""
 
 
+class Work(NamedTuple):
+    """One artefact to make.
+
+    Attributes:
+        task: the task.
+        source: how its histories are made: "ppo", by an ego that learns, "noise" or "search", by a script.
+        learner: number of the learner among the independent ones of the task.
+    """
+
+    task: Task
+    source: str = "ppo"
+    learner: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the artefact's folder."""
+        return f"{self.task.task_id}-l{self.learner}" if self.learner else self.task.task_id
+
+
 @dataclass(frozen=True)
 class TeammateConfig:
     """The suite of learned teammates of each layout; the defaults are the paper's tables (App. B.1).
@@ -56,9 +74,9 @@ class TeammateConfig:
         ppo: hyper-parameters of every policy.
     """
 
-    members: Annotated[Count, Option("Policies of each population.")] = 10
-    train: Annotated[Count, Option("Teammates of each algorithm for training tasks.")] = PAPER_TEAMMATES
-    heldout: Annotated[Natural, Option("Held-out teammates of each algorithm.")] = 5
+    members: Count = 10
+    train: Count = PAPER_TEAMMATES
+    heldout: Natural = 5
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
             total_steps=PAPER_TEAMMATE_STEPS, environments=256, warmup=0.05, shaping_horizon=15_000_000

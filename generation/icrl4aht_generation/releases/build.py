@@ -24,8 +24,7 @@ from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.populations.build import build_suite
 from icrl4aht_generation.populations.headroom import learned_headroom
 from icrl4aht_generation.populations.select import THRESHOLD, make_tasks
-from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.releases.measures import teammate_facts
 from icrl4aht_generation.releases.package import check_release_folder, package_release
 

@@ -14,8 +14,7 @@ from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.schema import curve_ends
 from icrl4aht_data.writing.card import teammate_name
 from icrl4aht_generation.collection.curate import select_streams, stream_returns
-from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.releases.measures import TeammateFacts
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +22,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.format.provenance import ExpertLabels
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import read_text
@@ -35,32 +35,11 @@ from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.learners.rollout import init_rollout, network_player, policy_player, roll_out
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.releases.remembered import measured_once
+from icrl4aht_generation.releases.measures import measured_once
 from icrl4aht_generation.teammates.registry import build_teammate
 
 _LEAST_GAIN = 2.0  # minimum gain of an earlier checkpoint: a tenth of a delivery per episode
 _STANDARD_ERRORS = 2.0  # minimum gain in standard errors of the difference
-
-
-@dataclass(frozen=True)
-class Labeller:
-    """The checkpoint of an ego whose greedy actions label the histories of its task.
-
-    Attributes:
-        folder: the checkpoint.
-        sha256: SHA-256 of its weights.
-        step: environment steps that it was trained for.
-        return_greedy: its mean return with the task's teammate, acting greedily.
-        return_sampled: its mean return with sampled actions.
-        last_return_greedy: greedy return of the same learner's last checkpoint.
-    """
-
-    folder: Path
-    sha256: str
-    step: int
-    return_greedy: float
-    return_sampled: float
-    last_return_greedy: float
 
 
 _Returns = Annotated[list[float], msgspec.Meta(min_length=LABEL_EPISODES, max_length=LABEL_EPISODES)]
@@ -78,18 +57,22 @@ class CheckpointReturns(msgspec.Struct):
     sampled: list[_Returns]
 
 
-def choose_labeller(folders: Sequence[Path], task: Task, suite: Path) -> Labeller:
+def choose_labeller(folders: Sequence[Path], task: Task, suite: Path) -> tuple[Path, ExpertLabels]:
     """Choose the checkpoint that labels the histories of a task: the best of the learners' choices.
 
     Args:
         folders: the finished artefacts of the task's learners.
         task: the task.
         suite: folder of the learned teammates.
+
+    Returns:
+        The checkpoint's folder, and its record in the provenance of the task.
     """
-    return max((learner_labeller(folder, task, suite) for folder in folders), key=lambda found: found.return_greedy)
+    found = [learner_labeller(folder, task, suite) for folder in folders]
+    return max(found, key=lambda one: one[1].return_greedy or 0.0)
 
 
-def learner_labeller(folder: Path, task: Task, suite: Path) -> Labeller:
+def learner_labeller(folder: Path, task: Task, suite: Path) -> tuple[Path, ExpertLabels]:
     """Measure the checkpoints of a finished artefact, and choose the one that would label its histories.
 
     The measurements are kept in the artefact, in `LABELLER_RETURNS`, and are not repeated there.
@@ -113,13 +96,15 @@ def learner_labeller(folder: Path, task: Task, suite: Path) -> Labeller:
     greedy, sampled = (np.mean(returns, axis=1) for returns in (measured.greedy, measured.sampled))
     chosen = choose_checkpoint(np.array(measured.greedy))
     step = metadata["checkpoint_updates"][chosen] * metadata["ego"]["environments"] * metadata["ego"]["rollout"]
-    return Labeller(
-        folder=checkpoints[chosen],
-        sha256=hashes[chosen],
+    return checkpoints[chosen], ExpertLabels(
+        policy_sha256=hashes[chosen],
+        action="greedy, recurrent",
         step=step,
         return_greedy=float(greedy[chosen]),
         return_sampled=float(sampled[chosen]),
+        episodes=LABEL_EPISODES,
         last_return_greedy=float(greedy[-1]),
+        view="ego",  # the network of a learner takes observations
     )
 
 
@@ -132,7 +117,7 @@ def choose_checkpoint(returns: np.ndarray) -> int:
     Args:
         returns: (C, E), greedy returns of C checkpoints in the same E episodes.
     """
-    differences = returns - returns[-1]
+    differences = returns - returns[-1]  # paired: all checkpoints play the same episodes
     means = differences.mean(axis=1)
     errors = differences.std(axis=1, ddof=1) / np.sqrt(returns.shape[1])
     clearly = (means >= _LEAST_GAIN) & (means > _STANDARD_ERRORS * errors)

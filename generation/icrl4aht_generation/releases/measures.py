@@ -6,28 +6,34 @@ Others are measured once; the measurements are kept next to the artefacts, in hi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON
 from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import IndexFormatError
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
 from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.utils.files import atomic_write, read_text
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.populations.headroom import learned_headroom
-from icrl4aht_generation.releases.remembered import measured_once
 from icrl4aht_generation.teammates.distances import nearest_test
-from icrl4aht_generation.teammates.draws import Draw, hosted_families, read_draws
-from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_returns
+from icrl4aht_generation.teammates.draws import hosted_families, unhosted_reason
+from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_egos, reference_returns
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
 from icrl4aht_generation.teammates.spread import find_measured
 
 _DIGITS = 4
+
+T = TypeVar("T")
 
 
 class TeammateFacts(NamedTuple):
@@ -70,11 +76,9 @@ def teammate_facts(
     for key, members in groups.items():
         draw, made = find_measured(key[0], members[0].teammate), recorded.get(members[0].task_id)
         if draw is not None:
-            near = NearestTest(draw.nearest, draw.distance, draw.behaviour)
-            if draw.other_distance < draw.distance:
-                near = NearestTest(draw.other, draw.other_distance, draw.behaviour)
+            distance, _, name = min((draw.distance, 0, draw.nearest), (draw.other_distance, 1, draw.other))
             egos = ReferenceEgos(draw.stay, draw.random, draw.oracle, REFERENCE_EPISODES)
-            found[key] = TeammateFacts(egos, near)
+            found[key] = TeammateFacts(egos, NearestTest(name, distance, draw.behaviour))
         elif made is not None and made.references is not None:
             found[key] = TeammateFacts(made.references, made.nearest_test)
     unknown = [key for key in groups if key not in found]
@@ -92,6 +96,27 @@ def teammate_facts(
         measured = measured_once(kept, settings, list[TeammateFacts], measure)
         found |= dict(zip(keys, measured, strict=True))
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
+
+
+def measured_once(path: Path, settings: dict[str, Any], kind: type[T], measure: Callable[[], T]) -> T:
+    """Return the measurements cached in a JSON file; measure and write them if its settings differ.
+
+    Args:
+        path: the file.
+        settings: what the measurements depend on.
+        kind: their type, which msgspec checks.
+        measure: function that measures them.
+    """
+    try:
+        content = msgspec.json.decode(read_text(path))  # unlike `json`, it refuses NaN
+        if content["settings"] == json.loads(json.dumps(settings)):
+            return msgspec.convert(content["measured"], kind)
+    except (IndexFormatError, KeyError, TypeError, msgspec.MsgspecError):
+        pass  # damaged, or written by another version
+    measured = measure()
+    with atomic_write(path) as partial:
+        partial.write_bytes(msgspec.json.encode({"settings": settings, "measured": measured}))
+    return measured
 
 
 def release_provenance(root: Path) -> dict[str, Provenance]:
@@ -118,8 +143,7 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     returns |= learned_headroom(missing, suite) if missing else {}
     for task in heuristics:  # one at a time: tasks may want dishes of their own, and all of a family share a program
         egos = reference_returns(task.layout, [build_teammate(None, task.teammate)])
-        stay, random, oracle = (float(egos[ego][0]) for ego in ("stay", "random", "oracle"))
-        returns[task.task_id] = ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES)
+        returns[task.task_id] = reference_egos(egos, 0)
     nearest: dict[str, NearestTest] = {}
     layout = tasks[0].layout
     if learned and layout.name in TESTED_ON:  # other layouts have no test teammates
@@ -138,20 +162,6 @@ def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
     for layout in (layout for layout in layouts if layout in TESTED_ON):
         hosted = hosted_families(layout)
         for family in (family for family in HEURISTIC_FAMILIES if family not in hosted):
-            draws = read_draws(layout, family)
-            found.append(LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, _why_unhosted(draws)))
+            reason = unhosted_reason(layout, family)
+            found.append(LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, reason))
     return found
-
-
-def _why_unhosted(draws: Sequence[Draw]) -> str:
-    if not draws:
-        return "no draws were measured"
-    admissible = [draw for draw in draws if draw.admissible]
-    if not admissible:
-        farthest = max(draw.distance for draw in draws)
-        return f"all {len(draws)} draws act like a test teammate of the family (distance {farthest:.3f} at most)"
-    widest = max(draw.spread for draw in admissible)
-    return (
-        f"with none of the {len(admissible)} draws that act unlike those of the test does the ego matter (returns "
-        f"differ by {widest:.1f} at most)"
-    )

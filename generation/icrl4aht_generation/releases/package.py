@@ -5,21 +5,20 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, LABEL_EPISODES, SCRIPTED_SOURCES
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, SCRIPTED_SOURCES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.layouts_file import layout_title
-from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSuite
+from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos, TeammateSuite
 from icrl4aht_data.format.schema import Kind, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves, save_figure
@@ -33,8 +32,7 @@ from icrl4aht_generation.collection.task_folder import METADATA
 from icrl4aht_generation.learners.checkpoint import load_policy
 from icrl4aht_generation.populations.select import THRESHOLD
 from icrl4aht_generation.populations.train import population_threads
-from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.releases.histories import TaskHistories, select_histories
 from icrl4aht_generation.releases.labeller import choose_labeller
 from icrl4aht_generation.releases.measures import (
@@ -156,14 +154,20 @@ def _populations(task: Task, profile: Profile, suite: Path, recorded: Mapping[st
 def _new_task(
     found: TaskHistories, profile: Profile, suite: Path, facts: TeammateFacts, recorded: Mapping[str, Provenance]
 ) -> NewTask:
+    """Return a task with its labels: the actions of a learner's checkpoint, or a script's before random ones."""
     task, metadata = found.task, json.loads((found.folders[0] / METADATA).read_text(encoding="utf-8"))
+    files, labeller = checkpoint_files(suite, task), None
+    if found.source in SCRIPTED_SOURCES:
+        expert, own = _script_labels(found.source, facts.references), {"noise": metadata["noise"]}
+    else:
+        labeller, expert = choose_labeller(found.folders, task, suite)
+        files |= expert_files(labeller, str(expert.policy_sha256)) if profile.policies else {}
+        own = {"ego": metadata["ego"], "ego_hash": metadata["ego_hash"], "learners": len(found.folders)}
+        own["filter"] = filter_report(found.recorded, found.kept, found.least_improvement)
     made = Provenance(
         profile=profile.name,
         profile_hash=profile.hash,
-        code_version=metadata["code_version"],
-        jax_version=metadata["jax_version"],
-        platform=metadata["platform"],
-        xla_threads=metadata["xla_threads"],
+        **{name: metadata[name] for name in ("code_version", "jax_version", "platform", "xla_threads")},
         seed=task.seed,
         source=found.source,
         references=facts.references,
@@ -172,75 +176,40 @@ def _new_task(
         streams_recorded=len(found.recorded),
         streams_kept=len(found.kept),
         suite=_populations(task, profile, suite, recorded) if task.teammate_family == "rl" else None,
+        expert=expert,
+        **own,
     )
-    files = checkpoint_files(suite, task)
-    if found.source in SCRIPTED_SOURCES:
-        return _scripted_task(found, replace(made, noise=metadata["noise"]), profile, files)
-    learned = replace(made, ego=metadata["ego"], ego_hash=metadata["ego_hash"], learners=len(found.folders))
-    return _ppo_task(found, learned, profile, suite, files)
-
-
-def _has_oracle_actions(found: TaskHistories, made: Provenance, profile: Profile) -> bool:
-    """Return whether a release has the oracle's actions of a task: if they are worth learning, or are its labels."""
-    return profile.oracle_actions and made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
-
-
-def _scripted_task(found: TaskHistories, made: Provenance, profile: Profile, files: dict[str, Path]) -> NewTask:
-    """Return a task of a scripted source; its labels are the script's actions before random ones replace them."""
-    if found.source == "noise":
-        earned, action = made.references, "scripted oracle, which sees the full state"
-    else:
-        earned, action = None, "scripted searcher, which sees the full state but not which dish is wanted"
-    expert = ExpertLabels(
-        policy_sha256=None,
-        action=action,
-        return_greedy=None if earned is None else earned.oracle,
-        episodes=None if earned is None else earned.episodes,
-        view="state",  # scripts see a `Situation`
-    )
-    with_oracle = _has_oracle_actions(found, made, profile)
+    # The oracle's actions are stored where they are worth learning, or are the labels anyway.
+    with_oracle = profile.oracle_actions and made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
 
     def load() -> Iterator[NewHistory]:
-        for _, stream, arrays in _recorded_histories(found):
-            labels = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")[stream]
-            wanted = {"expert_actions": labels}
-            if with_oracle:
-                own = found.source == "noise"
-                wanted["oracle_actions"] = (
-                    labels if own else oracle_labels(found.task.layout, arrays["state"], arrays["actions"])
-                )
-            yield NewHistory(stream, arrays | wanted)
-
-    return NewTask(found.task, replace(made, expert=expert), len(found.kept), load, files)
-
-
-def _ppo_task(found: TaskHistories, made: Provenance, profile: Profile, suite: Path, files: dict[str, Path]) -> NewTask:
-    """Return a task of the source "ppo", whose labels are the greedy actions of a checkpoint."""
-    task = found.task
-    labeller = choose_labeller(found.folders, task, suite)
-    expert = ExpertLabels(
-        policy_sha256=labeller.sha256,
-        action="greedy, recurrent",
-        step=labeller.step,
-        return_greedy=labeller.return_greedy,
-        return_sampled=labeller.return_sampled,
-        episodes=LABEL_EPISODES,
-        last_return_greedy=labeller.last_return_greedy,
-        view="ego",  # the network of a learner takes observations
-    )
-    with_oracle = _has_oracle_actions(found, made, profile)
-    effect = filter_report(found.recorded, found.kept, found.least_improvement)
-
-    def load() -> Iterator[NewHistory]:
-        network, params, _ = load_policy(labeller.folder)
+        label = _labels(found, labeller)
         for learner, stream, arrays in _recorded_histories(found):
-            wanted = {"expert_actions": relabel(task.layout, network, params, arrays["state"])}
-            if with_oracle:
-                wanted["oracle_actions"] = oracle_labels(task.layout, arrays["state"], arrays["actions"])
-            yield NewHistory(stream, arrays | wanted, learner)
+            labels = {"expert_actions": label(stream, arrays["state"])}
+            if with_oracle and found.source == "noise":
+                labels["oracle_actions"] = labels["expert_actions"]
+            elif with_oracle:
+                labels["oracle_actions"] = oracle_labels(task.layout, arrays["state"], arrays["actions"])
+            yield NewHistory(stream, arrays | labels, learner)
 
-    policies = expert_files(labeller.folder, labeller.sha256) if profile.policies else {}
-    return NewTask(task, replace(made, expert=expert, filter=effect), len(found.kept), load, files | policies)
+    return NewTask(task, made, len(found.kept), load, files)
+
+
+def _script_labels(source: str, references: ReferenceEgos) -> ExpertLabels:
+    """Return the record of a script's labels; scripts see a `Situation`."""
+    if source == "noise":
+        action = "scripted oracle, which sees the full state"
+        return ExpertLabels(None, action, return_greedy=references.oracle, episodes=references.episodes, view="state")
+    return ExpertLabels(None, "scripted searcher, which sees the full state but not which dish is wanted", view="state")
+
+
+def _labels(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.ndarray], np.ndarray]:
+    """Return a function of a stream's number and states uint8 (T, S) that returns its expert actions, int8 (T,)."""
+    if labeller is None:
+        script = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")
+        return lambda stream, states: script[stream]
+    network, params, _ = load_policy(labeller)
+    return lambda stream, states: relabel(found.task.layout, network, params, states)
 
 
 def _recorded_histories(found: TaskHistories) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:

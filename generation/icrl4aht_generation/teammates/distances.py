@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +29,10 @@ from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
 from icrl4aht_generation.experts.padded import padded_layout
-from icrl4aht_generation.learners.rollout import init_rollout, roll_out
+from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Policy, Situation
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_thetas
-from icrl4aht_generation.teammates.references import REFERENCE_EGOS, player_in_some, stacked_families
+from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_families
 from icrl4aht_generation.teammates.registry import build_teammate
 
 _EPISODES = 10
@@ -41,23 +41,8 @@ _EPISODES = 10
 _SEED = 5
 
 
-class CommonStates(NamedTuple):
-    """States on which teammates of a layout are compared.
-
-    Attributes:
-        records: state records, uint8 (T, families x episodes, S).
-        instances: names of the test instances.
-        actions: actions of each test instance on the states of its own family, int8 (instances, T, episodes).
-    """
-
-    records: UInt8[Array, "T N S"]
-    instances: tuple[str, ...]
-    actions: np.ndarray
-
-    def family_states(self, actions: np.ndarray, instance: int) -> np.ndarray:
-        """Return the part (..., T, episodes) of actions (..., T, N) on the states of an instance's family."""
-        episodes, family = self.actions.shape[-1], instance // INSTANCES
-        return actions[..., family * episodes : (family + 1) * episodes]
+INSTANCE_NAMES = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
+"""Names of the test instances, such as "H3/t1", by family and number."""
 
 
 def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest]:
@@ -68,36 +53,28 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
     Raises:
         UnknownNameError: if the layout is not one of the benchmark.
     """
-    common = common_states(layout)
-    actions = act_along(layout, policies, common.records)
-    distances = distances_to_tests(common, actions)
+    records, tested = common_states(layout)
+    actions = act_along(layout, policies, records)
+    distances = distances_to_tests(tested, actions)
     nearest = distances.argmin(axis=1)
     return [
-        NearestTest(common.instances[k], float(distances[number, k]), behaviour)
+        NearestTest(INSTANCE_NAMES[k], float(distances[number, k]), behaviour)
         for number, (k, behaviour) in enumerate(zip(nearest, group_behaviours(actions), strict=True))
     ]
 
 
 @lru_cache(maxsize=2)
-def common_states(layout: Layout) -> CommonStates:
-    """Return the states of a layout on which teammates are compared.
+def common_states(layout: Layout) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
+    """Return the states of a layout on which teammates are compared, and what the test instances do there.
+
+    Returns:
+        State records, see `common_records`, and the actions of the test instances, int8 (instances, T, N).
 
     Raises:
         UnknownNameError: if the layout is not one of the benchmark.
     """
     records = common_records(layout)
-    return join_states(records, act_along(layout, instance_policies(layout), records))
-
-
-def join_states(records: Array, actions: np.ndarray) -> CommonStates:
-    """Return common states: records, and the actions of `instance_policies` on them, int8 (instances, T, N)."""
-    each = records.shape[1] // len(TESTED_FAMILIES)
-    # On all states, as every policy that is compared: an episode's number decides the draws of a policy's noise.
-    parts = [
-        actions[k * INSTANCES : (k + 1) * INSTANCES, :, k * each : (k + 1) * each] for k in range(len(TESTED_FAMILIES))
-    ]
-    names = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FAMILIES for t in range(INSTANCES))
-    return CommonStates(records, names, np.concatenate(parts))
+    return records, act_along(layout, instance_policies(layout), records)
 
 
 def instance_policies(layout: Layout) -> list[Policy]:
@@ -136,19 +113,20 @@ def _play_tests(families: tuple[Policy, ...], episodes: int) -> Callable[..., Ar
     """Return a compiled function of tables, the oracle's and the test instances' parameters and a key, to records."""
     each = INSTANCES * 2 * episodes
     total = len(families) * each
+    # Random egos visit odd states, the oracle those of good play; teammates are compared on both.
     with_oracle = np.arange(total) // episodes % 2 == 1
 
     @jax.jit
     def play(tables: Tables, expert: Any, params: Sequence[Any], key: Key[Array, ""]) -> Array:
         env = Environment(tables, KEPT_STEPS)
         players = [
-            player_in_some(env, REFERENCE_EGOS["random"], (), EGO, np.flatnonzero(~with_oracle), total),
-            player_in_some(env, SITUATION_ORACLE, expert, EGO, np.flatnonzero(with_oracle), total),
+            policy_player(env, REFERENCE_EGOS["random"], (), EGO, total, only=np.flatnonzero(~with_oracle)),
+            policy_player(env, SITUATION_ORACLE, expert, EGO, total, only=np.flatnonzero(with_oracle)),
         ]
         for k, (family, own) in enumerate(zip(families, params, strict=True)):
             envs = np.arange(k * each, (k + 1) * each)
             repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2 * episodes, axis=0), own)
-            players.append(player_in_some(env, family, repeated, TEAMMATE, envs, total, own_params=True))
+            players.append(policy_player(env, family, repeated, TEAMMATE, total, own_params=True, only=envs))
         carry = init_rollout(env, players, jax.random.split(key, total))
         return roll_out(env, players, carry, env.max_steps, key)[1].record
 
@@ -211,18 +189,23 @@ def _actions(family: Policy, see: Callable[[Array], Any], params: Any, records: 
         memories = jax.vmap(family.init, in_axes=(None, 0))(params, keys)
         return jax.lax.scan(step, memories, records)[1]
 
-    return jax.lax.map(one, params)
+    return jax.lax.map(one, params)  # one policy at a time, which bounds the memory
 
 
-def distances_to_tests(common: CommonStates, actions: np.ndarray) -> np.ndarray:
-    """Return distances of teammates to the test instances: int8 (teammates, T, N) -> float64 (teammates, instances)."""
-    return np.stack(
-        [
-            (common.family_states(actions, number) != tested).mean(axis=(1, 2))
-            for number, tested in enumerate(common.actions)
-        ],
-        axis=1,
-    )
+def distances_to_tests(tested: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Return distances of teammates to the test instances, each on the states of the instance's family.
+
+    Args:
+        tested: actions of the test instances on the common states, int8 (instances, T, N).
+        actions: actions of teammates on the same states, int8 (teammates, T, N).
+
+    Returns:
+        float64 (teammates, instances).
+    """
+    families = len(tested) // INSTANCES
+    tested, actions = (array.reshape(*array.shape[:2], families, -1) for array in (tested, actions))
+    pairs = [(own[:, number // INSTANCES], number // INSTANCES) for number, own in enumerate(tested)]
+    return np.stack([(actions[:, :, family] != own).mean(axis=(1, 2)) for own, family in pairs], axis=1)
 
 
 def hamming_distances(actions: np.ndarray) -> np.ndarray:

@@ -11,15 +11,17 @@ farther from every test instance.
 
 from __future__ import annotations
 
-import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Protocol, TypeVar
 
-from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS
+import msgspec
+from msgspec import Struct
+
+from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS, layout_order
 from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -54,7 +56,7 @@ def _least_distance(base_seed: int) -> float:
     return DIVERSE_DISTANCE if base_seed in _DIVERSE_SEEDS.values() else SAME_BEHAVIOUR
 
 
-class Draw(NamedTuple):
+class Draw(Struct, frozen=True, forbid_unknown_fields=True):
     """One draw on one layout: `sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)`.
 
     Attributes:
@@ -85,6 +87,11 @@ class Draw(NamedTuple):
     oracle: float
     other: str = ""
     other_distance: float = 1.0
+
+    @property
+    def order(self) -> tuple[Any, ...]:
+        """Sort key in the table: by layout, family, seed and theta_id."""
+        return layout_order(self.layout), list(HEURISTIC_FAMILIES).index(self.family), self.base_seed, self.theta_id
 
     @property
     def admissible(self) -> bool:
@@ -235,9 +242,9 @@ def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
     """
     draws = _usable(layout, family, base_seed)
     if not draws:
+        why, hosted = unhosted_reason(layout, family, base_seed), _hosted_text(layout, base_seed)
         raise OptionError(
-            f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: {_reason(layout, family, base_seed)}; "
-            f"name other families ({_hosted_text(layout, base_seed)})"
+            f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: {why}; name other families ({hosted})"
         )
     first = {(draw.like_another_family, draw.behaviour): draw for draw in reversed(draws)}
 
@@ -259,18 +266,20 @@ def _has_headroom(layout: str, base_seed: int) -> bool:
     return any(draw.admissible and draw.headroom for draw in draws)
 
 
-def _reason(layout: str, family: str, base_seed: int) -> str:
+def unhosted_reason(layout: str, family: str, base_seed: int = 0) -> str:
     """Return why no draw of a family may be used on a layout."""
     draws = read_draws(layout, family, base_seed)
     if not draws:
-        return "it has no draws there; `icrl4aht-data research draws` measures them"
-    if not any(draw.admissible for draw in draws):
-        distance, instance = max((draw.nearest_counted for draw in draws), key=lambda found: found[0])
-        return (
-            f"all {len(draws)} draws act like a test instance (Hamming distance at most {distance:.3f}, to {instance}; "
-            f"expected at least {_least_distance(base_seed)})"
-        )
-    return f"the ego matters with none of its admissible draws (returns differ by less than {LEAST_HEADROOM:g})"
+        return "no draws were measured"
+    admissible = [draw for draw in draws if draw.admissible]
+    if not admissible:
+        farthest = max(draw.nearest_counted[0] for draw in draws)
+        return f"all {len(draws)} draws act like a test teammate of the family (distance {farthest:.3f} at most)"
+    widest = max(draw.spread for draw in admissible)
+    return (
+        f"with none of the {len(admissible)} draws that act unlike those of the test does the ego matter (returns "
+        f"differ by {widest:.1f} at most)"
+    )
 
 
 def _hosted_text(layout: str, base_seed: int) -> str:
@@ -281,33 +290,40 @@ def _hosted_text(layout: str, base_seed: int) -> str:
 @lru_cache(maxsize=1)
 def _bundled_draws() -> dict[tuple[str, str, int], tuple[Draw, ...]]:
     draws: dict[tuple[str, str, int], list[Draw]] = defaultdict(list)
-    for draw in read_draws_table(DRAWS_TABLE):
+    for draw in read_table(DRAWS_TABLE, Draw):
         draws[draw.layout, draw.family, draw.base_seed].append(draw)
     return {key: tuple(found) for key, found in draws.items()}
 
 
-def read_draws_table(path: Path) -> list[Draw]:
-    """Return the draws of a table, in its order.
+class Row(Protocol):
+    """A line of a table of measured teammates."""
+
+    @property
+    def order(self) -> tuple[Any, ...]:
+        """Sort key in the table."""
+        ...
+
+
+AnyRow = TypeVar("AnyRow", bound=Row)
+
+
+def read_table(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
+    """Return the lines of a table of measured teammates, in its order.
 
     Raises:
         TaskFormatError: names the file and the line.
     """
-    draws = []
+    found = []
     for number, line in enumerate(read_lines(path), start=1):
         try:
-            draws.append(Draw(**parse_json(line)))
-        except (TypeError, Icrl4ahtError) as error:
-            raise TaskFormatError(f"{path}, line {number}: expected the fields {', '.join(Draw._fields)}") from error
-    return draws
+            found.append(msgspec.convert(parse_json(line), kind))
+        except (msgspec.ValidationError, Icrl4ahtError) as error:
+            raise TaskFormatError(f"{path}, line {number}: {error}") from error
+    return found
 
 
-def write_draws_table(path: Path, draws: Iterable[Draw]) -> None:
-    """Write draws, one JSON line each, by layout, family, seed and theta_id."""
-    layouts, families = list(TESTED_ON), list(HEURISTIC_FAMILIES)
-
-    def order(draw: Draw) -> tuple[int, ...]:
-        return layouts.index(draw.layout), families.index(draw.family), draw.base_seed, draw.theta_id
-
-    lines = (json.dumps(draw._asdict(), separators=(",", ":")) for draw in sorted(draws, key=order))
+def write_table(path: Path, rows: Iterable[Row]) -> None:
+    """Write one JSON line per row, sorted."""
+    lines = [msgspec.json.encode(row) + b"\n" for row in sorted(rows, key=lambda row: row.order)]
     with atomic_write(path) as partial:
-        partial.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+        partial.write_bytes(b"".join(lines))

@@ -33,7 +33,7 @@ _H1: ParameterSets = {
     "idle_prob": (0.1, 0.75, 0.6, 0.7, 0.15),
     "path_blocking": (0.0, 0.4, 0.85, 0.6, 0.3),
 }
-_H1_CRAMPED: ParameterSets = {
+_H1_CRAMPED: ParameterSets = _H1 | {
     "press_L_when_unknown": (0.9, 0.5, 0.3, 0.2, 0.7),
     "refresh_interval": (80, 120, 200, 250, 100),
     "cost_sensitivity": (0.1, 0.4, 0.7, 0.8, 0.2),
@@ -42,7 +42,6 @@ _H1_CRAMPED: ParameterSets = {
     "plate_timing": (0.0, 0.3, 0.25, 0.4, 0.9),
     "dist_weight": (0.15, 0.1, 0.2, 0.25, 0.2),
     "inertia": (0.85, 0.95, 0.7, 0.6, 0.75),
-    "task_specialization": (1.0, 0.0, 0.0, 0.0, 1.0),
     "stubbornness": (0.6, 0.9, 0.4, 0.5, 0.6),
     "wrong_ingredient_prob": (0.0, 0.2, 0.5, 0.8, 0.0),
     "idle_prob": (0.2, 0.3, 0.6, 0.15, 0.2),
@@ -57,13 +56,11 @@ _H2: ParameterSets = {
     "behavior_mode": (1, 2, 3, 4, 5),
     "action_probability": (1.0, 1.0, 0.15, 1.0, 1.0),
 }
-_H2_CRAMPED: ParameterSets = {
-    "split_mode": (0, 0, 1, 0, 0),
+_H2_CRAMPED: ParameterSets = _H2 | {
     "strictness": (0.7, 0.6, 0.5, 0.65, 0.9),
     "shared_margin": (0, 1, 1, 1, 0),
     "rescue_threshold": (0.95, 0.9, 0.9, 0.95, 0.95),
     "yield_bias": (0.01, 0.05, 0.1, 0.02, 0.01),
-    "behavior_mode": (1, 2, 3, 4, 5),
     "action_probability": (1.0, 1.0, 0.1, 1.0, 1.0),
 }
 _H3: ParameterSets = {

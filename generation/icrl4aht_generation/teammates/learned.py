@@ -40,7 +40,8 @@ def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Po
     network, params, _ = load_policy(folder)
     weights = {name: part for name, part in params["params"].items() if name not in _CRITIC}
     acting = ActorCritic(network.widths, critic=False)
-    expected = _shapes(acting, layout)
+    untrained = jax.eval_shape(lambda key: acting.untrained(key, layout.channels), jax.random.key(0))
+    expected = jax.tree.map(lambda leaf: leaf.shape, untrained["params"])
     found = jax.tree.map(lambda leaf: leaf.shape, weights)
     if found != expected:
         raise OptionError(
@@ -93,11 +94,6 @@ def _functions(widths: Widths, action: Action):
         return chosen.astype(jnp.int32), hidden
 
     return init, act
-
-
-def _shapes(network: ActorCritic, layout: Layout) -> dict[str, Any]:
-    tree = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
-    return jax.tree.map(lambda leaf: leaf.shape, tree["params"])
 
 
 def _differing(one: Any, other: Any) -> dict[str, Any]:

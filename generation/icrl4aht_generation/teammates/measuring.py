@@ -3,7 +3,6 @@ other, returns."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,9 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.distances import (
+    INSTANCE_NAMES,
     act_along,
     common_records,
     common_states,
@@ -20,15 +21,14 @@ from icrl4aht_generation.teammates.distances import (
     group_behaviours,
     hamming_distances,
     instance_entries,
-    join_states,
 )
 from icrl4aht_generation.teammates.draws import (
     DIVERSE_DISTANCE,
     DRAWS_PER_SEED,
     Draw,
     ranges_of,
-    read_draws_table,
-    write_draws_table,
+    read_table,
+    write_table,
 )
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES
 from icrl4aht_generation.teammates.references import reference_returns
@@ -44,13 +44,14 @@ from icrl4aht_generation.teammates.spread import (
     LayoutSpread,
     SpreadTeammate,
     choose_spread,
-    read_spread_table,
     spread_candidates,
-    write_spread_table,
 )
 
 _DIGITS = 4
 """Decimal places of stored numbers: all digits of shares of 10,000 states, and of means of 20 returns."""
+
+_EGOS = ("stay", "random", "oracle")
+"""Reference egos whose returns the tables have."""
 
 _SPREAD_EPISODES = 4
 """Episodes of the states on which spread teammates are compared, of each test instance with each of the two egos."""
@@ -64,25 +65,31 @@ DRAW_NUMBERS = [
 """Family, base_seed and theta_id of each draw of a layout."""
 
 
-def fill_draws_table(
-    path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool
+def fill_table(
+    path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool, *, spread: bool
 ) -> None:
-    """Measure the layouts whose draws a table does not have yet, and write it after each of them.
+    """Measure the layouts that a table does not have yet, and write it after each of them.
 
     Args:
         path: the table; a missing one is started.
         layouts: short names of training layouts.
         on_layout: called with the number of finished layouts and the name of the next one.
         overwrite: also measure the layouts that the table has.
+        spread: whether it is a table of `teammates.spread`, or one of `teammates.draws`.
     """
-    draws = read_draws_table(path) if path.is_file() else []
-    measured = Counter(draw.layout for draw in draws)
+    rows: list[Any] = read_table(path, LayoutSpread if spread else Draw) if path.is_file() else []
+    candidates = spread_candidates() if spread else []
     for number, name in enumerate(layouts):
         on_layout(number, name)
-        if overwrite or measured[name] != len(DRAW_NUMBERS):
-            draws = [draw for draw in draws if draw.layout != name]
-            draws += measure_draws(get_layout(name))
-            write_draws_table(path, draws)
+        own = [row for row in rows if row.layout == name]
+        complete = len(own) == len(DRAW_NUMBERS)
+        if spread:  # a list that was chosen from other candidates is chosen again
+            complete = [row.tried for row in own] == [len(candidates)]
+        if overwrite or not complete:
+            layout = get_layout(name)
+            measured = [measure_spread(layout, candidates)] if spread else measure_draws(layout)
+            rows = [row for row in rows if row.layout != name] + measured
+            write_table(path, rows)
     on_layout(len(layouts), "")
 
 
@@ -97,56 +104,49 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
         build_teammate(layout, sample_teammate(family, theta_id, ranges_of(seed), seed))
         for family, seed, theta_id in numbers
     ]
-    common = common_states(layout)
-    actions = act_along(layout, policies, common.records)
-    distances = distances_to_tests(common, actions)
+    records, tested = common_states(layout)
+    actions = act_along(layout, policies, records)
+    distances, returns = distances_to_tests(tested, actions), _returns(layout, policies)
     families = np.array([family for family, _, _ in numbers])
-    own = families[:, None] == np.repeat(TESTED_FAMILIES, INSTANCES)
-    nearest, others = (np.where(mask, distances, np.inf).argmin(axis=1) for mask in (own, ~own))
     behaviours = np.zeros(len(numbers), int)
     for family in np.unique(families):
         behaviours[families == family] = group_behaviours(actions[families == family])
-    returns = reference_returns(layout, policies)
     return [
         Draw(
             layout.name,
             family,
             base_seed,
             theta_id,
-            common.instances[nearest[k]],
-            round(float(distances[k, nearest[k]]), _DIGITS),
-            int(behaviours[k]),
-            *(round(float(returns[ego][k]), _DIGITS) for ego in ("stay", "random", "oracle")),
-            other=common.instances[others[k]],
-            other_distance=round(float(distances[k, others[k]]), _DIGITS),
+            behaviour=int(behaviours[k]),
+            **_measured(family, distances[k], returns[k]),
         )
         for k, (family, base_seed, theta_id) in enumerate(numbers)
     ]
 
 
-def fill_spread_table(
-    path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool
-) -> list[LayoutSpread]:
-    """Choose the spread teammates of layouts that a table does not have yet, and write it after each of them.
+def _returns(layout: Layout, policies: Sequence[Policy]) -> np.ndarray:
+    """Return mean returns of the reference egos with each teammate, float64 (teammates, egos)."""
+    returns = reference_returns(layout, policies)
+    return np.stack([returns[ego] for ego in _EGOS], axis=1)
+
+
+def _measured(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[str, Any]:
+    """Return the fields that lines of both tables have: the nearest test instances, and the egos' returns.
 
     Args:
-        path: the table; a missing one is started.
-        layouts: short names of training layouts.
-        on_layout: called with the number of finished layouts and the name of the next one.
-        overwrite: also measure the layouts that the table has.
-
-    Returns:
-        The table.
+        family: kind of the teammate.
+        to_tests: float64 (instances,), its distances to the test instances.
+        returns: float64 (egos,), returns of the reference egos with it.
     """
-    spreads = {spread.layout: spread for spread in read_spread_table(path)} if path.is_file() else {}
-    candidates = spread_candidates()
-    for number, name in enumerate(layouts):
-        on_layout(number, name)
-        if overwrite or name not in spreads or spreads[name].tried != len(candidates):
-            spreads[name] = measure_spread(get_layout(name), candidates)
-            write_spread_table(path, spreads.values())
-    on_layout(len(layouts), "")
-    return list(spreads.values())
+    own = np.repeat(TESTED_FAMILIES, INSTANCES) == family
+    near, other = (int(np.where(mask, to_tests, np.inf).argmin()) for mask in (own, ~own))
+    return {
+        "nearest": INSTANCE_NAMES[near],
+        "distance": round(float(to_tests[near]), _DIGITS),
+        "other": INSTANCE_NAMES[other],
+        "other_distance": round(float(to_tests[other]), _DIGITS),
+        **{ego: round(float(value), _DIGITS) for ego, value in zip(_EGOS, returns, strict=True)},
+    }
 
 
 def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: int = MOST_CHOSEN) -> LayoutSpread:
@@ -161,33 +161,22 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: i
     tested, records = instance_entries(layout), common_records(layout, _SPREAD_EPISODES)
     policies = [build_teammate(None, entry) for entry in with_equal_parameters([*tested, *candidates])]
     actions, policies = act_along(layout, policies, records), policies[len(tested) :]
-    common, actions = join_states(records, actions[: len(tested)]), actions[len(tested) :]
-    tests = distances_to_tests(common, actions)
-    egos = reference_returns(layout, policies)  # with all of them, so that layouts share one compilation
-    returns = np.stack([egos[ego] for ego in ("stay", "random", "oracle")], axis=1)
+    tests, actions = distances_to_tests(actions[: len(tested)], actions[len(tested) :]), actions[len(tested) :]
+    returns = _returns(layout, policies)  # with all of them, so that layouts share one compilation
     unlike = tests.min(axis=1) >= DIVERSE_DISTANCE
     headroom = unlike & (np.ptp(returns, axis=1) >= LEAST_HEADROOM)
     usable = np.flatnonzero(headroom if headroom.any() else unlike)
     distances = hamming_distances(actions[usable].reshape(len(usable), -1))
     order, separations = choose_spread(distances, DIVERSE_DISTANCE, most)
-    families = np.repeat(TESTED_FAMILIES, INSTANCES)
-    chosen = []
-    for number, (place, separation) in enumerate(zip(usable[order], separations, strict=True)):
-        entry, to_tests = candidates[place], tests[place]
-        own = families == entry["family"]
-        near, other = (int(np.where(mask, to_tests, np.inf).argmin()) for mask in (own, ~own))
-        chosen.append(
-            SpreadTeammate(
-                "validation" if number % VALIDATES == VALIDATES - 1 else "train",
-                entry["family"],
-                entry["theta_id"],
-                entry["theta"],
-                common.instances[near],
-                round(float(to_tests[near]), _DIGITS),
-                common.instances[other],
-                round(float(to_tests[other]), _DIGITS),
-                round(separation, _DIGITS),
-                *(round(float(value), _DIGITS) for value in returns[place]),
-            )
+    chosen = [
+        SpreadTeammate(
+            split="validation" if number % VALIDATES == VALIDATES - 1 else "train",
+            family=candidates[place]["family"],
+            theta_id=candidates[place]["theta_id"],
+            theta=candidates[place]["theta"],
+            separation=round(separation, _DIGITS),
+            **_measured(candidates[place]["family"], tests[place], returns[place]),
         )
+        for number, (place, separation) in enumerate(zip(usable[order], separations, strict=True))
+    ]
     return LayoutSpread(layout.name, len(candidates), int(unlike.sum()), int(headroom.sum()), tuple(chosen))

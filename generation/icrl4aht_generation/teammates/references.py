@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -13,13 +13,14 @@ import numpy as np
 from jaxtyping import Array
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
+from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
 from icrl4aht_generation.experts.padded import own_layout, padded_layout
-from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out
+from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Policy, stacked
 
 REFERENCE_EPISODES = 20
@@ -56,6 +57,18 @@ def reference_returns(
     return dict(zip(REFERENCE_EGOS, means, strict=True))
 
 
+def reference_egos(returns: Mapping[str, np.ndarray], number: int, self_play: float | None = None) -> ReferenceEgos:
+    """Return the record of one teammate's measurements.
+
+    Args:
+        returns: from `reference_returns`.
+        number: number of the teammate.
+        self_play: mean return of a learned teammate with the policy that it was trained with.
+    """
+    stay, random, oracle = (float(returns[ego][number]) for ego in REFERENCE_EGOS)
+    return ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES, self_play)
+
+
 @lru_cache(maxsize=16)
 def _program(families: tuple[tuple[tuple[int, ...], Policy], ...], teammates: int, episodes: int) -> Callable[..., Any]:
     """Return a compiled function of tables, parameters of the oracle and of each family, to the episodes' returns."""
@@ -68,21 +81,18 @@ def _program(families: tuple[tuple[tuple[int, ...], Policy], ...], teammates: in
     def play(tables: Tables, expert: Any, params: Sequence[Any]) -> Array:
         env = Environment(tables, KEPT_STEPS)
         players = [
-            player_in_some(env, ego, expert if name == "oracle" else (), EGO, k * each + np.arange(each), total)
+            policy_player(env, ego, expert if name == "oracle" else (), EGO, total, only=k * each + np.arange(each))
             for k, (name, ego) in enumerate(REFERENCE_EGOS.items())
         ]
         for (numbers, family), all_params in zip(families, params, strict=True):
             envs = np.flatnonzero(np.isin(mate_of, numbers))
-            own = _rows(all_params, np.searchsorted(numbers, mate_of[envs]))
-            players.append(player_in_some(env, family, own, TEAMMATE, envs, total, own_params=True))
+            rows = np.searchsorted(numbers, mate_of[envs])
+            own = jax.tree.map(lambda leaf, rows=rows: leaf[rows], all_params)
+            players.append(policy_player(env, family, own, TEAMMATE, total, own_params=True, only=envs))
         carry = init_rollout(env, players, jnp.tile(starts, total // episodes))
         return roll_out(env, players, carry, env.max_steps, starts[0])[1].reward.sum(axis=0)
 
     return play
-
-
-def _rows(tree: Any, rows: np.ndarray) -> Any:
-    return jax.tree.map(lambda leaf: leaf[rows], tree)
 
 
 def _act_randomly(params: Any, key: Any, view: Any, _: Any) -> tuple[Any, Any]:
@@ -100,29 +110,6 @@ REFERENCE_EGOS = {
     "oracle": SITUATION_ORACLE,
 }
 """The egos "stay", "random" (uniform over the six actions) and "oracle", whose draws are the episode's."""
-
-
-def player_in_some(
-    env: Environment, policy: Policy, params: Any, agent: int, envs: np.ndarray, total: int, *, own_params: bool = False
-) -> Player:
-    """Return a player that does not learn, as one agent of some of the environments.
-
-    Args:
-        env: the environment.
-        policy: the policy's functions.
-        params: parameters for all of `envs`; with `own_params`, stacked on a leading axis, one for each.
-        agent: 0 or 1.
-        envs: int (M,), numbers of the environments.
-        total: number of all environments.
-        own_params: whether each has parameters of its own.
-    """
-    player = policy_player(env, policy, params, agent, len(envs), own_params=own_params)
-
-    return Player(
-        agent * total + envs,
-        lambda state: player.init(_rows(state, envs)),
-        lambda memory, state, key: player.act(memory, _rows(state, envs), key),
-    )
 
 
 def stacked_families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:

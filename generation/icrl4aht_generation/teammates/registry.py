@@ -70,11 +70,12 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
     if split not in samplings:
         raise unknown("split", split, samplings)
     presets, ranges = samplings[split]
+    # A hash, because a draw must depend neither on the order of draws nor on Python's own salted hashes.
     digest = hashlib.sha256(f"{family}:{theta_id}:{split}:{base_seed}".encode()).hexdigest()
     key, own = jax.random.split(jax.random.key(int(digest[:8], 16)))
     theta = heuristic.defaults | heuristic.presets[presets[_randint(own, len(presets))]]
     for name, value in theta.items():
-        key, own = jax.random.split(key)
+        key, own = jax.random.split(key)  # for every parameter, drawn or not: ranges can change one by one
         if isinstance(ranges.get(name), list):
             theta[name] = ranges[name][_randint(own, len(ranges[name]))]
         elif name in ranges:

@@ -13,15 +13,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from msgspec import Struct
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, layout_order
-from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
+from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
-from icrl4aht_generation.teammates.draws import Draw, equal_parameters, find_draw
+from icrl4aht_generation.teammates.draws import Draw, equal_parameters, find_draw, read_table
 from icrl4aht_generation.teammates.heuristics.assembly_line import PLATER, RUNNER
 from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS
 from icrl4aht_generation.teammates.heuristics.territory import (
@@ -153,6 +151,11 @@ class LayoutSpread(Struct, forbid_unknown_fields=True):
     headroom: int
     chosen: tuple[SpreadTeammate, ...]
 
+    @property
+    def order(self) -> tuple[Any, ...]:
+        """Sort key in the table: the benchmark's order of layouts."""
+        return layout_order(self.layout)
+
     def of_split(self, split: str) -> list[SpreadTeammate]:
         """Return the teammates of split "train" or "validation", in order."""
         return [mate for mate in self.chosen if mate.split == split]
@@ -208,48 +211,16 @@ def find_measured(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
         if (mate.family, mate.theta_id) == (teammate["family"], teammate["theta_id"]):
             if not equal_parameters(mate.theta, teammate["theta"]):
                 return None
+            near, other = (mate.nearest, mate.distance), (mate.other, mate.other_distance)
             returns = (mate.stay, mate.random, mate.oracle)
-            return Draw(
-                layout,
-                mate.family,
-                SPREAD_SEED,
-                mate.theta_id,
-                mate.nearest,
-                mate.distance,
-                number,
-                *returns,
-                other=mate.other,
-                other_distance=mate.other_distance,
-            )
+            return Draw(layout, mate.family, SPREAD_SEED, mate.theta_id, *near, number, *returns, *other)
     return None
 
 
 @lru_cache(maxsize=1)
 def _bundled_spreads() -> dict[str, LayoutSpread]:
-    table = read_spread_table(SPREAD_TABLE) if SPREAD_TABLE.is_file() else []
+    table = read_table(SPREAD_TABLE, LayoutSpread) if SPREAD_TABLE.is_file() else []
     return {spread.layout: spread for spread in table}
-
-
-def read_spread_table(path: Path) -> list[LayoutSpread]:
-    """Return the layouts of a table, in its order.
-
-    Raises:
-        TaskFormatError: names the file and the line.
-    """
-    found = []
-    for number, line in enumerate(read_lines(path), start=1):
-        try:
-            found.append(msgspec.convert(parse_json(line), LayoutSpread))
-        except (msgspec.ValidationError, Icrl4ahtError) as error:
-            raise TaskFormatError(f"{path}, line {number}: {error}") from error
-    return found
-
-
-def write_spread_table(path: Path, spreads: Iterable[LayoutSpread]) -> None:
-    """Write one JSON line per layout, in the benchmark's order."""
-    lines = [msgspec.json.encode(spread) for spread in sorted(spreads, key=lambda one: layout_order(one.layout))]
-    with atomic_write(path) as partial:
-        partial.write_bytes(b"".join(line + b"\n" for line in lines))
 
 
 def spread_rows(spreads: Iterable[LayoutSpread]) -> list[dict[str, Any]]:

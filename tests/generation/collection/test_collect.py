@@ -22,8 +22,7 @@ from icrl4aht_generation.collection.task_folder import (
     partial_folder,
 )
 from icrl4aht_generation.learners.resume import StateFile
-from icrl4aht_generation.profiles import Profile, load_profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.releases.check import compare_rebuilds
 
 from tests.helpers.tiny import TINY, artefact, start

@@ -19,9 +19,8 @@ from icrl4aht_generation.collection.job import run_task
 from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules, play_scripted_histories
 from icrl4aht_generation.collection.task_folder import METADATA, TIMING, last_timing, partial_folder
-from icrl4aht_generation.profiles import Profile, load_profile
+from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
-from icrl4aht_generation.profiles.work import Work
 from icrl4aht_generation.releases.check import compare_rebuilds
 from icrl4aht_generation.teammates.distances import act_along
 from icrl4aht_generation.teammates.learned import build_learned

@@ -195,8 +195,8 @@ class Stopped(Exception):
 def stopped(tmp_path, monkeypatch) -> Path:
     """LBRDiv, stopped in the last update: the first episodes are over, and the multipliers have moved."""
 
-    def stop(update: int, updates: int, metrics: dict[str, float]) -> None:
-        if update == updates:
+    def stop(updates: int, speed: float) -> None:
+        if updates == run_of("lbrdiv").updates:
             raise Stopped
 
     with pytest.raises(Stopped):
@@ -215,7 +215,7 @@ def test_a_stopped_run_resumes_with_its_multipliers_and_only_under_its_settings(
     assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
 
     done: list[int] = []
-    train_population(run_of("lbrdiv"), stopped, lambda update, updates, metrics: done.append(update))
+    train_population(run_of("lbrdiv"), stopped, lambda updates, speed: done.append(updates))
     assert done == [6]
     uninterrupted = population(trained("lbrdiv"), "lbrdiv")
     assert weights(stopped) == weights(uninterrupted)

@@ -17,8 +17,7 @@ from icrl4aht_generation.collection.curate import relabel
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, is_task_finished
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
-from icrl4aht_generation.profiles import load_profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Work, load_profile
 from icrl4aht_generation.releases import labeller
 from icrl4aht_generation.releases.labeller import CheckpointReturns, choose_checkpoint, choose_labeller
 from icrl4aht_generation.releases.package import package_release

@@ -14,14 +14,14 @@ from click.testing import CliRunner
 from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.record import HistoryArrays
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA
-from icrl4aht_generation.profiles import Profile, load_profile
-from icrl4aht_generation.profiles.work import Work
+from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.releases import measures
 from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unhosted_families
 from icrl4aht_generation.releases.package import package_release, recorded_sources
 from icrl4aht_generation.teammates import draws as draws_table
 from icrl4aht_generation.teammates.draws import Draw, find_draw
 from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_teammate
+from msgspec.structs import replace as replace_fields
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LABEL_EPISODES
@@ -246,7 +246,8 @@ def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkey
 def test_the_nearest_test_teammate_of_a_draw_may_be_of_another_family(monkeypatch):
     def draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
         (first, *_) = fake_draws(layout, family, base_seed)
-        return [first._replace(other="H1/t0", other_distance=0.006), first._replace(theta_id=1, other_distance=0.4)]
+        near = replace_fields(first, other="H1/t0", other_distance=0.006)
+        return [near, replace_fields(first, theta_id=1, other_distance=0.4)]
 
     monkeypatch.setattr(measures, "read_draws", draws)
     monkeypatch.setattr(draws_table, "read_draws", draws)

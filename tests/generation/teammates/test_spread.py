@@ -9,13 +9,13 @@ import pytest
 from icrl4aht_generation.policy import Noise, Situation
 from icrl4aht_generation.teammates import spread as module
 from icrl4aht_generation.teammates.distances import (
+    INSTANCE_NAMES,
     act_along,
     common_records,
     distances_to_tests,
     instance_policies,
-    join_states,
 )
-from icrl4aht_generation.teammates.draws import DIVERSE_DISTANCE, find_draw
+from icrl4aht_generation.teammates.draws import DIVERSE_DISTANCE, find_draw, read_table, write_table
 from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS, Heuristic, Sampling
 from icrl4aht_generation.teammates.preference import WATCHER
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, check_theta, sample_teammate
@@ -28,11 +28,9 @@ from icrl4aht_generation.teammates.spread import (
     choose_spread,
     find_measured,
     read_spread,
-    read_spread_table,
     spread_candidates,
     spread_rows,
     spread_teammates,
-    write_spread_table,
 )
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TESTED_ON
@@ -114,11 +112,11 @@ def test_rows_count_behaviours(three):
 
 def test_tables_are_read_as_written(three, tmp_path):
     path = tmp_path / "spread.jsonl"
-    write_spread_table(path, [three])
-    assert read_spread_table(path) == [three]
+    write_table(path, [three])
+    assert read_table(path, LayoutSpread) == [three]
     path.write_text(path.read_text("utf-8").replace('"separation"', '"seperation"'), encoding="utf-8")
     with pytest.raises(TaskFormatError, match=r"spread\.jsonl, line 1: .*seperation"):
-        read_spread_table(path)
+        read_table(path, LayoutSpread)
 
 
 # The shipped list.
@@ -155,11 +153,11 @@ def test_two_of_the_list_are_measured_again():
     family = "assembly_line"
     chosen = [mate for mate in spread.chosen if mate.family == family and RANDOM_ACTIONS not in mate.theta][:2]
     records = common_records(layout, 4)
-    common = join_states(records, act_along(layout, instance_policies(layout), records))
+    tested = act_along(layout, instance_policies(layout), records)
     actions = act_along(layout, [build_teammate(None, mate.entry) for mate in chosen], records)
     assert (actions[0] != actions[1]).mean() >= DIVERSE_DISTANCE
-    for mate, distances in zip(chosen, distances_to_tests(common, actions), strict=True):
-        assert distances[common.instances.index(mate.nearest)] == pytest.approx(mate.distance, abs=1e-4)
+    for mate, distances in zip(chosen, distances_to_tests(tested, actions), strict=True):
+        assert distances[INSTANCE_NAMES.index(mate.nearest)] == pytest.approx(mate.distance, abs=1e-4)
         assert distances.min() == pytest.approx(min(mate.distance, mate.other_distance), abs=1e-4)
 
 

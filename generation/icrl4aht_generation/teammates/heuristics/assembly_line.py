@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +10,14 @@ from jaxtyping import Array, Bool, Int, Key
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
 from icrl4aht_data.overcooked.cells import POT
 from icrl4aht_generation.paths import Rule, Scene, is_ingredient
-from icrl4aht_generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
+from icrl4aht_generation.teammates.heuristics.heuristic import (
+    SHARES,
+    Heuristic,
+    Sampling,
+    draw,
+    extra_split,
+    parameters,
+)
 
 RUNNER, PLATER, FLEX = range(3)
 AT_POTS, CENTRAL, NEAR_PARTNER = range(3)
@@ -21,24 +26,9 @@ _MOVES_BY_DRAW = (RIGHT, DOWN, LEFT, UP)
 _OFF_BEATS = (np.arange(10) / 10).astype(np.float32)
 
 
-class AssemblyMemory(NamedTuple):
-    """Memory of an H3 teammate.
-
-    Attributes:
-        key: typed key, scalar, the next of its chain.
-    """
-
-    key: Key[Array, ""]
-
-
-def begin_assembly_line(key: Key[Array, ""]) -> AssemblyMemory:
-    """Return the memory at the start of an episode."""
-    return AssemblyMemory(key)
-
-
-def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int[Array, ""], AssemblyMemory]:
-    """Take one step of an H3 teammate."""
-    following, u = draw(memory.key)
+def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int[Array, ""], Key[Array, ""]]:
+    """Take one step of an H3 teammate, whose memory is the next key of its chain."""
+    following, u = draw(memory)
     idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
     makes_room = _makes_room(scene)
     # Deliveries and emergency moves are exempt from slips: no published teammate loses a dish by accident.
@@ -46,7 +36,7 @@ def act_assembly_line(params, memory: AssemblyMemory, scene: Scene) -> tuple[Int
     slips = ~(idles | makes_room | final)
     action, following = _slip(scene, params, action, slips, u[1], following)
     action = jnp.where(makes_room, _step_aside(scene), action)
-    return jnp.where(idles, STAY, action), AssemblyMemory(following)
+    return jnp.where(idles, STAY, action), following
 
 
 def _off_beat(scene: Scene) -> Array:
@@ -65,6 +55,8 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
     plates_now = soup | (cooking & (params["plate_urgency"] > 0.5))
     plater = (params["role_mode"] == PLATER) | ((params["role_mode"] == FLEX) & plates_now)
     runner = ~plater
+    # What the partner carries counts as if in the pot: otherwise both agents would fetch the last missing piece.
+    coming = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
     chosen = scene.first(
         [
             Rule(scene.holds_dish, scene.goals),
@@ -74,7 +66,7 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
             Rule((runner & plate) | (plater & ingredient), scene.empty_counters),
             Rule(runner & ingredient, scene.nonfull),
             Rule(runner & ingredient, _handoff_counters(scene, params)),
-            Rule(runner & empty, _needed_piles(scene)),
+            Rule(runner & empty, scene.piles_of(scene.needed - coming > 0)),
             Rule(plater & plate, scene.cooked),
             Rule(plater & empty, scene.plate_piles),
             # From here on nothing can be done: agents wait where their next task will be.
@@ -95,13 +87,6 @@ def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
         return step
     distance = scene.distances(scene.partner)[scene.destination(step)]
     return jnp.where((step < STAY) & (distance <= 1), STAY, step)
-
-
-def _needed_piles(scene: Scene) -> Bool[Array, " cells"]:
-    """Piles of the recipe's missing ingredients over all pots; one in the partner's hand counts as if in the pot."""
-    # Otherwise both agents would fetch the last missing piece.
-    carried = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
-    return scene.piles_of(scene.needed - carried > 0)
 
 
 def _handoff_counters(scene: Scene, params) -> Bool[Array, " cells"]:
@@ -161,35 +146,23 @@ def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], 
 
 ASSEMBLY_LINE = Heuristic(
     kind="assembly_line",
-    begin=begin_assembly_line,
+    begin=lambda key: key,
     act=act_assembly_line,
-    defaults={
-        "role_mode": FLEX,
-        "handoff_style": AT_POTS,
-        "plate_urgency": 0.5,
-        "prestage_bias": 0.3,  # a published parameter that no rule reads
-        "start_cook_bias": 0.7,  # a published parameter without effect, since pots start by themselves
-        "hesitation_prob": 0.0,
-        "wrong_action_prob": 0.0,
-        "task_abandon_prob": 0.0,
-        "stubbornness": 0.0,
-        "timing_mismatch": 0.0,
-    },
-    presets={
-        "default": {},
-        "ingredient_runner": {
-            "role_mode": RUNNER,
-            "plate_urgency": 0.0,
-            "prestage_bias": 0.5,
-            "start_cook_bias": 0.8,
+    **parameters(
+        ("default", "ingredient_runner", "plater_deliverer"),
+        {
+            "role_mode": (None, FLEX, RUNNER, PLATER),
+            "handoff_style": (None, AT_POTS, AT_POTS, AT_POTS),
+            "plate_urgency": ((0.0, 1.0), 0.5, 0.0, 0.8),
+            "prestage_bias": ((0.0, 1.0), 0.3, 0.5, 0.0),  # no effect: no rule reads it
+            "start_cook_bias": ((0.0, 1.0), 0.7, 0.8, 0.3),  # no effect: pots start by themselves
+            "hesitation_prob": (None, 0.0, 0.0, 0.0),
+            "wrong_action_prob": (None, 0.0, 0.0, 0.0),
+            "task_abandon_prob": (None, 0.0, 0.0, 0.0),
+            "stubbornness": (None, 0.0, 0.0, 0.0),
+            "timing_mismatch": (None, 0.0, 0.0, 0.0),
         },
-        "plater_deliverer": {
-            "role_mode": PLATER,
-            "plate_urgency": 0.8,
-            "prestage_bias": 0.0,
-            "start_cook_bias": 0.3,
-        },
-    },
+    ),
     train=Sampling(
         ("default", "ingredient_runner"),
         {"role_mode": [0, 2], "plate_urgency": (0.0, 0.6), "prestage_bias": (0.2, 0.6)},
@@ -211,11 +184,6 @@ ASSEMBLY_LINE = Heuristic(
             "timing_mismatch": SHARES,
         },
     ),
-    spans={
-        "plate_urgency": (0.0, 1.0),
-        "prestage_bias": (0.0, 1.0),
-        "start_cook_bias": (0.0, 1.0),
-    },
     choices={"role_mode": 3, "handoff_style": 3},
 )
 """The family H3; its parameters' order is that of the published manifests."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from numbers import Real
@@ -110,6 +110,22 @@ class Heuristic:
         if name in self.choices:
             return self.choices[name] - 1
         return math.inf if name in self.unbounded else 1.0
+
+
+def parameters(presets: Sequence[str], rows: Mapping[str, tuple[Any, ...]]) -> dict[str, Any]:
+    """Return the fields `defaults`, `presets` and `spans` of a family as keyword arguments of `Heuristic`.
+
+    Args:
+        presets: names of the presets; the values of the first one are the defaults.
+        rows: parameter -> its full range, or None for a parameter that sampling leaves alone, then its value in each
+            preset.
+    """
+    spans, *values = (dict(zip(rows, column, strict=True)) for column in zip(*rows.values(), strict=True))
+    return {
+        "defaults": values[0],
+        "presets": dict(zip(presets, values, strict=True)),
+        "spans": {name: span for name, span in spans.items() if span},
+    }
 
 
 @lru_cache(maxsize=64)

@@ -7,13 +7,20 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, Key, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.cells import GOAL, NOWHERE, PLATE, POT
 from icrl4aht_data.overcooked.state import POT_STEPS
 from icrl4aht_generation.paths import UNREACHABLE, Rule, Scene, is_dish, is_ingredient
-from icrl4aht_generation.teammates.heuristics.heuristic import SHARES, Heuristic, Sampling, draw, extra_split
+from icrl4aht_generation.teammates.heuristics.heuristic import (
+    SHARES,
+    Heuristic,
+    Sampling,
+    draw,
+    extra_split,
+    parameters,
+)
 
 _CRAMPED_CELLS = 8
 """Largest number of floor cells of a cramped layout."""
@@ -39,72 +46,38 @@ class ButtonMemory(NamedTuple):
     seen: Int[Array, ""]
 
 
-class Role(NamedTuple):
-    """Restrictions of a specialist: agent 0 only cooks, agent 1 only delivers.
-
-    Attributes:
-        cooks_only: bool scalar.
-        delivers_only: bool scalar.
-    """
-
-    cooks_only: Bool[Array, ""]
-    delivers_only: Bool[Array, ""]
-
-
-class Noises(NamedTuple):
-    """Decisions of the step's draws, bool scalars.
-
-    Attributes:
-        idles: whether it does nothing.
-        presses: whether it presses the button, if it considers that.
-        errs: whether it fetches the wrong ingredient.
-        blocks: whether it walks to a busy cell instead of fetching an ingredient.
-    """
-
-    idles: Bool[Array, ""]
-    presses: Bool[Array, ""]
-    errs: Bool[Array, ""]
-    blocks: Bool[Array, ""]
-
-
-def begin_recipe_aware_button(key: Key[Array, ""]) -> ButtonMemory:
-    """Return the memory at the start of an episode."""
-    return ButtonMemory(key, jnp.int32(0), jnp.uint8(0), jnp.int32(_NEVER))
-
-
 def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple[Int[Array, ""], ButtonMemory]:
     """Take one step of an H1 teammate."""
-    memory = _look(scene, memory)
-    following, u = draw(memory.key)
-    unsure = (memory.recipe == 0) | (memory.clock - memory.seen > params["refresh_interval"])
-    # The roll for the button splits the step's own key once more, which draws u1 again.
-    presses = u[0] < params["press_L_when_unknown"] * (1 - params["cost_sensitivity"])
-    noises = Noises(
-        u[0] < params["idle_prob"], presses, u[1] < params["wrong_ingredient_prob"], u[2] < params["path_blocking"]
-    )
-    action, considered, pressed, erred = _decide(scene, params, memory.recipe, unsure, noises)
-    # Published quirk: where the roll for the button fails, the key stays.
-    key = jnp.where(considered & ~pressed & ~noises.idles, memory.key, following)
-    key, _ = extra_split(key, erred & ~noises.idles)
-    action = jnp.where(noises.idles, STAY, action)
-    return action, memory._replace(key=key, clock=memory.clock + 1)
-
-
-def _look(scene: Scene, memory: ButtonMemory) -> ButtonMemory:
-    """Return the memory with the recipe, if the layout has an indicator (seen or not) or the button is lit."""
+    # It knows the recipe while the button is lit, and on layouts with an indicator, seen or not.
     shown = jnp.any(scene.indicators) | scene.button_lit
-    return memory._replace(
-        recipe=jnp.where(shown, scene.state.recipe, memory.recipe),
-        seen=jnp.where(shown, memory.clock, memory.seen),
-    )
+    recipe, seen = jnp.where(shown, scene.state.recipe, memory.recipe), jnp.where(shown, memory.clock, memory.seen)
+    following, u = draw(memory.key)
+    unsure = (recipe == 0) | (memory.clock - seen > params["refresh_interval"])
+    idles = u[0] < params["idle_prob"]
+    action, considered, pressed, erred = _decide(scene, params, recipe, unsure, u)
+    # Published quirk: where the roll for the button fails, the key stays.
+    key = jnp.where(considered & ~pressed & ~idles, memory.key, following)
+    key, _ = extra_split(key, erred & ~idles)
+    action = jnp.where(idles, STAY, action)
+    return action, ButtonMemory(key, memory.clock + 1, recipe, seen)
 
 
-def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], noises: Noises):
-    """The action of a step without idling; whether pressing the button was considered, whether it was chosen, and
-    whether the branch of the wrong ingredient was entered: all three decide how the key chain proceeds."""
+def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], u: Float[Array, " 4"]):
+    """Return the action of a step without idling, and three facts that decide how the key chain proceeds.
+
+    They are whether pressing the button was considered, whether it was chosen, and whether the branch of the wrong
+    ingredient was entered.
+
+    Args:
+        scene: the state.
+        params: the teammate's parameters.
+        recipe: item byte of the last recipe that it knew; 0 for none.
+        unsure: whether it does not know the recipe, or has not seen it for long.
+        u: the step's uniform draws.
+    """
     # One parameter makes specialists of both agents: agent 0 cooks and agent 1 delivers.
     specialist = params["task_specialization"] > 0.5
-    role = Role(specialist & (scene.slot == 0), specialist & (scene.slot == 1))
+    cooks_only, delivers_only = specialist & (scene.slot == 0), specialist & (scene.slot == 1)
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
     cramped = is_cramped(scene)
     # In a cramped layout agent 1 is the one that gives way.
@@ -112,19 +85,21 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
     ids = jnp.asarray(scene.tables.ingredients)
 
     considered = empty & unsure & ~scene.button_lit & jnp.any(scene.buttons)
-    fetches_plate = empty & _wants_plate(scene, params, role)
+    # The roll for the button splits the step's own key once more, which draws u1 again.
+    presses = u[0] < params["press_L_when_unknown"] * (1 - params["cost_sensitivity"])
+    fetches_plate = empty & ((_plate_is_urgent(scene, params) & ~cooks_only) | delivers_only)
     fetches_plate &= ~(second & _leaves_plates(scene))
-    cooks = empty & ~role.delivers_only
-    errs = cooks & noises.errs & (jnp.max(ids) > 0)
+    cooks = empty & ~delivers_only
+    errs = cooks & (u[1] < params["wrong_ingredient_prob"]) & (jnp.max(ids) > 0)
     right = _right_ingredient(scene, params, recipe, second)
     first_rules = [
-        Rule(dish & role.cooks_only, scene.empty_counters),
-        Rule(dish & ~role.cooks_only, scene.goals),
+        Rule(dish & cooks_only, scene.empty_counters),
+        Rule(dish & ~cooks_only, scene.goals),
         Rule(plate, scene.cooked),
         Rule(plate, scene.pots_in_use, waits=True),
         Rule(ingredient, _pots_for(scene, recipe)),
         Rule(ingredient, scene.empty_counters),
-        Rule(considered & noises.presses, scene.buttons),
+        Rule(considered & presses, scene.buttons),
         Rule(fetches_plate, scene.plate_piles),
     ]
     pot_rule, press_rule = 4, 6
@@ -143,7 +118,7 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
     action = jnp.where(second & chosen.found & (chosen.number == pot_rule) & gives_way, aside, action)
     action = jnp.where(chosen.found, action, scene.wander())
     blocks, step = _block(scene)
-    blocks &= cooks & noises.blocks & ~settled
+    blocks &= cooks & (u[2] < params["path_blocking"]) & ~settled
     action = jnp.where(blocks, step, action)
     clears = cramped & plate & is_dish(scene.partner_hand) & ~jnp.any(scene.reach(scene.cooked))
     action = jnp.where(clears, _clear_the_way(scene), action)
@@ -151,12 +126,12 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
     return action, considered, pressed, errs & ~settled & ~blocks
 
 
-def _wants_plate(scene: Scene, params, role: Role) -> Bool[Array, ""]:
+def _plate_is_urgent(scene: Scene, params) -> Bool[Array, ""]:
     timers = scene.state.pot_timers
     # A soup becomes urgent as it cooks, so that the plate arrives when it is done.
     cooking = jnp.max(jnp.where(timers > 0, jnp.asarray(_URGENCY)[timers.astype(jnp.int32)], 0))
     urgency = jnp.where(jnp.any(scene.cooked), 1, cooking)
-    return ((urgency >= 1 - params["plate_timing"]) & ~role.cooks_only) | role.delivers_only
+    return urgency >= 1 - params["plate_timing"]
 
 
 def _decoded(scene: Scene) -> Bool[Array, " 3"]:
@@ -264,56 +239,26 @@ def _clear_the_way(scene: Scene) -> Int[Array, ""]:
 
 RECIPE_AWARE_BUTTON = Heuristic(
     kind="recipe_aware_button",
-    begin=begin_recipe_aware_button,
+    begin=lambda key: ButtonMemory(key, jnp.int32(0), jnp.uint8(0), jnp.int32(_NEVER)),
     act=act_recipe_aware_button,
-    defaults={
-        "press_L_when_unknown": 0.8,
-        "refresh_interval": 100,
-        "cost_sensitivity": 0.2,
-        "strict_recipe": 0.9,
-        "exploration_bias": 0.1,  # a published parameter that no rule reads
-        "plate_timing": 0.5,
-        "dist_weight": 0.3,  # a published parameter without effect: the nearest target wins, unweighted
-        "inertia": 0.4,  # a published parameter without effect: no rule looks at the last intent
-        "task_specialization": 0.0,
-        "stubbornness": 0.0,  # a published parameter without effect: it is read and not used
-        "wrong_ingredient_prob": 0.0,
-        "idle_prob": 0.0,
-        "path_blocking": 0.0,
-    },
-    presets={
-        "default": {},
-        "high_L_priority": {
-            "press_L_when_unknown": 1.0,
-            "refresh_interval": 50,
-            "cost_sensitivity": 0.0,
-            "strict_recipe": 1.0,
-            "exploration_bias": 0.0,
-            "plate_timing": 0.6,
-            "dist_weight": 0.3,
-            "inertia": 0.3,
+    **parameters(
+        ("default", "high_L_priority", "lazy_learner", "strict_adherent"),
+        {
+            "press_L_when_unknown": ((0.0, 1.0), 0.8, 1.0, 0.3, 0.9),
+            "refresh_interval": (None, 100, 50, 200, 80),
+            "cost_sensitivity": ((0.0, 1.0), 0.2, 0.0, 0.8, 0.1),
+            "strict_recipe": ((0.0, 1.0), 0.9, 1.0, 0.3, 1.0),
+            "exploration_bias": ((0.0, 1.0), 0.1, 0.0, 0.5, 0.0),  # no effect: no rule reads it
+            "plate_timing": ((0.0, 1.0), 0.5, 0.6, 0.4, 0.7),
+            "dist_weight": ((0.1, 1.0), 0.3, 0.3, 0.4, 0.25),  # no effect: the nearest target wins, unweighted
+            "inertia": ((0.0, 1.0), 0.4, 0.3, 0.5, 0.5),  # no effect: no rule looks at the last intent
+            "task_specialization": (None, 0.0, 0.0, 0.0, 0.0),
+            "stubbornness": (None, 0.0, 0.0, 0.0, 0.0),  # no effect: it is read and not used
+            "wrong_ingredient_prob": (None, 0.0, 0.0, 0.0, 0.0),
+            "idle_prob": (None, 0.0, 0.0, 0.0, 0.0),
+            "path_blocking": (None, 0.0, 0.0, 0.0, 0.0),
         },
-        "lazy_learner": {
-            "press_L_when_unknown": 0.3,
-            "refresh_interval": 200,
-            "cost_sensitivity": 0.8,
-            "strict_recipe": 0.3,
-            "exploration_bias": 0.5,
-            "plate_timing": 0.4,
-            "dist_weight": 0.4,
-            "inertia": 0.5,
-        },
-        "strict_adherent": {
-            "press_L_when_unknown": 0.9,
-            "refresh_interval": 80,
-            "cost_sensitivity": 0.1,
-            "strict_recipe": 1.0,
-            "exploration_bias": 0.0,
-            "plate_timing": 0.7,
-            "dist_weight": 0.25,
-            "inertia": 0.5,
-        },
-    },
+    ),
     train=Sampling(
         ("default", "high_L_priority"),
         {
@@ -346,15 +291,6 @@ RECIPE_AWARE_BUTTON = Heuristic(
             "path_blocking": SHARES,
         },
     ),
-    spans={
-        "press_L_when_unknown": (0.0, 1.0),
-        "cost_sensitivity": (0.0, 1.0),
-        "strict_recipe": (0.0, 1.0),
-        "exploration_bias": (0.0, 1.0),
-        "plate_timing": (0.0, 1.0),
-        "dist_weight": (0.1, 1.0),
-        "inertia": (0.0, 1.0),
-    },
     unbounded=frozenset({"refresh_interval"}),
 )
 """The family H1; its parameters' order is that of the published manifests.

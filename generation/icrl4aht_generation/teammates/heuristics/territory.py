@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from icrl4aht_data.overcooked.actions import DOWN, LEFT, RIGHT, STAY, UP
 from icrl4aht_generation.paths import Rule, Scene
-from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw
+from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw, parameters
 
 VERTICAL, HORIZONTAL, STATIONS = range(3)
 NORMAL, BLOCKER, HOARDER, LAZY, COUNTER, INVADER = range(6)
@@ -32,23 +32,6 @@ class TerritoryMemory(NamedTuple):
     key: Key[Array, ""]
     cell: Int[Array, ""]
     stuck: Int[Array, ""]
-
-
-class Areas(NamedTuple):
-    """Parts of the layout, as masks over cells.
-
-    Attributes:
-        strict: bool (cells,), the teammate's own territory.
-        relaxed: bool (cells,), the territory and the margin that it shares.
-    """
-
-    strict: Bool[Array, " cells"]
-    relaxed: Bool[Array, " cells"]
-
-
-def begin_territory(key: Key[Array, ""]) -> TerritoryMemory:
-    """Return the memory at the start of an episode."""
-    return TerritoryMemory(key, jnp.int32(_NOWHERE), jnp.int32(0))
 
 
 def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Array, ""], TerritoryMemory]:
@@ -147,9 +130,8 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
     # Two finished soups are as urgent as it gets: then even strict teammates help outside their territory.
     urgency = jnp.minimum(jnp.sum(scene.cooked) / 2, 1)
     anywhere = (urgency > params["rescue_threshold"]) | (params["strictness"] <= 0.5)
-    mine = areas(scene, params)
     reach = scene.reach(jnp.stack([mask for mask, _ in masks]))
-    strict, relaxed = reach & mine.strict, reach & mine.relaxed
+    strict, relaxed = (reach & area for area in areas(scene, params))
     fallback = jnp.asarray(np.array([[fallback] for _, fallback in masks]))
     found = jnp.where(
         jnp.any(strict, axis=1, keepdims=True),
@@ -159,8 +141,11 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
     return jnp.where(anywhere, reach, found)
 
 
-def areas(scene: Scene, params) -> Areas:
-    """Return the areas of the scene's agent, or of its partner for the mode INVADER."""
+def areas(scene: Scene, params) -> tuple[Bool[Array, " cells"], Bool[Array, " cells"]]:
+    """Return the agent's own territory, and the territory with the margin that it shares.
+
+    For the mode INVADER both are its partner's.
+    """
     # The split by stations can leave one agent without floor, in small rooms; such layouts are split vertically.
     tables = scene.tables
     stations, floor = jnp.asarray(tables.stations), jnp.asarray(tables.walkable)
@@ -177,35 +162,25 @@ def areas(scene: Scene, params) -> Areas:
     near = beyond + margin
     # As published: cells exactly at the margin are shared, but not in the split by stations.
     shared = jnp.where(kind == STATIONS, near > 0, near >= 0)
-    return Areas(strict, jnp.where(second, shared, beyond < margin))
+    return strict, jnp.where(second, shared, beyond < margin)
 
 
 TERRITORY = Heuristic(
     kind="territory",
-    begin=begin_territory,
+    begin=lambda key: TerritoryMemory(key, jnp.int32(_NOWHERE), jnp.int32(0)),
     act=act_territory,
-    defaults={
-        "split_mode": VERTICAL,
-        "strictness": 0.7,
-        "shared_margin": 1,
-        "rescue_threshold": 0.6,
-        "yield_bias": 0.3,
-        "behavior_mode": NORMAL,
-        "action_probability": 1.0,
-    },
-    presets={
-        "default": {},
-        "strict_vertical": {"strictness": 1.0, "shared_margin": 0, "rescue_threshold": 0.8, "yield_bias": 0.5},
-        "strict_horizontal": {
-            "split_mode": HORIZONTAL,
-            "strictness": 1.0,
-            "shared_margin": 0,
-            "rescue_threshold": 0.8,
-            "yield_bias": 0.5,
+    **parameters(
+        ("default", "strict_vertical", "strict_horizontal", "object_stations", "flexible"),
+        {
+            "split_mode": (None, VERTICAL, VERTICAL, HORIZONTAL, STATIONS, VERTICAL),
+            "strictness": ((0.0, 1.0), 0.7, 1.0, 1.0, 0.8, 0.3),
+            "shared_margin": (None, 1, 0, 0, 1, 2),
+            "rescue_threshold": ((0.0, 1.0), 0.6, 0.8, 0.8, 0.5, 0.3),
+            "yield_bias": ((0.0, 1.0), 0.3, 0.5, 0.5, 0.4, 0.2),
+            "behavior_mode": (None, NORMAL, NORMAL, NORMAL, NORMAL, NORMAL),
+            "action_probability": (None, 1.0, 1.0, 1.0, 1.0, 1.0),
         },
-        "object_stations": {"split_mode": STATIONS, "strictness": 0.8, "rescue_threshold": 0.5, "yield_bias": 0.4},
-        "flexible": {"strictness": 0.3, "shared_margin": 2, "rescue_threshold": 0.3, "yield_bias": 0.2},
-    },
+    ),
     train=Sampling(
         ("default", "flexible"),
         {"split_mode": [0, 1], "strictness": (0.0, 0.3), "shared_margin": [1, 2, 3], "rescue_threshold": (0.2, 0.4)},
@@ -226,11 +201,6 @@ TERRITORY = Heuristic(
             "action_probability": [1.0, 1.0, 0.75, 0.5, 0.25],
         },
     ),
-    spans={
-        "strictness": (0.0, 1.0),
-        "rescue_threshold": (0.0, 1.0),
-        "yield_bias": (0.0, 1.0),
-    },
     choices={"split_mode": 3, "behavior_mode": 6},
     unbounded=frozenset({"shared_margin"}),
 )

@@ -12,7 +12,7 @@ from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.cells import POT
 from icrl4aht_data.overcooked.state import ingredient_count
 from icrl4aht_generation.paths import UNREACHABLE, Scene
-from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, next_key
+from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, next_key, parameters
 
 DELIVER, PICK_UP, PLATE_UP, ADD, FETCH, STAGE, START, PRESS = range(8)
 
@@ -29,11 +29,6 @@ class GreedyMemory(NamedTuple):
     key: Key[Array, ""]
     intent: Int[Array, ""]
     wait: Int[Array, ""]
-
-
-def begin_utility_greedy(key: Key[Array, ""]) -> GreedyMemory:
-    """Return the memory at the start of an episode."""
-    return GreedyMemory(key, jnp.int32(-1), jnp.int32(0))
 
 
 def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[Array, ""], GreedyMemory]:
@@ -77,7 +72,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
     scores = jnp.where(feasible, values - params["dist_weight"] * distance + bonus, -jnp.inf)
     best = jnp.argmax(scores)
     target = scene.closest(targets[best])
-    action = jnp.where(waits & (best == PICK_UP), scene.hover(target), scene.go_to(target))
+    action = scene.go_to(target, waits=waits & (best == PICK_UP))
     # `argmax` over nothing but -inf returns 0, so whether anything is feasible decides separately.
     some = jnp.any(feasible)
     return jnp.where(some, best, -1), jnp.where(some, action, scene.wander())
@@ -127,68 +122,29 @@ def _yield(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
     return jnp.where(yields, STAY, action), jnp.where(yields, 1 + (roll % 2).astype(jnp.int32), 0)
 
 
-_SPANS = {
-    "w_deliver": (5.0, 20.0),
-    "w_pickup_cooked": (3.0, 15.0),
-    "w_get_plate": (2.0, 10.0),
-    "w_add_ingredient": (3.0, 12.0),
-    "w_fetch_ingredient": (2.0, 10.0),
-    "w_stage_on_counter": (0.5, 5.0),
-    "w_start_cooking": (3.0, 15.0),
-    "w_press_L": (1.0, 8.0),
-    "dist_weight": (0.1, 1.5),
-    "inertia": (0.0, 1.0),
-    "counter_preference": (0.0, 1.0),
-}
+_TABLE = parameters(
+    ("default", "delivery_focused", "prep_focused", "high_inertia", "distance_sensitive"),
+    {
+        "w_deliver": ((5.0, 20.0), 10.0, 15.0, 8.0, 10.0, 10.0),
+        "w_pickup_cooked": ((3.0, 15.0), 8.0, 12.0, 5.0, 8.0, 8.0),
+        "w_get_plate": ((2.0, 10.0), 5.0, 8.0, 3.0, 5.0, 5.0),
+        "w_add_ingredient": ((3.0, 12.0), 6.0, 3.0, 10.0, 6.0, 6.0),
+        "w_fetch_ingredient": ((2.0, 10.0), 4.0, 2.0, 8.0, 4.0, 4.0),
+        "w_stage_on_counter": ((0.5, 5.0), 2.0, 1.0, 4.0, 2.0, 2.0),
+        "w_start_cooking": ((3.0, 15.0), 7.0, 4.0, 12.0, 7.0, 7.0),  # no effect: pots start by themselves
+        "w_press_L": ((1.0, 8.0), 3.0, 2.0, 5.0, 3.0, 3.0),
+        "dist_weight": ((0.1, 1.5), 0.5, 0.3, 0.4, 0.5, 1.0),
+        "inertia": ((0.0, 1.0), 0.3, 0.4, 0.5, 0.7, 0.3),
+        "counter_preference": ((0.0, 1.0), 0.5, 0.3, 0.7, 0.5, 0.5),
+    },
+)
+_SPANS = _TABLE["spans"]
 
 UTILITY_GREEDY = Heuristic(
     kind="utility_greedy",
-    begin=begin_utility_greedy,
+    begin=lambda key: GreedyMemory(key, jnp.int32(-1), jnp.int32(0)),
     act=act_utility_greedy,
-    defaults={
-        "w_deliver": 10.0,
-        "w_pickup_cooked": 8.0,
-        "w_get_plate": 5.0,
-        "w_add_ingredient": 6.0,
-        "w_fetch_ingredient": 4.0,
-        "w_stage_on_counter": 2.0,
-        "w_start_cooking": 7.0,  # a published parameter without effect, since pots start by themselves
-        "w_press_L": 3.0,
-        "dist_weight": 0.5,
-        "inertia": 0.3,
-        "counter_preference": 0.5,
-    },
-    presets={
-        "default": {},
-        "delivery_focused": {
-            "w_deliver": 15.0,
-            "w_pickup_cooked": 12.0,
-            "w_get_plate": 8.0,
-            "w_add_ingredient": 3.0,
-            "w_fetch_ingredient": 2.0,
-            "w_stage_on_counter": 1.0,
-            "w_start_cooking": 4.0,
-            "w_press_L": 2.0,
-            "dist_weight": 0.3,
-            "inertia": 0.4,
-            "counter_preference": 0.3,
-        },
-        "prep_focused": {
-            "w_deliver": 8.0,
-            "w_pickup_cooked": 5.0,
-            "w_get_plate": 3.0,
-            "w_add_ingredient": 10.0,
-            "w_fetch_ingredient": 8.0,
-            "w_stage_on_counter": 4.0,
-            "w_start_cooking": 12.0,
-            "w_press_L": 5.0,
-            "dist_weight": 0.4,
-            "inertia": 0.5,
-            "counter_preference": 0.7,
-        },
-        "high_inertia": {"dist_weight": 0.5, "inertia": 0.7, "counter_preference": 0.5},
-        "distance_sensitive": {"dist_weight": 1.0, "inertia": 0.3, "counter_preference": 0.5},
-    },
+    **_TABLE,
     train=Sampling(
         ("default", "delivery_focused"),
         {
@@ -213,7 +169,6 @@ UTILITY_GREEDY = Heuristic(
         ("default",),
         {name: span for name, span in _SPANS.items() if name != "w_start_cooking"} | {"w_press_L": (0.0, 8.0)},
     ),
-    spans=_SPANS,
     unbounded=frozenset(_SPANS.keys() - {"inertia", "counter_preference"}),
 )
 """The family H4; its parameters' order is that of the published manifests."""
