@@ -29,7 +29,7 @@ from icrl4aht_data.benchmark.facts import (
     check_membership,
     kind_family,
 )
-from icrl4aht_data.errors import Icrl4ahtError, TaskFormatError, check_choice, unknown
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout, with_recipes
 from icrl4aht_data.utils.files import is_inside, json_hash, parse_json, read_lines
 
@@ -265,11 +265,9 @@ def _check_recipes(task: Task) -> None:
     """
     if task.recipes is None:
         return
-    if not task.recipes or len({tuple(sorted(recipe)) for recipe in task.recipes}) < len(task.recipes):
-        raise TaskFormatError(f"recipes: expected different ones, at least one, found {list(task.recipes)}")
     try:
         _ = task.layout
-    except ValueError as error:
+    except OptionError as error:
         raise TaskFormatError(f"recipes: {error}") from error
 
 

@@ -39,7 +39,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.cached_arrays import cached_arrays
 from icrl4aht_data.format.info import ReleaseInfo, read_info
-from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_layouts_known, read_layouts
+from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_layouts_carried, read_layouts
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, check_name, encode
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -337,5 +337,6 @@ def read_index(root: Path) -> Index:
         raise IndexFormatError(
             f"{path}, line {without[0] + 1}: expected has_teammate_actions true in a {info.kind} release"
         )
-    check_layouts_known(entries.values("layout"), path)
+    check_layouts_carried(entries.values("layout"), layouts, path)
+    check_layouts_carried((get_layout(task.layout).name for task in info.left_out), layouts, root / INFO)
     return Index(root, info, entries, layouts)

@@ -11,16 +11,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from icrl4aht_data.benchmark.tasks import Task, read_tasks
-from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, UnknownNameError
+from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError
 from icrl4aht_data.format.schema import LAYOUTS_FILE, check_name
-from icrl4aht_data.overcooked.cells import GOAL, PLATES, POT
-from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, LayoutLine, add_layouts, get_layout
+from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, LayoutLine, add_layouts
+from icrl4aht_data.overcooked.solvable import check_solvable
 from icrl4aht_data.utils.files import read_lines, resolve_inside
 
 LAYOUTS_NAME = LAYOUTS_FILE.rpartition("/")[2]
@@ -33,8 +34,6 @@ OTHER = "other"
 """Family of layouts that were not generated."""
 
 _GENERATED = re.compile(r"(\w+)-(\d+)-(\d+)", re.ASCII).fullmatch
-
-_NEEDED = {GOAL: "a goal", POT: "a pot", PLATES: "a pile of plates"}
 
 
 @dataclass(frozen=True)
@@ -63,8 +62,8 @@ def read_layouts(root: Path) -> ReleaseLayouts:
     """Read the layouts of a release, and make them known to `get_layout`.
 
     Raises:
-        IndexFormatError: if a line is malformed, a name occurs twice or stands for another map elsewhere, or no dish
-            can be made on a map; with the file and the line number.
+        IndexFormatError: if a line is malformed, a name occurs twice or stands for another map elsewhere, a recipe
+            cannot be delivered, or family, seed or number do not belong to the name; with the file and line number.
     """
     return _read_layouts_file(resolve_inside(root, LAYOUTS_FILE))
 
@@ -75,20 +74,29 @@ def _read_layouts_file(path: Path) -> ReleaseLayouts:
     layouts = []
     for number, line in enumerate(read_lines(path) if path.is_file() else (), start=1):
         try:
-            fields = msgspec.json.decode(line, type=LayoutLine)
-            check_name(fields.name)
-            check_name(fields.family)
-            if fields.name in families:
-                raise IndexFormatError(f"layout {fields.name!r} is listed twice")
-            families[fields.name] = fields.family
-            layout = fields.layout()
-            missing = [what for kind, what in _NEEDED.items() if kind not in layout.kinds]
-            if missing:
-                raise IndexFormatError(f"layout {fields.name!r}: its map has not {' and '.join(missing)}")
+            layout, family = _parse(line)
+            if layout.name in families:
+                raise IndexFormatError(f"layout {layout.name!r} is listed twice")
+            families[layout.name] = family
             layouts += add_layouts([layout])
-        except (msgspec.MsgspecError, Icrl4ahtError, ValueError) as error:
+        except (msgspec.MsgspecError, Icrl4ahtError) as error:
             raise IndexFormatError(f"{path}, line {number}: {error}") from error
     return ReleaseLayouts(families, tuple(layouts))
+
+
+@lru_cache(maxsize=1024)  # the search for a way takes half a millisecond, and opening a release reads the file twice
+def _parse(line: str) -> tuple[Layout, str]:
+    """Return the layout of a line, and its family; see `read_layouts` for the errors."""
+    fields = msgspec.json.decode(line, type=LayoutLine)
+    check_name(fields.name)
+    check_name(fields.family)
+    layout = fields.layout()
+    if (expected := _origin(fields.name)) != (found := (fields.family, fields.seed, fields.number)):
+        raise IndexFormatError(
+            f"layout {fields.name!r}: expected family, seed and number {expected} for this name, found {found}"
+        )
+    check_solvable(layout)
+    return layout, fields.family
 
 
 def read_tasks_and_layouts(path: Path) -> list[Task]:
@@ -105,14 +113,20 @@ def read_tasks_and_layouts(path: Path) -> list[Task]:
 
 
 def write_layouts(root: Path, layouts: Iterable[Layout]) -> None:
-    """Write the layouts that the benchmark does not have to a release; no file if there are none."""
+    """Write the layouts that the benchmark does not have to a release, see `write_layouts_file`."""
     write_layouts_file(root / LAYOUTS_FILE, layouts)
 
 
 def write_layouts_file(path: Path, layouts: Iterable[Layout]) -> None:
-    """Write the layouts that the benchmark does not have to a file; no file if there are none."""
-    lines = [_line(layout) for layout in dict.fromkeys(layouts) if layout.name not in LAYOUTS]
-    if lines:
+    """Write the layouts that the benchmark does not have to a file; no file if there are none.
+
+    Raises:
+        OptionError: if a recipe of one of them cannot be delivered, which readers would refuse.
+    """
+    own = [layout for layout in dict.fromkeys(layouts) if layout.name not in LAYOUTS]
+    for layout in own:
+        check_solvable(layout)
+    if lines := list(map(_line, own)):
         path.write_bytes(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
 
 
@@ -123,21 +137,21 @@ def layout_title(name: str) -> str:
 
 
 def _line(layout: Layout) -> LayoutLine:
-    generated = _GENERATED(layout.name)
-    own = layout.name, layout.rows, layout.recipes, layout.indicates_delivery
-    if generated is None:
-        return LayoutLine(*own, OTHER)
-    return LayoutLine(*own, generated[1], int(generated[2]), int(generated[3]))
+    return LayoutLine(layout.name, layout.rows, layout.recipes, layout.indicates_delivery, *_origin(layout.name))
 
 
-def check_layouts_known(names: Iterable[str], path: Path) -> None:
-    """Check that the layouts of an index exist.
+def _origin(name: str) -> tuple[str, int | None, int | None]:
+    """Return family, seed and number of a layout, which the name of a generated one consists of."""
+    generated = _GENERATED(name)
+    return (OTHER, None, None) if generated is None else (generated[1], int(generated[2]), int(generated[3]))
+
+
+def check_layouts_carried(names: Iterable[str], layouts: ReleaseLayouts, path: Path) -> None:
+    """Check that the layouts of an index are published, or carried by the release.
 
     Raises:
-        IndexFormatError: if the package and the release's file of layouts both lack one.
+        IndexFormatError: if one is not; other releases opened in this process, and installed packages, do not count.
     """
     for name in names:
-        try:
-            get_layout(name)
-        except UnknownNameError as error:
-            raise IndexFormatError(f"{path}: layout {name!r} is neither published nor in {LAYOUTS_FILE}") from error
+        if name not in LAYOUTS and name not in layouts.families:
+            raise IndexFormatError(f"{path}: layout {name!r} is neither published nor in {LAYOUTS_FILE}; add it there")

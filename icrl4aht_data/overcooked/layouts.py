@@ -37,10 +37,20 @@ from icrl4aht_data.overcooked.cells import (
     WINDOW,
 )
 from icrl4aht_data.overcooked.tables import Tables, make_tables
+from icrl4aht_data.utils.options import convert_option
 from icrl4aht_data.utils.plugins import Plugins
 
 _LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
 _TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
+
+_FIELDS = {
+    "name": str,
+    "alias": str,
+    "rows": tuple[str, ...],
+    "recipes": tuple[tuple[int, int, int], ...],
+    "indicates_delivery": bool,
+}
+"""Field of `Layout` -> its type, for the checks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +61,13 @@ class Layout:
         name: the paper's short name, such as coord_simple.
         alias: the environment name in OvercookedV2 and in the published manifests, such as grounded_coord_simple.
         rows: the map, one string per row, all of one width; docs/format.md explains the letters.
-        recipes: triples of ingredient ids; the current recipe is drawn uniformly from them.
+        recipes: different triples of ingredient ids, at least one; the current recipe is drawn uniformly from them.
         indicates_delivery: whether the observation has the delivery channel.
 
     Raises:
-        ValueError: if the map is not rectangular, has an unknown letter, does not have exactly two agents, has piles of
-            more than three ingredient types (an item is one byte), or an agent can reach the map's edge.
+        OptionError: if the map is not rectangular, has an unknown letter, does not have exactly two agents, has piles
+            of more than three ingredient types (an item is one byte), or an agent can reach the map's edge; if the
+            recipes are not different triples of ingredients that have a pile.
     """
 
     name: str
@@ -66,25 +77,40 @@ class Layout:
     indicates_delivery: bool = False
 
     def __post_init__(self) -> None:
+        for name, kind in _FIELDS.items():
+            object.__setattr__(self, name, convert_option(f"layout {self.name}: {name}", getattr(self, name), kind))
+        if fault := self._map_fault() or self._recipe_fault():
+            raise OptionError(f"layout {self.name}: {fault}")
+
+    def _map_fault(self) -> str | None:
+        """Return what is wrong with the map, or None."""
         if len({len(row) for row in self.rows}) != 1:
-            raise ValueError(f"layout {self.name}: rows have widths {[len(row) for row in self.rows]}, expected one")
+            return f"rows have widths {[len(row) for row in self.rows]}, expected one"
         wrong = {c for row in self.rows for c in row if c not in _LETTERS and c not in digits}
         if wrong:
-            raise ValueError(f"layout {self.name}: unknown map letters {sorted(wrong)}")
+            return f"unknown map letters {sorted(wrong)}"
         if len(self.agent_cells) != 2:
-            raise ValueError(f"layout {self.name}: {len(self.agent_cells)} agents 'A' in the map, expected 2")
+            return f"{len(self.agent_cells)} agents 'A' in the map, expected 2"
         if self.cells > NOWHERE - 1 or len(self.ingredients) > 3:
-            raise ValueError(
-                f"layout {self.name}: {self.cells} cells and {len(self.ingredients)} piled ingredient types; "
+            return (
+                f"{self.cells} cells and {len(self.ingredients)} piled ingredient types; "
                 f"a state record holds at most {NOWHERE - 1} cells and 3 types"
             )
-        missing = {i for recipe in self.recipes for i in recipe} - set(self.ingredients)
-        if missing:
-            raise ValueError(f"layout {self.name}: recipes use ingredients {sorted(missing)} that have no pile")
         for cell in self.walkable.nonzero()[0]:
             x, y = cell % self.width, cell // self.width
             if x in (0, self.width - 1) or y in (0, self.height - 1):
-                raise ValueError(f"layout {self.name}: an agent can reach the map's edge at ({x}, {y})")
+                return f"an agent can reach the map's edge at ({x}, {y})"
+        return None
+
+    def _recipe_fault(self) -> str | None:
+        """Return what is wrong with the recipes, or None."""
+        missing = {i for recipe in self.recipes for i in recipe} - set(self.ingredients)
+        if missing:
+            return f"recipes use ingredients {sorted(missing)} that have no pile"
+        # The order of a recipe's pieces does not matter, so a second order would double its chance.
+        if not self.recipes or len({tuple(sorted(recipe)) for recipe in self.recipes}) < len(self.recipes):
+            return f"expected different recipes, at least one, found {list(self.recipes)}"
+        return None
 
     @property
     def width(self) -> int:
@@ -369,7 +395,7 @@ def with_recipes(layout: Layout, recipes: tuple[tuple[int, int, int], ...]) -> L
     """Return a layout with other recipes; equal arguments give the same object.
 
     Raises:
-        ValueError: if a recipe has an ingredient without a pile.
+        OptionError: if the recipes are not different triples of ingredients that have a pile.
     """
     return replace(layout, recipes=recipes)
 

@@ -166,7 +166,8 @@ def write_release(
             shutil.copyfile(source, root / name)
         with (root / HISTORIES).open("w", encoding="utf-8") as stream:
             stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in writer.entries)
-        write_layouts(root, [get_layout(one.task.layout_name) for one in new])  # not with the recipes of a task
+        named_layouts = [*(one.task.layout_name for one in new), *(one.layout for one in left_out)]
+        write_layouts(root, map(get_layout, named_layouts))  # not with the recipes of a task
         known = [] if named else [one.task for one in new]
         write_tasks(root / TASKS, known)
         provenance = {one.task.task_id: one.provenance for one in new}

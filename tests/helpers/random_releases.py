@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from icrl4aht_data.benchmark.facts import TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSwaps
-from icrl4aht_data.format.schema import Entry, Kind
+from icrl4aht_data.format.schema import LAYOUTS_FILE, Entry, Kind
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import step
 from icrl4aht_data.overcooked.state import start
@@ -139,6 +140,7 @@ def long_index(root: Path, lines: int = 3000) -> list[Entry]:
             line["expert_return_sampled"] = float(rng.normal())
         made.append(line | ({"h5_row": number % 500} if number % 3 else {}))
     (root / "meta").mkdir(parents=True)
+    shutil.copy(MINI / LAYOUTS_FILE, root / LAYOUTS_FILE)
     (root / "meta" / "info.json").write_text(
         json.dumps(json.loads((MINI / "meta" / "info.json").read_text()) | {"histories": lines})
     )

@@ -1,7 +1,7 @@
 """Layouts without end: families of generated layouts, each a function of its family, seed and number."""
 
+from icrl4aht_data.overcooked.solvable import check_solvable
 from icrl4aht_generation.layouts.families import find_generated, generate_layouts, split_of
 from icrl4aht_generation.layouts.grids import canonical_map
-from icrl4aht_generation.layouts.solvable import check_solvable
 
 __all__ = ["canonical_map", "check_solvable", "find_generated", "generate_layouts", "split_of"]

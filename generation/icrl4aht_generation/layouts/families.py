@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Iterator
+from itertools import islice
 
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.options import check_int
 from icrl4aht_generation.layouts.fixtures import LayoutDraw
 from icrl4aht_generation.layouts.grids import canonical_map
 from icrl4aht_generation.layouts.rearranged import MOST_REPEATS, draw_rearranged
@@ -28,6 +30,10 @@ LAYOUT_SPLITS = {"train": 0.8, "validation": 0.1, "test": 0.1}
 """Split -> share of the layouts that may be trained on; the others are divided equally among the last two."""
 
 
+MOST_LAYOUTS = 100_000
+"""Number of layouts of a family and seed, unless it is exhausted before."""
+
+
 def generate_layouts(family: str, seed: int, count: int, *, split: str | None = None) -> list[Layout]:
     """Return the first layouts of a family.
 
@@ -38,21 +44,22 @@ def generate_layouts(family: str, seed: int, count: int, *, split: str | None = 
     Args:
         family: "rearranged", "templates" or "rooms".
         seed: number of the sequence of layouts, at least 0.
-        count: number of layouts.
+        count: number of layouts, at most `MOST_LAYOUTS`.
         split: "train", "validation" or "test": only layouts of this split, see `split_of`.
 
     Raises:
         UnknownNameError: for an unknown family or split.
-        OptionError: if the family does not have so many layouts, or for a negative seed or count.
+        OptionError: if the family does not have so many layouts, or seed or count is not an integer of at least 0.
     """
     if family not in LAYOUT_FAMILIES:
         raise unknown("family of layouts", family, LAYOUT_FAMILIES)
     if split not in (None, *LAYOUT_SPLITS):
         raise unknown("split of layouts", split, LAYOUT_SPLITS)
-    if seed < 0 or count < 0:
-        raise OptionError(f"seed = {seed}, count = {count}: expected numbers of at least 0")
+    seed, count = check_int("seed", seed, 0), check_int("count", count, 0)
+    if count > MOST_LAYOUTS:
+        raise OptionError(f"count = {count}: a family has at most {MOST_LAYOUTS} layouts of one seed; ask for fewer")
     found: list[Layout] = []
-    numbered = _numbered(family, seed)
+    numbered = islice(_numbered(family, seed), MOST_LAYOUTS)  # with a split, far more may be drawn than are kept
     while len(found) < count:
         layout = next(numbered, None)
         if layout is None:
@@ -70,7 +77,7 @@ def find_generated(name: str) -> Layout:
     """Return the generated layout with a name such as templates-0-17; draws it and all before it.
 
     Raises:
-        OptionError: if the name is not family-seed-number, or the family has fewer layouts.
+        OptionError: if the name is not family-seed-number, or the family has fewer layouts, at most `MOST_LAYOUTS`.
         UnknownNameError: for an unknown family.
     """
     parts = re.fullmatch(r"(\w+)-(\d+)-(\d+)", name, re.ASCII)

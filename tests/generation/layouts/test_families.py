@@ -152,8 +152,12 @@ def test_bad_arguments():
         generate_layouts("template", 0, 1)
     with pytest.raises(UnknownNameError, match="unknown split of layouts 'heldout'"):
         generate_layouts("rooms", 0, 1, split="heldout")
-    with pytest.raises(OptionError, match="seed = -1, count = 3: expected numbers of at least 0"):
-        generate_layouts("rooms", -1, 3)
+    for seed, count, message in ((-1, 3, "seed = -1"), (0, 1.5, "count = 1.5"), (True, 1, "seed = True")):
+        with pytest.raises(OptionError, match=message):
+            generate_layouts("rooms", seed, count)  # type: ignore[arg-type]
+    for draw in (lambda: generate_layouts("rooms", 0, 10**9), lambda: find_generated(f"rooms-0-{10**9 - 1}")):
+        with pytest.raises(OptionError, match=f"count = {10**9}"):
+            draw()
     for name in ("templates-0", "templates-0-x", "coord_ring"):
         with pytest.raises(OptionError, match=f"{name}: expected the name of a generated layout"):
             find_generated(name)

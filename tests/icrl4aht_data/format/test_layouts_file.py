@@ -29,6 +29,7 @@ from icrl4aht_data.utils.text import listed_names
 from tests.helpers.random_releases import make_tasks, random_release
 
 ROWS = ("WPWWW", "0A A1", "W   W", "WBWXW")
+OTHER = {"family": "other", "seed": None, "number": None}
 MINE = Layout("mine-3-5", "mine-3-5", ROWS, ((0, 0, 1), (0, 1, 1)))
 
 
@@ -139,16 +140,38 @@ class TestRelease:
         [
             (lambda lines: [], r"unknown layout .*'mine-3-5'"),
             (lambda lines: lines * 2, "line 2: layout 'mine-3-5' is listed twice"),
-            (lambda lines: [lines[0] | {"name": "coord_simple"}], "layout 'coord_simple': differs from the layout"),
-            (lambda lines: [lines[0] | {"map": ["WPWWW", *ROWS[1:3], "WBWWW"]}], "its map has not a goal"),
+            (
+                lambda lines: [lines[0] | {"name": "coord_simple"} | OTHER],
+                "layout 'coord_simple': differs from the layout",
+            ),
+            (lambda lines: [lines[0] | {"map": ["WPWWW", *ROWS[1:3], "WBWWW"]}], "no agent can face a goal"),
             (lambda lines: [lines[0] | {"map": ["WP2W3", *ROWS[1:]]}], "20 cells and 4 piled ingredient types"),
             (lambda lines: [lines[0] | {"recipes": [[0, 0, 2]]}], r"recipes use ingredients \[2\]"),
             (lambda lines: [lines[0] | {"name": "mine\x1b[31m"}], "name"),
+            (
+                lambda lines: [lines[0] | {"map": ["WPWXW", *ROWS[1:3], "WWWBW"], "recipes": [[0, 0, 0]] * 2}],
+                "different",
+            ),
+            (
+                lambda lines: [lines[0] | {"map": ["WPWWW", "0A AW", "W   W", "WBWX1"]}],
+                "ingredient 1 cannot reach a pot",
+            ),
+            (lambda lines: [lines[0] | {"family": "rooms"}], r"found \('rooms', 3, 5\)"),
+            (lambda lines: [lines[0] | {"number": 6}], r"expected .* \('mine', 3, 5\)"),
+            (lambda lines: [lines[0] | {"seed": None}], r"found \('mine', None, 5\)"),
+            (lambda lines: [lines[0] | {"name": "mine"}], r"expected .* \('other', None, None\)"),
         ],
     )
     def test_refused(self, root, change, message):
         with pytest.raises(IndexFormatError, match=message):
             load_icrl4aht(rewritten(root, change(stored(root))))
+
+    def test_layouts_of_other_releases_do_not_count(self, root):
+        load_icrl4aht(root)
+        (root / LAYOUTS_FILE).unlink()
+        write_manifest(root)
+        with pytest.raises(IndexFormatError, match=r"layout 'mine-3-5' is neither published nor in meta/layouts.jsonl"):
+            load_icrl4aht(root)
 
     def test_one_name_for_two_maps(self, root, tmp_path):
         load_icrl4aht(root)
@@ -170,8 +193,8 @@ class TestRecipesOfATask:
     @pytest.mark.parametrize(
         ("recipes", "message"),
         [
-            ([], "expected different ones, at least one"),
-            ([[0, 0, 1], [0, 1, 0]], "expected different ones"),
+            ([], "expected different recipes, at least one"),
+            ([[0, 0, 1], [0, 1, 0]], "expected different recipes"),
             ([[0, 0, 9]], r"recipes use ingredients \[9\] that have no pile"),
             ("000", "recipes"),
         ],

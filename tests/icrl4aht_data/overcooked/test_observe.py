@@ -16,7 +16,7 @@ import re
 import numpy as np
 import pytest
 
-from icrl4aht_data.errors import UnknownNameError
+from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import INTERACT, STAY
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
@@ -127,10 +127,17 @@ def test_an_unknown_layout_lists_the_names_and_the_nearest(wrong, nearest):
         (("WWWWW", "0A A0", "WWWWW"), {}, "ingredients \\[1\\] that have no pile"),
         (("WWWWW", "0A A1", "WWWWW"), {"recipes": ((0, 1, 2), (0, 3, 1))}, "ingredients \\[2, 3\\]"),
         (("WW WW", "0A A1", "WWWWW"), {}, "edge at \\(2, 0\\)"),
+        ((), {}, "widths \\[\\]"),
+        ("WWWWW", {}, "rows = "),
+        (("WWWWW", "WA AW", "WWWWW"), {"recipes": ()}, "at least one"),
+        (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 0, 1), (0, 1, 0))}, "different recipes"),
+        (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 1),)}, "recipes = "),
+        (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 0, True),)}, "recipes = "),
+        (("W0W1W", "WA AW", "WWWWW"), {"indicates_delivery": 1}, "indicates_delivery = "),
     ],
 )
 def test_impossible_maps_are_refused(rows, options, message):
-    with pytest.raises(ValueError, match=f"layout mine: .*{message}"):
+    with pytest.raises(OptionError, match=f"layout mine: .*{message}"):
         Layout("mine", "mine_too", rows, **options)
 
 

@@ -1,0 +1,62 @@
+"""Search for a way in which the agents of a layout can cook and deliver every recipe.
+
+Shapes: `N` cells, `P` pots.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.cells import GOAL, PILE, PLATES, POT, WALL
+from icrl4aht_data.overcooked.layouts import Layout
+
+_NEEDED = {GOAL: "a goal", POT: "a pot", PLATES: "a plate pile"}
+
+
+def check_solvable(layout: Layout) -> None:
+    """Check that the agents of a layout can deliver every recipe.
+
+    Each ingredient has to reach a pot, and the soup of this pot, on a plate, a goal. Agents carry items in their rooms,
+    and hand them over on counters that both can face.
+
+    Raises:
+        OptionError: if they cannot; says what is missing.
+    """
+    if fault := _delivery_fault(layout):
+        raise OptionError(f"layout {layout.name}: {fault}; change the map or the recipes")
+
+
+def _delivery_fault(layout: Layout) -> str | None:
+    """Return why some recipe cannot be delivered, or None if each can."""
+    reach = np.zeros((2, layout.cells), bool)  # (2, N), the cells that each agent can face
+    for faced, room in zip(reach, layout.rooms, strict=True):
+        faced[layout.ahead[room]] = True
+    counters = bool((reach.all(axis=0) & (layout.kinds == WALL)).any())
+
+    def agents_at(fixtures: np.ndarray) -> np.ndarray:
+        """Return bool (2,), the agents that can face one of some fixtures, bool (N,)."""
+        return np.any(reach & fixtures, axis=1)
+
+    def agents_given(agents: np.ndarray) -> np.ndarray:
+        """Return bool (2,), the agents that can have an item which some agents, bool (2,), can have."""
+        return agents | (counters and agents.any())
+
+    for kind, what in _NEEDED.items():
+        if not agents_at(layout.kinds == kind).any():
+            return f"no agent can face {what}"
+    pots = reach[:, layout.kinds == POT]  # (2, P)
+    plates, goals = agents_given(agents_at(layout.kinds == PLATES)), agents_at(layout.kinds == GOAL)
+    served = [pot for pot in pots.T if (agents_given(pot & plates) & goals).any()]
+    if not served:
+        return "no soup can reach a goal on a plate"
+    for recipe in layout.recipes:
+        piles = {one: (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(one)) for one in recipe}
+        available = {ingredient: agents_given(agents_at(piles[ingredient])) for ingredient in sorted(piles)}
+        for ingredient, agents in available.items():
+            if not any((pot & agents).any() for pot in served):
+                return f"ingredient {ingredient} cannot reach a pot whose soup can be delivered"
+        # An agent must reach the pot for each ingredient, but it need not be the same agent.
+        if not any(all((pot & agents).any() for agents in available.values()) for pot in served):
+            return f"the ingredients of recipe {recipe} cannot reach the same pot"
+    return None
