@@ -321,7 +321,7 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     and oracle earn with it. With --spread, chooses widely different teammates for the profiles' tasks.spread. Layouts
     that the table has are kept, so that a stopped command resumes.
     """
-    from icrl4aht_generation.teammates.draws import DRAWS_TABLE, read_table
+    from icrl4aht_generation.teammates.draws import DRAWS_TABLE, read_measured
     from icrl4aht_generation.teammates.measuring import fill_table
     from icrl4aht_generation.teammates.spread import SPREAD_TABLE, LayoutSpread, spread_rows
 
@@ -333,7 +333,7 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     with progress_bars(unit="layouts") as show:
         fill_table(path, names, lambda done, name: show("draws", done, len(names), name), overwrite, spread=spread)
     if spread:
-        rows = spread_rows(read_table(path, LayoutSpread))
+        rows = spread_rows(read_measured(path, LayoutSpread))
         from rich.table import Table
 
         table = Table(*(name.replace("_", " ") for name in rows[0]))

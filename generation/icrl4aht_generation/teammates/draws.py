@@ -290,7 +290,7 @@ def _hosted_text(layout: str, base_seed: int) -> str:
 @lru_cache(maxsize=1)
 def _bundled_draws() -> dict[tuple[str, str, int], tuple[Draw, ...]]:
     draws: dict[tuple[str, str, int], list[Draw]] = defaultdict(list)
-    for draw in read_table(DRAWS_TABLE, Draw):
+    for draw in read_measured(DRAWS_TABLE, Draw):
         draws[draw.layout, draw.family, draw.base_seed].append(draw)
     return {key: tuple(found) for key, found in draws.items()}
 
@@ -307,7 +307,7 @@ class Row(Protocol):
 AnyRow = TypeVar("AnyRow", bound=Row)
 
 
-def read_table(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
+def read_measured(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
     """Return the lines of a table of measured teammates, in its order.
 
     Raises:

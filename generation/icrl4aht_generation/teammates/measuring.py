@@ -27,7 +27,7 @@ from icrl4aht_generation.teammates.draws import (
     DRAWS_PER_SEED,
     Draw,
     ranges_of,
-    read_table,
+    read_measured,
     write_table,
 )
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES
@@ -77,7 +77,7 @@ def fill_table(
         overwrite: also measure the layouts that the table has.
         spread: whether it is a table of `teammates.spread`, or one of `teammates.draws`.
     """
-    rows: list[Any] = read_table(path, LayoutSpread if spread else Draw) if path.is_file() else []
+    rows: list[Any] = read_measured(path, LayoutSpread if spread else Draw) if path.is_file() else []
     candidates = spread_candidates() if spread else []
     for number, name in enumerate(layouts):
         on_layout(number, name)

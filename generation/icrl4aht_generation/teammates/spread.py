@@ -19,7 +19,7 @@ from msgspec import Struct
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, layout_order
 from icrl4aht_data.errors import OptionError, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_generation.teammates.draws import Draw, equal_parameters, find_draw, read_table
+from icrl4aht_generation.teammates.draws import Draw, equal_parameters, find_draw, read_measured
 from icrl4aht_generation.teammates.heuristics.assembly_line import PLATER, RUNNER
 from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS
 from icrl4aht_generation.teammates.heuristics.territory import (
@@ -219,7 +219,7 @@ def find_measured(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
 
 @lru_cache(maxsize=1)
 def _bundled_spreads() -> dict[str, LayoutSpread]:
-    table = read_table(SPREAD_TABLE, LayoutSpread) if SPREAD_TABLE.is_file() else []
+    table = read_measured(SPREAD_TABLE, LayoutSpread) if SPREAD_TABLE.is_file() else []
     return {spread.layout: spread for spread in table}
 
 

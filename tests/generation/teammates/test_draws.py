@@ -17,7 +17,7 @@ from icrl4aht_generation.teammates.draws import (
     drawn_teammates,
     hosted_families,
     read_draws,
-    read_table,
+    read_measured,
     validation_tasks,
     write_table,
 )
@@ -63,14 +63,14 @@ def test_the_table_has_every_draw_once():
         for seed, count in DRAWS_PER_SEED.items()
         for theta_id in range(count)
     ]
-    assert [number_of(found) for found in read_table(DRAWS_TABLE, Draw)] == expected
+    assert [number_of(found) for found in read_measured(DRAWS_TABLE, Draw)] == expected
     assert [found.theta_id for found in read_draws("demo_wide", H1)] == list(range(DRAWS_PER_SEED[0]))
     assert number_of(read_draws("demo_cook_wide", H1, 1)[3]) == ("demo_wide", H1, 1, 3)
 
 
 def test_the_table_is_as_written(tmp_path):
     """Writing what was read gives the same bytes."""
-    write_table(tmp_path / "again.jsonl", reversed(read_table(DRAWS_TABLE, Draw)))
+    write_table(tmp_path / "again.jsonl", reversed(read_measured(DRAWS_TABLE, Draw)))
     assert (tmp_path / "again.jsonl").read_bytes() == DRAWS_TABLE.read_bytes()
 
 
@@ -202,7 +202,7 @@ def test_a_damaged_table_is_named_with_its_line(tmp_path):
     for line in ("[1]", "{", '{"layout":"demo_wide"}'):
         path.write_text(path.read_text().splitlines()[0] + f"\n{line}\n")
         with pytest.raises(TaskFormatError, match=r"draws\.jsonl, line 2: "):
-            read_table(path, Draw)
+            read_measured(path, Draw)
 
 
 # The command.

@@ -15,7 +15,7 @@ from icrl4aht_generation.teammates.distances import (
     distances_to_tests,
     instance_policies,
 )
-from icrl4aht_generation.teammates.draws import DIVERSE_DISTANCE, find_draw, read_table, write_table
+from icrl4aht_generation.teammates.draws import DIVERSE_DISTANCE, find_draw, read_measured, write_table
 from icrl4aht_generation.teammates.heuristics.heuristic import RANDOM_ACTIONS, Heuristic, Sampling
 from icrl4aht_generation.teammates.preference import WATCHER
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate, check_theta, sample_teammate
@@ -113,10 +113,10 @@ def test_rows_count_behaviours(three):
 def test_tables_are_read_as_written(three, tmp_path):
     path = tmp_path / "spread.jsonl"
     write_table(path, [three])
-    assert read_table(path, LayoutSpread) == [three]
+    assert read_measured(path, LayoutSpread) == [three]
     path.write_text(path.read_text("utf-8").replace('"separation"', '"seperation"'), encoding="utf-8")
     with pytest.raises(TaskFormatError, match=r"spread\.jsonl, line 1: .*seperation"):
-        read_table(path, LayoutSpread)
+        read_measured(path, LayoutSpread)
 
 
 # The shipped list.
