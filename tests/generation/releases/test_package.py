@@ -222,7 +222,6 @@ def fake_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
 
 
 def test_drawn_teammates_are_looked_up_and_others_measured_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(measures, "read_draws", fake_draws)
     monkeypatch.setattr(draws_table, "read_draws", fake_draws)
     entry = sample_teammate("assembly_line", 1, "train")
     drawn = make_task("teammate", "train", "demo_wide", entry, 0)
@@ -249,7 +248,6 @@ def test_the_nearest_test_teammate_of_a_draw_may_be_of_another_family(monkeypatc
         near = replace_fields(first, other="H1/t0", other_distance=0.006)
         return [near, replace_fields(first, theta_id=1, other_distance=0.4)]
 
-    monkeypatch.setattr(measures, "read_draws", draws)
     monkeypatch.setattr(draws_table, "read_draws", draws)
     entries = [sample_teammate("assembly_line", theta_id, "train") for theta_id in range(2)]
     tasks = [make_task("teammate", "train", "demo_wide", entry, 0) for entry in entries]
@@ -259,7 +257,6 @@ def test_the_nearest_test_teammate_of_a_draw_may_be_of_another_family(monkeypatc
 
 
 def test_families_that_a_layout_cannot_host_are_named(monkeypatch):
-    monkeypatch.setattr(measures, "read_draws", fake_draws)
     monkeypatch.setattr(draws_table, "read_draws", fake_draws)
     monkeypatch.setattr(
         measures, "hosted_families", lambda layout: ["recipe_aware_button", "territory", "assembly_line"]
