@@ -159,7 +159,7 @@ def test_finished_work_is_kept(swept, monkeypatch):
     run_experiment("sweep context", plan, out, lambda what, *counts: steps.append((what.split(": ")[1], *counts)))
     assert [(path, path.stat().st_mtime_ns) for path in results] == before
     assert steps == [("training steps", 0, 2), ("training steps", 2, 2), ("episodes", 0, 2), ("episodes", 2, 2)]
-    with pytest.raises(OptionError, match=r"train\.seed: the run has 0, expected 3"):
+    with pytest.raises(OptionError, match=r"train\.seed: it has 0, expected 3"):
         run_experiment("sweep context", dataclasses.replace(plan, train=TRAIN | {"seed": 3}), out)
 
 

@@ -116,4 +116,4 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
     assert config["histories"]["data_version"] == "0.0.1"
     assert config["histories"]["root"] == server.url
     assert config["histories"]["manifest_sha256"] == file_hash(lite[0] / "MANIFEST.sha256")
-    assert "model.teammate_actions: the run has False, expected True" in str(again.exception)
+    assert "model.teammate_actions: it has False, expected True" in str(again.exception)
