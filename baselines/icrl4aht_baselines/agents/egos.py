@@ -111,6 +111,11 @@ SCRIPTED: tuple[Callable[..., Policy], ...] = (oracle, searcher)
 """Scripted reference egos. Their functions take one layout or several, since their parameters are tables of these."""
 
 
+def agent_names() -> tuple[str, ...]:
+    """Return the names that `find_agent` knows: reference egos and bundled models."""
+    return (*AGENTS, *bundled_models())
+
+
 def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None) -> NamedEgo:
     """Return a reference ego, a bundled model, or the trained model in a run folder of `icrl4aht-data train`.
 
@@ -132,7 +137,7 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
     model = bundled_models().get(name)
     if model is None and not Path(name).is_dir():
         hint = "A trained model is named by its folder, which `icrl4aht-data train` makes."
-        raise UnknownNameError(f"{unknown('agent', name, [*AGENTS, *bundled_models()])} {hint}")
+        raise UnknownNameError(f"{unknown('agent', name, agent_names())} {hint}")
     if model is None and not (Path(name) / CONFIG).is_file():
         raise UnknownNameError(f"{name}: not a run: {CONFIG} is missing; `icrl4aht-data train` makes runs")
     own_greedy = model is None or not model.sampled
