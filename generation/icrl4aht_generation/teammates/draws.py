@@ -242,9 +242,13 @@ def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
     """
     draws = _usable(layout, family, base_seed)
     if not draws:
-        why, hosted = unhosted_reason(layout, family, base_seed), _hosted_text(layout, base_seed)
+        farthest = max((draw.nearest_counted for draw in read_draws(layout, family, base_seed)), default=None)
+        near = f", to {farthest[1]}" if farthest else ""
         raise OptionError(
-            f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: {why}; name other families ({hosted})"
+            f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: "
+            f"{unhosted_reason(layout, family, base_seed)}; expected a distance of {_least_distance(base_seed)} or "
+            f"more{near}, and returns that differ by {LEAST_HEADROOM:g} or more; name other families "
+            f"({_hosted_text(layout, base_seed)})"
         )
     first = {(draw.like_another_family, draw.behaviour): draw for draw in reversed(draws)}
 
@@ -270,11 +274,12 @@ def unhosted_reason(layout: str, family: str, base_seed: int = 0) -> str:
     """Return why no draw of a family may be used on a layout."""
     draws = read_draws(layout, family, base_seed)
     if not draws:
-        return "no draws were measured"
+        return "no draws were measured; `icrl4aht-data research draws` measures them"
     admissible = [draw for draw in draws if draw.admissible]
     if not admissible:
         farthest = max(draw.nearest_counted[0] for draw in draws)
-        return f"all {len(draws)} draws act like a test teammate of the family (distance {farthest:.3f} at most)"
+        tests = "a test teammate" if base_seed in _DIVERSE_SEEDS.values() else "a test teammate of the family"
+        return f"all {len(draws)} draws act like {tests} (distance {farthest:.3f} at most)"
     widest = max(draw.spread for draw in admissible)
     return (
         f"with none of the {len(admissible)} draws that act unlike those of the test does the ego matter (returns "
