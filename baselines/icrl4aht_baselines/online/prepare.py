@@ -191,7 +191,7 @@ def _groups(
         tasks: number of all tasks.
 
     Raises:
-        OptionError: if other versions are wanted and a layout has learned teammates alone, which play on it only.
+        OptionError: if other versions are wanted and a layout's teammates play on it only, see `_heuristics`.
     """
     heuristics = _heuristics(teammates) if play.four_recipes or play.rearranged else {}
     everywhere, shares, hidden = dict(teammates), dict(shares), list(hidden)
@@ -221,7 +221,18 @@ def _groups(
 
 
 def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Teammate]]]:
-    """Return the heuristic teammates of each layout by kind: they can be built on other layouts as well."""
+    """Return the heuristic teammates of each layout by kind: they can be built on other layouts as well.
+
+    Raises:
+        OptionError: if a layout has learned teammates alone, or tasks with a dish of their own, which other versions of
+            the layout would not have.
+    """
+    for layout, _ in teammates:
+        if layout.recipes != get_layout(layout.name).recipes:
+            raise OptionError(
+                f"{layout.name}: has tasks with a fixed dish, which rearranged layouts and four recipes do not keep; "
+                f"leave out --rearranged and --four-recipes, or these tasks"
+            )
     found: dict[Layout, dict[str, dict[str, _Teammate]]] = {layout: {} for layout, _ in teammates}
     for (layout, kind), mates in teammates.items():
         if all(mate.entry["kind"] == "heuristic" for mate in mates.values()):

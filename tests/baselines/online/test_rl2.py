@@ -361,6 +361,12 @@ class TestPreparing:
             ),
             (PlayOptions(), CHOICE, ("layout", "test"), "none of the 40 tasks is on cramped_up, but on asymm_right, "),
             (PlayOptions(), HistoryOptions(("cramped_up",), queries=7), None, "queries = 7: rl2 learns by playing"),
+            (
+                PlayOptions(rearranged=6),
+                HistoryOptions(("asymm_both_plain",), source=("search",)),
+                None,
+                "asymm_both_plain: has tasks with a fixed dish",
+            ),
         ],
     )
     def test_invalid_choices_of_teammates(self, play, choice, manifest, message):
