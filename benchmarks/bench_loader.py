@@ -75,7 +75,7 @@ def published_reader(folder: Path, length: int) -> ReadWindows:
 
 
 def fair_reader(folder: Path, length: int, batch: int) -> ReadWindows:
-    """Return a reader into one batch buffer, for files whose chunks have the windows' length."""
+    """Return a reader that fills the same buffer for every batch; the chunks of the files are as long as a window."""
     file = h5py.File(folder / HISTORIES_H5, "r")
     first: Any = {name: file[f"/0/{name}"] for name in _READ}
     out = {name: np.ones((batch, length, *data.shape[1:]), data.dtype) for name, data in first.items()}

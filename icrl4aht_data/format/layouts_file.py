@@ -62,8 +62,9 @@ def read_layouts(root: Path) -> ReleaseLayouts:
     """Read the layouts of a release, and make them known to `get_layout`.
 
     Raises:
-        IndexFormatError: if a line is malformed, a name occurs twice or stands for another map elsewhere, a recipe
-            cannot be delivered, or family, seed or number do not belong to the name; with the file and line number.
+        IndexFormatError: if a line is malformed, if a name occurs twice or is already known for another map, if a
+            recipe cannot be delivered, or if family, seed and number are not those in the name. The error has the
+            file and the number of the line.
     """
     return _read_layouts_file(resolve_inside(root, LAYOUTS_FILE))
 

@@ -350,10 +350,12 @@ def _known_families(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
     """Return the families of heuristic training and validation teammates, by their similarity to test teammates.
 
     Returns:
-        `tested`: families whose teammates are test teammates, act like one of the same family, or were not compared
-        with those of their layout; `drawn`: families with other teammates; `drawn_distance`: the least distance of
-        these to a test teammate, rounded down to two digits; `alike`: teammates of these that act like a test teammate
-        of another family; `untested`: whether some play on layouts without test teammates to compare with.
+        `tested`: families in which a teammate is a test teammate, acts like one of its family, or was not compared with
+            those of its layout.
+        `drawn`: families with other teammates, the drawn ones.
+        `drawn_distance`: smallest distance of a drawn teammate to a test teammate, rounded down to two digits.
+        `alike`: drawn teammates that act like a test teammate of another family.
+        `untested`: whether a teammate plays on a layout that has no test teammates to compare with.
     """
     tested, drawn, alike, distances, untested = set(), set(), set(), [], False
     nearest = _nearest_tests(tasks)

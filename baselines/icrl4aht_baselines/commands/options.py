@@ -116,7 +116,8 @@ tasks_options = (
         default=("test",),
         help="Which tasks: test, or validation and diverse, by which models are chosen; repeat for several.",
     ),
-    click.option("--layout", "layouts", type=RELEASE_LAYOUT, **_ONLY_LAYOUTS),  # perhaps one of the manifest's
+    # Names are checked when the manifest is read, because the release next to it may carry the layout.
+    click.option("--layout", "layouts", type=RELEASE_LAYOUT, **_ONLY_LAYOUTS),
     click.option(
         "--family", "families", type=FAMILY, multiple=True, help="Only with teammates of this family; repeat."
     ),

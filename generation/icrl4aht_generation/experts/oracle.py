@@ -61,7 +61,8 @@ def oracle(layout: Layout | Sequence[Layout]) -> Policy:
     """Return the scripted ego.
 
     Args:
-        layout: the layout whose state records it sees; or several, for a policy that sees a `Situation` of one of them.
+        layout: one layout, for a policy that sees its state records; or several layouts, for a policy that sees a
+            `Situation` on one of them.
     """
     if isinstance(layout, Layout):
         return on_layout(SITUATION_ORACLE._replace(params=oracle_params([layout])), layout)
@@ -392,7 +393,7 @@ def _with_nothing(view: OracleView) -> list[Subgoal]:
     ingredients = fetch(missing > coming, to_pot[:, pot])
     quick = jnp.sum(missing * jnp.asarray(facts.trip)[pot]) <= WAIT_LIMIT - 4
 
-    # By way of the plates: the earliest step in which the ego stands in front of each pot with a plate.
+    # The earliest step in which the ego can face each pot with a plate in its hand: first to a plate, then to the pot.
     arrival = jnp.min(jnp.where(view.plates[:, None], view.time[:, None] + to_pot, NEVER), axis=0)
     due = view.timers <= arrival + 2
     right = view.right & ~view.mate_takes & facts.serves

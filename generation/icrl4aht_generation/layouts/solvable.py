@@ -1,4 +1,4 @@
-"""Layouts whose recipes the scripted experts can deliver, and cells on which an agent is in nobody's way.
+"""Checks of a map: whether the scripted oracle can deliver its recipes, and where an agent can wait without blocking.
 
 Shapes: `H` rows, `W` columns.
 """

@@ -51,7 +51,7 @@ _DIGITS = 4
 """Decimal places of stored numbers: all digits of shares of 10,000 states, and of means of 20 returns."""
 
 _EGOS = ("stay", "random", "oracle")
-"""Reference egos whose returns the tables have."""
+"""Reference egos. The tables list the return of each with every teammate."""
 
 _SPREAD_EPISODES = 4
 """Episodes of the states on which spread teammates are compared, of each test instance with each of the two egos."""

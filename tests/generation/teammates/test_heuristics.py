@@ -143,7 +143,7 @@ def test_noise_chain_is_the_published_one():
 
 
 def key_of(memory: Any) -> jax.Array:
-    """Return the key in a heuristic's memory, of which that of H3 has nothing else."""
+    """Return the random key in a heuristic's memory; the memory of H3 is the key itself."""
     return getattr(memory, "key", memory)
 
 

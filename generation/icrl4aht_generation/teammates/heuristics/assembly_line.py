@@ -27,7 +27,7 @@ _OFF_BEATS = (np.arange(10) / 10).astype(np.float32)
 
 
 def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int[Array, ""], Key[Array, ""]]:
-    """Take one step of an H3 teammate, whose memory is the next key of its chain."""
+    """Take one step of an H3 teammate. It remembers only a random key; every step replaces it by a new one."""
     following, u = draw(memory)
     idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
     makes_room = _makes_room(scene)
