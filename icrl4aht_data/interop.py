@@ -8,12 +8,12 @@ A sampler is a sequence of batches, each a pure function of its number, so most 
     Hugging Face   hf_index(dataset), hf_episodes(dataset), hf_windows(sampler); need the extra `hf`
 
 `len(sampler)` batches make one pass: together they have as many steps as the selection. Reading a sampler again gives
-equal batches, so for several passes take loaders that continue: `sampler.batches()` never ends, each pass over a
-`torch_loader` continues after the previous one, and for Grain there is
+equal batches, so for several passes take loaders that continue: `sampler.batches()` never ends, each pass over
+`sampler.batches(stop=len(sampler))` or a `torch_loader` continues after the previous one, and for Grain there is
 `grain.MapDataset.range(passes * len(sampler)).map(sampler.batch)` (`repeat` would repeat batches).
 
-`torch_loader` gives integers as int64. PyTorch's `DataLoader(sampler, batch_size=None)` gives int32, which PyTorch's
-losses refuse as targets.
+Targets are int64 everywhere but in JAX, so PyTorch's losses take them from `DataLoader(sampler, batch_size=None)`, too.
+Other integers are int32, and int64 from `torch_loader` and `hf_windows`, where targets are -100 on padding.
 
 Rows of episodes have state records, also rows from `datasets.load_dataset(release, "episodes", streaming=True)`;
 `render_observations(rows)` renders them as observations.
@@ -147,7 +147,7 @@ def _for_losses(batch: Any) -> Any:
     present = {name: array for name, array in batch._asdict().items() if array is not None}
     arrays = {name: array.astype(np.int64) if array.dtype == np.int32 else array for name, array in present.items()}
     if isinstance(batch, ADBatch):
-        arrays["target_actions"][~batch.attention_mask] = IGNORED
+        arrays["target_actions"] = np.where(batch.attention_mask, batch.target_actions, IGNORED)
     return batch._replace(**arrays)
 
 

@@ -24,10 +24,10 @@ from icrl4aht_data.utils.system import new_array
 from icrl4aht_data.utils.text import counted_histories, counted_noun, listed_names
 
 B = TypeVar("B", bound=tuple)
-"""A batch: a named tuple of NumPy arrays, some of which may be None."""
+"""A batch: a named tuple of NumPy arrays, some of which may be None. Targets are int64, which PyTorch's losses need."""
 
 D = TypeVar("D", bound=tuple)
-"""A batch on a device: a named tuple of JAX arrays."""
+"""A batch on a device: a named tuple of JAX arrays, whose integers are int32 unless JAX is set to 64 bits."""
 
 T = TypeVar("T", bound=tuple)
 """A batch for PyTorch: a named tuple of tensors; see `interop.torch_loader`."""

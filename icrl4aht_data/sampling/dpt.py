@@ -43,7 +43,7 @@ class DPTBatch(NamedTuple, Generic[A]):
 
     Attributes:
         query_obs: float32 or uint8 (B, 5, 5, C): the ego's observation at the query step.
-        query_target: int32 (B,): the label to predict at the query step: the action 0..5 of the expert or the oracle.
+        query_target: int64 (B,): the label to predict at the query step: the action 0..5 of the expert or the oracle.
         context_obs: float32 or uint8 (B, K, 5, 5, C): observations of transitions of the same task.
         context_actions: int32 (B, K): the ego's actions in these transitions, 0..5.
         context_next_obs: float32 or uint8 (B, K, 5, 5, C): the next observations in the same episode.
@@ -154,7 +154,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         asked = (self.local_size, self.queries) if self.queries > 1 else (self.local_size,)
         return {
             "query_obs": self._observer.spec(*asked),
-            "query_target": ArraySpec("int32", asked),
+            "query_target": ArraySpec("int64", asked),
             "context_obs": self._observer.spec(*shape),
             "context_actions": ArraySpec("int32", shape),
             "context_next_obs": self._observer.spec(*shape),
