@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -186,6 +186,8 @@ class Batches(Iterator[B], Generic[B]):
         Raises:
             OptionError: if the state comes from a sampler with other options or another selection; names them.
         """
+        if not isinstance(state, Mapping):
+            raise OptionError(f"state = {state!r:.100}: expected the result of state_dict()")
         expected, given = self._sampler.options(), {name: value for name, value in state.items() if name != "next"}
         if "channels" in expected:
             given.setdefault("channels", "own")  # states of version 0.1 do not contain this option
