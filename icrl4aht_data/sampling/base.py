@@ -175,6 +175,7 @@ class Sampler(Generic[B, D, T]):
 
     def _layout_specs(self) -> dict[str, ArraySpec]:
         """Return the spec of the field `layouts`, present in batches of state records of several layouts."""
+        # Rendered observations can be read without their layout, state records cannot.
         several = self.dataset.obs == "state" and len(self.layouts) > 1
         return {"layouts": ArraySpec("int32", (self.local_size,))} if several else {}
 
@@ -188,6 +189,7 @@ class Sampler(Generic[B, D, T]):
         for array in arrays.values():
             if not (isinstance(array, np.ndarray) and array.flags.c_contiguous and array.flags.writeable):
                 raise OptionError("out: expected writeable, C-contiguous arrays; take a batch from sampler.empty()")
+        # A narrower dtype would change values without an error, and a larger buffer would keep old ones.
         found = {name: ArraySpec(str(array.dtype), array.shape) for name, array in arrays.items()}
         if found != self.specs:
             raise OptionError(f"out: expected {self.specs}, found {found}; take a batch from sampler.empty()")
