@@ -230,7 +230,11 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
                 is_transient = status in _TRANSIENT_STATUS or status >= 500
             # huggingface_hub raises LocalEntryNotFoundError after its own retries.
             if wait is None or not is_transient or type(error).__name__ == "LocalEntryNotFoundError":
-                text = without_credentials(" ".join(f"{type(cause).__name__}: {cause}".split()))[:400]
+                # Some time-outs have no text.
+                said = str(cause) or (
+                    f"no answer for {_TIMEOUT:g} s" if isinstance(cause, TimeoutError) else "no reason given"
+                )
+                text = without_credentials(" ".join(f"{type(cause).__name__}: {said}".split()))[:400]
                 if isinstance(cause, FileNotFoundError) or status == 404:
                     raise RemoteError(f"{address}: the remote has no such file: {text}", missing=True) from None
                 raise RemoteError(

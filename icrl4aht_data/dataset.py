@@ -104,10 +104,6 @@ def load_icrl4aht(
         NotStoredError: for `min_expert_return`, if the release does not have the returns.
         ReleaseError: if the release cannot be read.
     """
-    if root is not None and not isinstance(root, (str, Path)):
-        raise OptionError(
-            f"root = {root!r}: expected a release folder or an address such as hf://datasets/<org>/<repo>"
-        )
     options = ReadOptions(obs, cache, usable_cores() if threads is None else threads, channels)
     dataset = open_dataset(open_root(MINI if root is None else root), options)
     return dataset.filter(

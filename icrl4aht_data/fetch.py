@@ -243,8 +243,21 @@ def _remove_from_cache(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
+def check_root(root: Any) -> None:
+    """Check that a root is a path, or a text without null characters.
+
+    Raises:
+        OptionError: if it is not.
+    """
+    if not isinstance(root, (str, Path)) or "\0" in str(root):
+        raise OptionError(
+            f"root = {root!r}: expected a release folder or an address such as hf://datasets/<org>/<repo>"
+        )
+
+
 def open_root(root: str | Path) -> ReleaseLocation:
-    """Locate a release, a folder or an address; see `open_remote` for the errors."""
+    """Locate a release, a folder or an address; see `check_root` and `open_remote` for the errors."""
+    check_root(root)
     if is_address(root):
         remote = open_remote(str(root))
         return ReleaseLocation(remote.folder, remote)

@@ -8,12 +8,12 @@ A sampler is a sequence of batches, each a pure function of its number, so most 
     Hugging Face   hf_index(dataset), hf_episodes(dataset), hf_windows(sampler); need the extra `hf`
 
 `len(sampler)` batches make one pass: together they have as many steps as the selection. Reading a sampler again gives
-equal batches, so for several passes take loaders that continue: `sampler.batches()` never ends, each pass over a
-`torch_loader` continues after the previous one, and for Grain there is
+equal batches, so for several passes take loaders that continue: `sampler.batches()` never ends, each pass over
+`sampler.batches(stop=len(sampler))` or a `torch_loader` continues after the previous one, and for Grain there is
 `grain.MapDataset.range(passes * len(sampler)).map(sampler.batch)` (`repeat` would repeat batches).
 
-`torch_loader` gives integers as int64. PyTorch's `DataLoader(sampler, batch_size=None)` gives int32, which PyTorch's
-losses refuse as targets.
+Targets are int64 everywhere but in JAX, so PyTorch's losses take them from `DataLoader(sampler, batch_size=None)`, too.
+Other integers are int32, and int64 from `torch_loader` and `hf_windows`, where targets are -100 on padding.
 
 Rows of episodes have state records, also rows from `datasets.load_dataset(release, "episodes", streaming=True)`;
 `render_observations(rows)` renders them as observations.
@@ -21,7 +21,7 @@ Rows of episodes have state records, also rows from `datasets.load_dataset(relea
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -50,6 +50,9 @@ T = TypeVar("T", bound=tuple)
 Rendered = Literal["float32", "uint8"]
 RENDERED: tuple[Rendered, ...] = ("float32", "uint8")
 """Dtypes that `render_observations` can return."""
+
+CONTEXTS = ("spawn", "forkserver", "fork")
+"""Ways in which `torch_loader` can start its processes."""
 
 IGNORED = -100
 """Target of padding in `torch_loader` and `hf_windows`; PyTorch's cross entropy ignores it."""
@@ -87,9 +90,11 @@ def torch_loader(
 
     Raises:
         OptionError: if PyTorch is not installed, for anything but a sampler, or for impossible numbers.
+        UnknownNameError: for another `context`.
     """
     loader = import_optional("torch.utils.data", "a DataLoader").DataLoader
     numbers, per_pass = _numbers(sampler, start, stop), len(sampler)
+    check_choice("context", context, CONTEXTS)
     if stop is None:
         numbers = range(numbers.start, (numbers.start // per_pass + 1) * per_pass)
     if workers and sampler.dataset.cache.cache != "stream":
@@ -147,7 +152,7 @@ def _for_losses(batch: Any) -> Any:
     present = {name: array for name, array in batch._asdict().items() if array is not None}
     arrays = {name: array.astype(np.int64) if array.dtype == np.int32 else array for name, array in present.items()}
     if isinstance(batch, ADBatch):
-        arrays["target_actions"][~batch.attention_mask] = IGNORED
+        arrays["target_actions"] = np.where(batch.attention_mask, batch.target_actions, IGNORED)
     return batch._replace(**arrays)
 
 
@@ -217,7 +222,10 @@ def render_observations(
     check_choice("obs", obs, RENDERED)
     if isinstance(rows, Mapping) and isinstance(rows.get("layout"), str):
         return render_observations([rows], channels=channels, obs=obs)[0]
-    layouts, canonical = [get_layout(name) for name in _column(rows, "layout")], channels == "canonical"
+    names = _column(rows, "layout")
+    if not isinstance(names, Iterable):
+        raise OptionError(f"layout = {names!r}: expected the name of a layout for each row")
+    layouts, canonical = list(map(get_layout, names)), channels == "canonical"
     shapes = {observation_shape(layout, canonical): layout for layout in layouts}
     if len(shapes) != 1:
         found = ", ".join(f"{layout.name} {shape}" for shape, layout in shapes.items())
@@ -225,7 +233,10 @@ def render_observations(
             f"observations of {len(layouts)} rows: expected one shape, found {found or 'none'}: give at least one row, "
             f'and take channels="canonical" for rows of several layouts'
         )
-    records = np.asarray(_column(rows, "state"), np.uint8)
+    try:
+        records = np.asarray(_column(rows, "state"), np.uint8)
+    except (TypeError, ValueError, OverflowError) as error:  # nested lists of unequal length, or not bytes
+        raise OptionError(f"state: expected bytes of equally long episodes: {error}") from error
     longest = record_width(layouts)
     if records.ndim != 3 or records.shape[-1] < longest:
         raise OptionError(f"state: expected (B, T, S) with S at least {longest}, found {records.shape}")

@@ -20,7 +20,7 @@ from icrl4aht_data.checking.structure import check_structure
 from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, check_choice
-from icrl4aht_data.fetch import ReleaseLocation, chosen_files, open_root
+from icrl4aht_data.fetch import ReleaseLocation, check_root, chosen_files, open_root
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
@@ -63,10 +63,12 @@ def verify_release(
     Raises:
         UnknownNameError: if `level` or a name in `wanted` does not exist.
         EmptySelectionError: if no history matches `wanted`.
-        OptionError: if the user name or password in an address has characters that are not percent-encoded.
+        OptionError: for a root that is neither a path nor an address, or if the user name or password in an address has
+            characters that are not percent-encoded.
     """
     check_choice("level", level, get_args(Level))
     root = MINI if root is None else root
+    check_root(root)
     check_credentials(str(root))
     report = Report(without_credentials(str(root)), level)
     try:

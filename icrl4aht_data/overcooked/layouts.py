@@ -343,6 +343,8 @@ def get_layout(name: str) -> Layout:
         UnknownNameError: lists the valid names and the nearest.
         PluginError: if a registered layout cannot be used.
     """
+    if not isinstance(name, str):
+        raise unknown("layout", name, all_layout_names())
     layout = LAYOUTS.get(name) or _BY_ALIAS.get(name) or _OF_RELEASES.get(name) or _of_manifests().get(name)
     if layout is not None:
         return layout

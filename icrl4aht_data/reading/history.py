@@ -101,6 +101,8 @@ class History(FieldArrays):
         """
         field = self._field(name)
         try:
+            if isinstance(start, bool) or isinstance(stop, bool):
+                raise TypeError
             start, stop, _ = slice(start, stop).indices(self.entry.rows(field))
         except TypeError as error:
             raise OptionError(f"rows {start!r} to {stop!r} of {name}: expected integers, as in a slice") from error

@@ -42,7 +42,7 @@ class ADBatch(NamedTuple, Generic[A]):
         obs: float32 or uint8 (B, L, 5, 5, C): the ego's observations; with obs="state" uint8 (B, L, S): state records.
         prev_actions: int32 (B, L): the ego's actions in the previous steps, 0..5; 0 at a history's first step.
         prev_rewards: float32 (B, L): the team's rewards in the previous steps; 0 at a history's first step.
-        target_actions: int32 (B, L): what a model learns to predict, 0..5: the ego's actions, or with `labels` those of
+        target_actions: int64 (B, L): what a model learns to predict, 0..5: the ego's actions, or with `labels` those of
             the expert or the oracle. The actions taken are then in the next column of `prev_actions`.
         dones: bool (B, L): True at the last step of an episode.
         attention_mask: bool (B, L): False on padding.
@@ -156,7 +156,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
             "obs": self._observer.spec(*shape),
             "prev_actions": ArraySpec("int32", shape),
             "prev_rewards": ArraySpec("float32", shape),
-            "target_actions": ArraySpec("int32", shape),
+            "target_actions": ArraySpec("int64", shape),
             "dones": ArraySpec("bool", shape),
             "attention_mask": ArraySpec("bool", shape),
             **({"prev_teammate_actions": ArraySpec("int32", shape)} if self.teammate_actions else {}),

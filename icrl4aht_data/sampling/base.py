@@ -24,10 +24,10 @@ from icrl4aht_data.utils.system import new_array
 from icrl4aht_data.utils.text import counted_histories, counted_noun, listed_names
 
 B = TypeVar("B", bound=tuple)
-"""A batch: a named tuple of NumPy arrays, some of which may be None."""
+"""A batch: a named tuple of NumPy arrays, some of which may be None. Targets are int64, which PyTorch's losses need."""
 
 D = TypeVar("D", bound=tuple)
-"""A batch on a device: a named tuple of JAX arrays."""
+"""A batch on a device: a named tuple of JAX arrays, whose integers are int32 unless JAX is set to 64 bits."""
 
 T = TypeVar("T", bound=tuple)
 """A batch for PyTorch: a named tuple of tensors; see `interop.torch_loader`."""
@@ -175,6 +175,7 @@ class Sampler(Generic[B, D, T]):
 
     def _layout_specs(self) -> dict[str, ArraySpec]:
         """Return the spec of the field `layouts`, present in batches of state records of several layouts."""
+        # Rendered observations can be read without their layout, state records cannot.
         several = self.dataset.obs == "state" and len(self.layouts) > 1
         return {"layouts": ArraySpec("int32", (self.local_size,))} if several else {}
 
@@ -188,6 +189,7 @@ class Sampler(Generic[B, D, T]):
         for array in arrays.values():
             if not (isinstance(array, np.ndarray) and array.flags.c_contiguous and array.flags.writeable):
                 raise OptionError("out: expected writeable, C-contiguous arrays; take a batch from sampler.empty()")
+        # A narrower dtype would change values without an error, and a larger buffer would keep old ones.
         found = {name: ArraySpec(str(array.dtype), array.shape) for name, array in arrays.items()}
         if found != self.specs:
             raise OptionError(f"out: expected {self.specs}, found {found}; take a batch from sampler.empty()")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -35,8 +35,9 @@ class BatchSource(Protocol[B]):
 class Batches(Iterator[B], Generic[B]):
     """An iterator over `sampler[start]`, `sampler[start + 1]`, .., prefetched by a thread.
 
-    After `break`, a new loop continues with the next batch; batch `stop - 1` is the last. `len(sampler)` batches have
-    as many steps as the selection: one pass over the data on average.
+    After `break`, a new loop continues with the next batch. `len(sampler)` batches have as many steps as the selection:
+    one pass over the data on average. With `stop`, a loop ends after batch `stop - 1`, and each further loop has the
+    next `stop - start` batches, as in `interop.torch_loader`.
 
     Exceptions in the thread are raised by `next`. The thread stops at the end of a `with` block, after `close()` and at
     the end of the iterator. Threads do not survive a fork: make a new iterator in the forked process.
@@ -44,7 +45,7 @@ class Batches(Iterator[B], Generic[B]):
     Args:
         sampler: makes the batches.
         start: number of the first batch.
-        stop: number after the last batch; None for an endless iterator.
+        stop: number after the last batch of the first loop; None for an endless iterator.
         prefetch: number of batches prepared in advance; with 0, `next` makes each batch itself, without a thread.
         device: a jax.Device or Sharding to which batches are copied as JAX arrays, while the previous batch is in use.
             If a sharding spans processes, each process contributes its share of the rows. Needs JAX.
@@ -76,7 +77,8 @@ class Batches(Iterator[B], Generic[B]):
         self._put = _device_put(device) if device is not None else None
         self._reuse = reuse or device is not None
         self.next, self.served, self.waited = check_int("start", start, 0), 0, 0.0
-        self._closed, self._process = False, os.getpid()
+        self._per_pass = 0 if self._stop is None else max(0, self._stop - self.next)
+        self._closed, self._ended, self._process = False, False, os.getpid()
         self._pool: ThreadPoolExecutor | None = None
         self._submitted = start
         self._pending: deque[tuple[Future[B], B | None]] = deque()  # submitted batches with their buffers
@@ -84,6 +86,10 @@ class Batches(Iterator[B], Generic[B]):
         self._lent: B | None = None  # buffer of the batch in use by the consumer
 
     def __iter__(self) -> Batches[B]:
+        # Only after the end of a pass: a position that was loaded there is the end of a finished training.
+        if self._ended and self._stop is not None and self._per_pass:
+            self._stop += (self.next - self._stop) // self._per_pass * self._per_pass + self._per_pass
+            self._closed = self._ended = False
         return self
 
     def __repr__(self) -> str:
@@ -92,8 +98,10 @@ class Batches(Iterator[B], Generic[B]):
         return f"Batches({state}; {self.served} taken, waited {self.waited:.1f} s) of {self._sampler!r}"
 
     def __next__(self) -> B:
-        if self._closed or (self._stop is not None and self.next >= self._stop):
+        if not self._closed and self._stop is not None and self.next >= self._stop:
             self.close()
+            self._ended = True
+        if self._closed:
             raise StopIteration
         if self._process != os.getpid():
             raise OptionError(
@@ -150,8 +158,8 @@ class Batches(Iterator[B], Generic[B]):
         return buffer
 
     def close(self) -> None:
-        """Stop the thread and discard prefetched batches; afterwards the iterator is exhausted."""
-        self._closed = True
+        """Stop the thread and discard prefetched batches; afterwards the iterator is exhausted, also for new loops."""
+        self._closed, self._ended = True, False
         self._stop_thread()
 
     def _stop_thread(self) -> None:
@@ -178,6 +186,8 @@ class Batches(Iterator[B], Generic[B]):
         Raises:
             OptionError: if the state comes from a sampler with other options or another selection; names them.
         """
+        if not isinstance(state, Mapping):
+            raise OptionError(f"state = {state!r:.100}: expected the result of state_dict()")
         expected, given = self._sampler.options(), {name: value for name, value in state.items() if name != "next"}
         if "channels" in expected:
             given.setdefault("channels", "own")  # states of version 0.1 do not contain this option
@@ -188,7 +198,7 @@ class Batches(Iterator[B], Generic[B]):
             found = ", ".join(f"{name} = {given.get(name)!r}, not {expected.get(name)!r}" for name in sorted(wrong))
             raise OptionError(f"the state belongs to other batches: it has {found or 'no `next`'}")
         self._stop_thread()
-        self._closed = False
+        self._closed = self._ended = False
         self.next = check_int("next", state["next"], 0)
 
 

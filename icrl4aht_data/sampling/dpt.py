@@ -43,7 +43,7 @@ class DPTBatch(NamedTuple, Generic[A]):
 
     Attributes:
         query_obs: float32 or uint8 (B, 5, 5, C): the ego's observation at the query step.
-        query_target: int32 (B,): the label to predict at the query step: the action 0..5 of the expert or the oracle.
+        query_target: int64 (B,): the label to predict at the query step: the action 0..5 of the expert or the oracle.
         context_obs: float32 or uint8 (B, K, 5, 5, C): observations of transitions of the same task.
         context_actions: int32 (B, K): the ego's actions in these transitions, 0..5.
         context_next_obs: float32 or uint8 (B, K, 5, 5, C): the next observations in the same episode.
@@ -134,9 +134,8 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         super().__init__(dataset, batch_size=batch_size, length=context, **options)
         check_choice("order", order, CONTEXT_ORDERS)
         self.labels = check_labels(dataset, labels)
-        ranges = (
-            map(self._transitions, self._draws.steps(i)) for i in (0, 2**62)
-        )  # the first and the last part of a curriculum
+        # The shortest part of a curriculum is its first or its last one, which a batch of any large number has.
+        ranges = (map(self._transitions, self._draws.steps(i)) for i in (0, 2**62))
         shortest = min(int((high - low).min()) for low, high in ranges)
         if (self.length if order == "contiguous" else 1) > shortest:
             raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; take fewer")
@@ -154,7 +153,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         asked = (self.local_size, self.queries) if self.queries > 1 else (self.local_size,)
         return {
             "query_obs": self._observer.spec(*asked),
-            "query_target": ArraySpec("int32", asked),
+            "query_target": ArraySpec("int64", asked),
             "context_obs": self._observer.spec(*shape),
             "context_actions": ArraySpec("int32", shape),
             "context_next_obs": self._observer.spec(*shape),
@@ -200,9 +199,8 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         observer.observe(context, records, batch.context_obs)
         observer.observe(context, next_records, batch.context_next_obs)
         if batch.layouts is not None:
-            batch.layouts[...] = self.dataset.layout_numbers[
-                query
-            ]  # query and context of a row have the same task, so the same layout
+            # Query and context of a row have the same task, so the same layout.
+            batch.layouts[...] = self.dataset.layout_numbers[query]
         return batch
 
     def _draw(self, i: int) -> _Contexts:

@@ -205,6 +205,8 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
         if not isinstance(episodes, tuple):
             raise TypeError
         first, stop = episodes
+        if isinstance(first, bool) or isinstance(stop, bool):
+            raise TypeError
         bounds = slice(first, stop)
         # Most histories have equally many episodes, so the Python loop is short.
         distinct, number = np.unique(counts, return_inverse=True)

@@ -346,6 +346,11 @@ def test_a_silent_server_times_out(what, tmp_path, monkeypatch):
     assert time.monotonic() - began < 5, "by default 15 s instead of 0.5 s"
 
 
+def test_a_time_out_without_text_says_what_happened():
+    with pytest.raises(RemoteError, match="https://a/b: TimeoutError: no answer for 15 s"):
+        clients.with_retries("https://a/b", lambda: (_ for _ in ()).throw(TimeoutError))
+
+
 def test_the_time_limit_of_the_hub_includes_other_requests_of_its_client(monkeypatch):
     monkeypatch.setattr(clients, "_TIMEOUT", 1.0)
     with silent_server() as server, clients.HubClient("org/name", "main").connect():
@@ -354,7 +359,6 @@ def test_the_time_limit_of_the_hub_includes_other_requests_of_its_client(monkeyp
         for path, limit in (("/other", 0.3), ("/file", 60)):
             with pytest.raises(Exception, match="timed out"):
                 get_session().get(endpoint + path, timeout=limit)
-            assert time.monotonic() - began < limit + 0.5
     assert time.monotonic() - began < 1.5
 
 

@@ -9,11 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch.nn import functional
+from torch.utils.data import DataLoader
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, torch_loader
@@ -202,6 +204,15 @@ class TestLosses:
         batch = take(load_icrl4aht(lite[0], layout="demo_wide").dpt(batch_size=3, context=7))
         assert batch.query_target.dtype == batch.context_actions.dtype == torch.int64
         assert functional.cross_entropy(torch.zeros(3, 6), batch.query_target) > 0
+
+
+def test_losses_take_the_targets_of_a_plain_data_loader(lite):
+    ds = load_icrl4aht(lite[0], layout="demo_wide")
+    samplers: list[Any] = [ds.ad(batch_size=3, length=9), ds.dpt(batch_size=3, context=7)]
+    batch, queries = (next(iter(DataLoader(one, batch_size=None))) for one in samplers)
+    assert (batch.target_actions.dtype, batch.prev_actions.dtype) == (torch.int64, torch.int32)
+    assert functional.cross_entropy(torch.zeros(3, 6, 9), batch.target_actions) > 0
+    assert functional.cross_entropy(torch.zeros(3, 6), queries.query_target) > 0
 
 
 @pytest.mark.parametrize(

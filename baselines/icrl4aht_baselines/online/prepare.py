@@ -108,6 +108,7 @@ def prepare_play(
 
 
 def _check_unused(name: str, histories: HistoryOptions) -> None:
+    # Settings are recorded: with an ignored option, equal runs would look different in tables.
     default = HistoryOptions(histories.layouts)
     for field in ("order", "queries", "labels", "every", "held_out"):
         found = getattr(histories, field)
@@ -135,7 +136,7 @@ def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple
 
 def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
     """Return the tasks on some layouts."""
-    check_heuristics(tasks)
+    check_heuristics(tasks)  # a manifest names learned teammates, but has no weights of theirs
     names = {layout.name for layout in layouts}
     found = [task for task in tasks if task.layout.name in names]
     if tasks and not found:
@@ -158,6 +159,7 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
                 found.setdefault((layout, teammate["family"]), {})[task_id] = mate
             else:
                 scripted.append((layout, task_id, teammate))
+    # Heuristics of one family play in one program, so all need the same parameters.
     entries = with_equal_parameters([teammate for _, _, teammate in scripted])
     for (layout, task_id, teammate), entry in zip(scripted, entries, strict=True):
         mates = found.setdefault((layout, teammate["family"]), {})
@@ -200,6 +202,7 @@ def _groups(
             other, (kind, mates) = with_four_recipes(layout), next(iter(kinds.items()))
             everywhere[other, kind] = mates
             shares[other.name] = FOUR_RECIPES_SHARE
+            # The version has another name, by which an indicator that is hidden on the layout would be shown.
             hidden += [other.name] * (layout.name in hidden)
     # Rearranged versions get their own part of the tasks; the other layouts divide the rest by their shares.
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
@@ -209,6 +212,7 @@ def _groups(
     groups = make_groups(policies, fixed, shares, hidden)
     played: set[str] = set()
     for group in groups:
+        # The same choice that `make_groups` made of the policies, which do not know their tasks.
         ids = list(everywhere[group.layouts[0], group.family])
         played |= {ids[number] for number in chosen_teammates(len(ids), len(group.teammates))}
     for layout, share in rearranged.items():
@@ -260,6 +264,7 @@ def _rearranged_groups(
         if not own:  # there may be fewer versions than kinds
             continue
         count = max(len(own), round(tasks * len(own) / versions))
+        # In turn, so that the numbers of tasks of two versions differ by one at most.
         where = [own[task % len(own)] for task in range(count)]
         chosen = [list(mates)[number] for number in chosen_teammates(len(mates), count)]
         policies = with_behaviours([mates[task_id].policy for task_id in chosen], mixed_chances(count))

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from icrl4aht_data import Curriculum, load_icrl4aht
-from icrl4aht_data.errors import Icrl4ahtError, OptionError, PositionTypeError
+from icrl4aht_data import Curriculum, get_layout, load_icrl4aht, verify_release
+from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.interop import hf_windows, render_observations, torch_loader
 
 SIZES: dict[str, Any] = {"batch_size": 2, "length": 5}
@@ -26,6 +26,7 @@ WRONG_OPTIONS: dict[str, dict[str, Any]] = {
     r"episodes = \(6, 9\): a history of 6 episodes has none": {"episodes": (6, 9)},
     r"episodes = \(0, 1, 2\): expected a pair": {"episodes": (0, 1, 2)},
     r"episodes = \(0, 1\.5\): expected a pair": {"episodes": (0, 1.5)},
+    r"episodes = \(True, 3\): expected a pair": {"episodes": (True, 3)},
     r"curriculum = \(10,\): expected a Curriculum": {"curriculum": (10,)},
     r"weights: expected 6 numbers.*found shape \(2,\)": {"weights": [1, 2]},
     "weights: expected 6 numbers.*not all zero": {"weights": [0] * 6},
@@ -43,6 +44,14 @@ WRONG_CONTEXTS: dict[str, dict[str, Any]] = {
 
 WRONG_CALLS: dict[str, Any] = {
     "root = 5: expected a release folder or an address": lambda ds: load_icrl4aht(5),  # type: ignore[arg-type]
+    r"root = 'a\\x00b': expected a release folder": lambda ds: load_icrl4aht("a\0b"),
+    "root = 7: expected a release folder": lambda ds: verify_release(7),  # type: ignore[arg-type]
+    r"unknown layout \['a'\]": lambda ds: get_layout(["a"]),  # type: ignore[arg-type]
+    "rows True to None of actions: expected integers": lambda ds: ds[0].read("actions", True),
+    "state = 5: expected": lambda ds: ds.ad(**SIZES).batches().load_state_dict(5),  # type: ignore[arg-type]
+    "unknown context 'x'; valid: spawn": lambda ds: torch_loader(ds.ad(**SIZES), workers=1, context="x"),
+    "state: expected bytes": lambda ds: render_observations({"layout": ["demo_wide"], "state": [[[300]]]}),
+    "layout = 5: expected": lambda ds: render_observations({"layout": 5, "state": []}),
     "split = {'train': 1}: expected a name": lambda ds: ds.filter(split={"train": 1}),
     "position True of the selection's histories: expected an integer": lambda ds: ds[True],
     "spans layouts coord_simple, demo_wide.*layout='coord_simple'": lambda ds: load_icrl4aht(ds.root).ad(**SIZES),
@@ -80,7 +89,7 @@ def test_options_of_contexts(dataset, message):
 
 @pytest.mark.parametrize("message", WRONG_CALLS)
 def test_calls(dataset, message):
-    with pytest.raises((OptionError, PositionTypeError), match=message):
+    with pytest.raises(Icrl4ahtError, match=message):
         WRONG_CALLS[message](dataset)
 
 

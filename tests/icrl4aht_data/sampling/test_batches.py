@@ -40,6 +40,23 @@ def test_batches_in_order(sampler, prefetch, reuse):
     assert next(batches, None) is None
 
 
+@pytest.mark.parametrize("prefetch", [0, 2])
+def test_a_second_loop_continues_after_the_first(sampler, prefetch):
+    batches = sampler.batches(2, 5, prefetch=prefetch)
+    for numbers in ([2, 3, 4], [5, 6, 7]):
+        assert [batches.next - 1 for _ in batches] == numbers
+        assert next(batches, None) is None
+    batches.load_state_dict({"next": 6, **sampler.options()})
+    assert [batches.next - 1 for _ in batches] == [6, 7]
+    batches.close()
+    assert list(batches) == list(sampler.batches(3, 3)) == []
+    finished = sampler.batches(0, 4)
+    finished.load_state_dict({"next": 4, **sampler.options()})
+    assert list(finished) == []
+    again = sampler.batches(stop=2)
+    assert_equal([*again, *again][3], sampler[3])
+
+
 def _aligned(array):
     """Return an array aligned such that JAX would alias it instead of copying."""
     if array is None:
@@ -56,7 +73,8 @@ def test_on_a_device(sampler, monkeypatch):
     for i, batch in enumerate(batches):
         assert isinstance(batch.obs, jax.Array)
         assert batch.prev_teammate_actions is None
-        assert_equal(jax.tree.map(np.asarray, batch), sampler[i])
+        in_32_bits = jax.tree.map(lambda array: np.asarray(jax.numpy.asarray(array)), sampler[i])
+        assert_equal(jax.tree.map(np.asarray, batch), in_32_bits)
 
 
 def test_prefetching_is_limited(sampler, monkeypatch):

@@ -161,7 +161,8 @@ def test_fields_dtypes_and_shapes(lite, obs):
         for name in found:
             steps = (4,) if name.startswith("query") else (4, 30)
             kind = name.split("_")[-1]
-            expected[name] = dtypes.get(kind, "int32"), (*steps, *shape) if kind == "obs" else steps
+            integer = "int64" if "target" in name else "int32"
+            expected[name] = dtypes.get(kind, integer), (*steps, *shape) if kind == "obs" else steps
         assert found == expected == sampler.specs
         assert batch.describe().splitlines()[0].split()[:2] == [next(iter(found)), dtypes["obs"]]
 
