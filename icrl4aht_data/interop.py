@@ -51,7 +51,7 @@ Rendered = Literal["float32", "uint8"]
 RENDERED: tuple[Rendered, ...] = ("float32", "uint8")
 """Dtypes that `render_observations` can return."""
 
-CONTEXTS = ("spawn", "forkserver", "fork")
+START_METHODS = ("spawn", "forkserver", "fork")
 """Ways in which `torch_loader` can start its processes."""
 
 IGNORED = -100
@@ -94,7 +94,7 @@ def torch_loader(
     """
     loader = import_optional("torch.utils.data", "a DataLoader").DataLoader
     numbers, per_pass = _numbers(sampler, start, stop), len(sampler)
-    check_choice("context", context, CONTEXTS)
+    check_choice("context", context, START_METHODS)
     if stop is None:
         numbers = range(numbers.start, (numbers.start // per_pass + 1) * per_pass)
     if workers and sampler.dataset.cache.cache != "stream":
