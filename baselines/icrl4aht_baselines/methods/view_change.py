@@ -27,6 +27,7 @@ from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
 from icrl4aht_data.overcooked.layouts import Layout
 
 _INDICATOR, _WALL = (CANONICAL_CHANNELS.index(name) for name in ("recipe_indicator", "wall"))
+_IS_WALL = np.arange(len(CANONICAL_CHANNELS)) == _WALL
 _RECIPE = np.array([name.startswith("recipe_") for name in CANONICAL_CHANNELS])
 _INGREDIENTS = [
     CANONICAL_CHANNELS.index(f"{of}_0")
@@ -70,7 +71,9 @@ class ViewChange(NamedTuple):
     def observations(self, obs: Num[Array, "*B 5 5 46"]) -> Num[Array, "*B 5 5 46"]:
         """Return the observations as the ego sees them."""
         hidden, rows, columns = (flag[..., None, None, None] for flag in self[:3])
-        counters = jnp.where(_RECIPE, 0, obs).at[..., _WALL].max(obs[..., _INDICATOR])
+        # `.at[..., _WALL].max` would be a scatter, which takes several times as long as all else here.
+        walls = jnp.maximum(obs, obs[..., _INDICATOR, None])
+        counters = jnp.where(_RECIPE, 0, jnp.where(_IS_WALL, walls, obs))
         obs = jnp.where(hidden, counters, obs)
         obs = _renamed(obs, self.naming)
         obs = jnp.where(rows, _exchanged(jnp.flip(obs, _ROWS), "up", "down"), obs)
