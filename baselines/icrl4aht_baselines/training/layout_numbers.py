@@ -20,15 +20,17 @@ class NumberedBatches:
     Args:
         sampler: of histories on some of the layouts.
         numbers: int32, new number of each layout of `sampler.layouts`.
-        layouts: number of all layouts.
-        mirrorings, namings: each row has one of the first so many of them; with 1 it is not changed.
+        layouts: all layouts.
+        mirror: whether to mirror each row at random.
+        rename: whether to rename the ingredients of each row's layout at random.
     """
 
     def __init__(
-        self, sampler: Any, numbers: np.ndarray, layouts: int = 1, mirrorings: int = 1, namings: int = 1
+        self, sampler: Any, numbers: np.ndarray, layouts: Sequence[Layout], mirror: bool = False, rename: bool = False
     ) -> None:
-        self._sampler, self._numbers, self._layouts = sampler, numbers, layouts
-        self._mirrorings, self._namings = mirrorings, namings
+        self._sampler, self._numbers, self._layouts = sampler, numbers, len(layouts)
+        self._mirrorings = MIRRORINGS if mirror else 1
+        self._namings = np.array([factorial(layout.ingredient_types) if rename else 1 for layout in layouts])
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._sampler, name)
@@ -42,12 +44,12 @@ class NumberedBatches:
         rows = len(batch.obs if hasattr(batch, "obs") else batch.query_obs)
         # A sampler of one layout does not number it.
         numbers = self._numbers[np.zeros(rows, np.int32) if batch.layouts is None else batch.layouts]
-        if self._mirrorings == self._namings == 1:
+        if self._mirrorings == self._namings.max() == 1:
             return batch._replace(layouts=numbers)
         # The change is a function of the batch's number and process, as the batch itself is.
         drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
         mirroring = drawn.integers(self._mirrorings, size=rows, dtype=np.int32)
-        naming = drawn.integers(self._namings, size=rows, dtype=np.int32)
+        naming = drawn.integers(self._namings[numbers], dtype=np.int32)
         actions = {
             name: mirrored_action(values, mirroring)
             for name, values in batch._asdict().items()
@@ -63,8 +65,6 @@ class NumberedBatches:
 def number_layouts(sampler: Any, layouts: Sequence[Layout], mirror: bool = False, rename: bool = False) -> Any:
     """Return the sampler with its layouts numbered as in `layouts`; its histories may be on some of these only."""
     numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
-    if mirror or rename:
-        namings = factorial(max(layout.ingredient_types for layout in layouts))
-        return NumberedBatches(sampler, numbers, len(layouts), MIRRORINGS if mirror else 1, namings if rename else 1)
     agree = sampler.dataset.obs != "state" or numbers.tolist() == list(range(len(layouts)))
-    return sampler if agree else NumberedBatches(sampler, numbers)
+    changed = mirror or rename
+    return NumberedBatches(sampler, numbers, layouts, mirror, rename) if changed or not agree else sampler
