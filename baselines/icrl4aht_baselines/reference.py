@@ -1,7 +1,7 @@
 """Make the reference models step by step, from a release of noise histories to evaluated models.
 
     OUT/noise/lite              release of noise histories, as `icrl4aht-data generate --profile noise` makes it
-    OUT/rl2-TRACK               RL^2, trained by playing with the training teammates of that release
+    OUT/rl2-reference-TRACK     RL^2, trained by playing with the training teammates of that release
     OUT/agent-TRACK             histories of RL^2 with falling noise, source `agent`
     OUT/rising-TRACK            such histories that begin at random, see `RL2_HISTORIES`
     OUT/NAME-TRACK              run folder of a model
@@ -92,6 +92,7 @@ class Recipe:
             to the first ones.
         greedy: whether it plays its most probable actions or draws them.
         cleared: whether to evaluate it on test tasks with its memory cleared at the start of each episode as well.
+        role: what the package bundles it for.
     """
 
     method: str
@@ -102,6 +103,7 @@ class Recipe:
     own_round: bool = False
     greedy: bool = False
     cleared: bool = False
+    role: str = ""
 
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
@@ -111,12 +113,18 @@ _QUERIES: dict[str, Any] = {"labels": "expert", "queries": _STEPS["context"] + 1
 _LONG: dict[str, Any] = {**_STEPS, "steps": 3000, "batch_size": 4, "context": 1000}
 
 RECIPES = {
-    "rl2": Recipe("rl2", "", RL2_SETTINGS["model"], {**RL2_SETTINGS["train"], "steps": 1600}),
-    "ad-student": Recipe("ad", "agent", _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True),
-    "dpt-student": Recipe("dpt", "agent", _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True),
-    "ad-rising": Recipe("ad", "rising", _TINY, _LONG, cleared=True),
+    "rl2-reference": Recipe(
+        "rl2", "", RL2_SETTINGS["model"], {**RL2_SETTINGS["train"], "steps": 1600}, role="plays best"
+    ),
+    "ad-reference": Recipe(
+        "ad", "agent", _TINY, _STEPS, {"labels": "expert"}, own_round=True, greedy=True, role="best of AD"
+    ),
+    "dpt-reference": Recipe(
+        "dpt", "agent", _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True, role="best of DPT"
+    ),
+    "ad-rising": Recipe("ad", "rising", _TINY, _LONG, cleared=True, role="gains most by its memory"),
 }
-"""Reference models by name: those of the bundled rl2-reference, ad-reference, dpt-reference and ad-rising."""
+"""Reference models by name; the bundled ones have the same names."""
 
 
 class ReferenceOutcome(NamedTuple):
@@ -224,7 +232,7 @@ class _Steps:
 
     def play(self) -> Path:
         """Train RL^2 by playing with the teammates of the noise histories and diverse ones. Return its run folder."""
-        recipe, folder = RECIPES["rl2"], self.out / f"rl2-{self.track}"
+        recipe, folder = RECIPES["rl2-reference"], self.out / f"rl2-reference-{self.track}"
         options = TrainOptions(**recipe.train)
         root = str(self.noise_release())
         choice = HistoryOptions(TRACKS[self.track]["train"], root, **TRACK_VIEWS[self.track])

@@ -434,6 +434,11 @@ def further_layout_names() -> tuple[str, ...]:
     return (*LAYOUT_PLUGINS.names, *(name for name in _OF_RELEASES if name not in LAYOUTS))
 
 
+def known_layouts() -> list[Layout]:
+    """Return all layouts that this process knows: published ones, those of this package's tasks, and further ones."""
+    return list({name: get_layout(name) for name in (*LAYOUTS, *_of_manifests(), *further_layout_names())}.values())
+
+
 def all_layout_names() -> list[str]:
     """Return all names that `get_layout` accepts: short names, environment names, and further ones."""
     return [*LAYOUTS, *_BY_ALIAS, *further_layout_names()]

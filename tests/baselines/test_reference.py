@@ -43,35 +43,35 @@ MODEL = {"layers": 1, "width": 8, "heads": 2, "encoder": "mlp", "teammate_action
 
 def test_recipes_make_the_bundled_models():
     """Recipes are valid, and equal the settings stored with the bundled models, except paths and newer options."""
-    names = {"rl2": "rl2-reference", "ad-student": "ad-reference", "dpt-student": "dpt-reference"}
     for name, recipe in RECIPES.items():
         get_method(recipe.method)
         ModelOptions(**recipe.model)
         TrainOptions(**recipe.train)
         for track, view in TRACK_VIEWS.items():
             HistoryOptions(TRACKS[track]["train"], **recipe.histories, **view)
-        bundle = names.get(name, name)
-        config = read_config(MODELS / bundle / "layout")
+        config = read_config(MODELS / name / "layout")
         rate = {"learning_rate": reference.OWN_SHARE * recipe.train["learning_rate"]} if recipe.own_round else {}
         expected = {**recipe.model, **recipe.train, **rate, "method": recipe.method}
         given = {**config["model"], **config["train"], "method": config["method"]}
         assert {key: given[key] for key in expected} == {
             key: list(value) if isinstance(value, tuple) else value for key, value in expected.items()
         }
-        assert bundled_models()[bundle].sampled is not recipe.greedy
+        assert bundled_models()[name].sampled is not recipe.greedy
         assert recipe.histories.items() <= config["histories"].items()
     assert all(noise.end == (0.0, 0.0) and noise.finish[1] < 1 for noise in RL2_HISTORIES.values())
 
 
 def test_unknown_names(tmp_path):
-    with pytest.raises(UnknownNameError, match=r"unknown reference model 'ad-studen'.*Did you mean 'ad-student'"):
-        make_reference("ad-studen", "teammate", tmp_path, print)
+    with pytest.raises(UnknownNameError, match=r"unknown reference model 'ad-referenc'.*Did you mean 'ad-reference'"):
+        make_reference("ad-referenc", "teammate", tmp_path, print)
     with pytest.raises(UnknownNameError, match="unknown track 'x'; valid: teammate, layout"):
-        make_reference("rl2", "x", tmp_path, print)
-    with pytest.raises(OptionError, match=r"rl2 learns from no histories.*ad-student, dpt-student, ad-rising"):
-        make_reference("rl2", "teammate", tmp_path, print, teacher="rl2-reference")
-    command = ["research", "reference", "--name", "rl2", "--out", str(tmp_path / "out"), "--teacher"]
-    for teacher, message in (("rl2-referenc", "unknown agent"), ("rl2-reference", "rl2 learns from no")):
+        make_reference("rl2-reference", "x", tmp_path, print)
+    with pytest.raises(
+        OptionError, match=r"rl2-reference learns from no histories.*ad-reference, dpt-reference, ad-rising"
+    ):
+        make_reference("rl2-reference", "teammate", tmp_path, print, teacher="rl2-reference")
+    command = ["research", "reference", "--name", "rl2-reference", "--out", str(tmp_path / "out"), "--teacher"]
+    for teacher, message in (("rl2-referenc", "unknown agent"), ("rl2-reference", "rl2-reference learns from no")):
         result = CliRunner().invoke(cli, [*command, teacher])
         assert message in f"{result.output} {result.exception}" and not (tmp_path / "out").exists()
 
@@ -109,18 +109,18 @@ def steps(tmp_path, monkeypatch) -> list[tuple[str, ...]]:
 
 
 def test_steps_of_building_ad_reference(steps, tmp_path):
-    found = make_reference("ad-student", "layout", tmp_path, print, evaluates=False)
-    assert found == ReferenceOutcome("ad-student", "layout", tmp_path / "ad-student-layout", {})
-    rate = f"{RECIPES['rl2'].train.get('learning_rate', TrainOptions.learning_rate):g}"
-    play = ("train", "rl2-layout", rate, "None")
+    found = make_reference("ad-reference", "layout", tmp_path, print, evaluates=False)
+    assert found == ReferenceOutcome("ad-reference", "layout", tmp_path / "ad-reference-layout", {})
+    rate = f"{RECIPES['rl2-reference'].train.get('learning_rate', TrainOptions.learning_rate):g}"
+    play = ("train", "rl2-reference-layout", rate, "None")
     assert steps == [
         play,
-        ("collect", "rl2-layout", "40", "agent-layout", "None"),
-        ("train", "ad-student-layout-first", "0.002", "None"),
+        ("collect", "rl2-reference-layout", "40", "agent-layout", "None"),
+        ("train", "ad-reference-layout-first", "0.002", "None"),
         play,  # finished: this stub only looks for the checkpoint
-        ("collect", "ad-student-layout-first", "20", "ad-student-layout-own", "rl2-layout"),
-        ("combine", "ad-student-layout-mixed", "agent-layout", "ad-student-layout-own"),
-        ("train", "ad-student-layout", "0.001", "ad-student-layout-first"),
+        ("collect", "ad-reference-layout-first", "20", "ad-reference-layout-own", "rl2-reference-layout"),
+        ("combine", "ad-reference-layout-mixed", "agent-layout", "ad-reference-layout-own"),
+        ("train", "ad-reference-layout", "0.001", "ad-reference-layout-first"),
     ]
 
 
@@ -141,7 +141,16 @@ def test_a_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
     monkeypatch.setattr(reference, "make_reference", make)
     monkeypatch.setattr(bundled, "bundle_run", lambda run, name, track, **way: copied.append((name, track)))
     monkeypatch.setattr(reference, "write_bundled_card", lambda name, found, **way: cards.append(found))
-    command = ["research", "reference", "--name", "rl2", "--out", str(tmp_path), "--bundle-as", "rl2-reference"]
+    command = [
+        "research",
+        "reference",
+        "--name",
+        "rl2-reference",
+        "--out",
+        str(tmp_path),
+        "--bundle-as",
+        "rl2-reference",
+    ]
     result = CliRunner().invoke(cli, [*command, "--track", "layout", "--track", "teammate"], catch_exceptions=False)
     assert result.exit_code == 0 and copied == [("rl2-reference", "layout"), ("rl2-reference", "teammate")]
     assert [found.track for found in cards[0]] == ["teammate", "layout"]
@@ -155,7 +164,7 @@ def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):
     trained = {"config": config, "manifest_sha256": "ab12", "run_hash": "1"}
 
     def evaluated(folder: Path) -> EvaluationRun:
-        run = evaluated_run("ad-student", ("cramped_down",) if "layout" in folder.parts else ("demo_wide",))
+        run = evaluated_run("ad-reference", ("cramped_down",) if "layout" in folder.parts else ("demo_wide",))
         return dataclasses.replace(run, sources=(run.sources[0]._replace(trained=trained, folder=str(folder)),))
 
     monkeypatch.setattr(reference, "read_run", evaluated)
@@ -164,11 +173,11 @@ def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):
     (tmp_path / "ad-x" / "layout" / "curves.png").write_bytes(b"")
     kinds = ("test-seeded", "validation", "diverse")
     outcomes = [
-        ReferenceOutcome("ad-student", track, tmp_path, {kind: Path(track) / kind for kind in kinds})
+        ReferenceOutcome("ad-reference", track, tmp_path, {kind: Path(track) / kind for kind in kinds})
         for track in TRACKS
     ]
     card = write_bundled_card("ad-x", outcomes, tmp_path).read_text(encoding="utf-8")
-    assert "| made by | `icrl4aht-data research reference --name ad-student --bundle-as ad-x` |" in card
+    assert "| made by | `icrl4aht-data research reference --name ad-reference --bundle-as ad-x` |" in card
     shown = re.findall(r"!\[\w+\]\((.+)\)", card.split("## Curves")[1].split("## Limits")[0])
     assert shown == ["layout/curves.png"]
 
@@ -193,16 +202,16 @@ def small(monkeypatch, tmp_path) -> Path:
 
 @pytest.mark.slow
 def test_a_model_of_rl2_histories_and_its_own(small):
-    found = make_reference("ad-student", "layout", small, lambda *shown: None, evaluates=False)
-    assert found.run == small / "ad-student-layout" and found.results == {}
+    found = make_reference("ad-reference", "layout", small, lambda *shown: None, evaluates=False)
+    assert found.run == small / "ad-reference-layout" and found.results == {}
     made = {path.name for path in small.iterdir() if path.is_dir() and not path.name.startswith(".")}
-    own_round = {f"ad-student-layout{end}" for end in ("", "-first", "-own", "-mixed")}
-    assert made == {"noise", "rl2-layout", "agent-layout", *own_round}
+    own_round = {f"ad-reference-layout{end}" for end in ("", "-first", "-own", "-mixed")}
+    assert made == {"noise", "rl2-reference-layout", "agent-layout", *own_round}
     trained = read_trained(found.run)
     assert trained.hide_recipe == ("asymm_both",) and trained.step == 2
     assert {cell["source"] for cell in trained.trained_on} == {"agent"}
-    own, mixed = (load_icrl4aht(small / f"ad-student-layout-{name}") for name in ("own", "mixed"))
+    own, mixed = (load_icrl4aht(small / f"ad-reference-layout-{name}") for name in ("own", "mixed"))
     assert len(mixed) == len(own) + len(load_icrl4aht(small / "agent-layout"))
     times = {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")}
-    make_reference("ad-student", "layout", small, lambda *shown: None, evaluates=False)
+    make_reference("ad-reference", "layout", small, lambda *shown: None, evaluates=False)
     assert {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")} == times

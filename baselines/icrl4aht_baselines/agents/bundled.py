@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,7 +31,7 @@ MODEL_CARD = "README.md"
 """File name of a bundled model's card, in the folder NAME."""
 
 BUNDLE = "bundle.json"
-"""File name of a bundled model's way of playing, in the folder NAME: {"sampled": whether it draws its actions}."""
+"""File name of what `BundledModel` says of a model, in the folder NAME."""
 
 _LARGEST = 2 * 10**6  # maximum size of a bundled model's parameters, in bytes
 
@@ -42,11 +43,15 @@ class BundledModel(NamedTuple):
         name: such as "ad-reference".
         runs: track -> run folder of its model.
         sampled: whether it draws its actions unless another way of playing is chosen.
+        role: what it is bundled for.
+        date: day on which it was bundled, such as "2026-11-24".
     """
 
     name: str
     runs: dict[str, Path]
     sampled: bool = False
+    role: str = ""
+    date: str = ""
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
@@ -55,7 +60,7 @@ def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
     for path in sorted(folder.glob("*/")):
         runs = {track: path / track for track in TRACKS if (path / track / CONFIG).is_file()}
         if runs:
-            found[path.name] = BundledModel(path.name, runs, parse_json(read_text(path / BUNDLE))["sampled"])
+            found[path.name] = BundledModel(path.name, runs, **parse_json(read_text(path / BUNDLE)))
     return found
 
 
@@ -68,7 +73,7 @@ def describe_model(model: BundledModel) -> list[str]:
         sources = sorted({cell["source"] for cell in trained.trained_on})
         context = "" if trained.method.data == "tasks" else f", K = {trained.context}"
         lines.append(
-            f"{model.name}, track {track}: {trained.label}, {count:,} parameters{context}, {trained.step:,} steps on "
+            f"track {track}: {trained.label}, {count:,} parameters{context}, {trained.step:,} steps on "
             f"{', '.join(trained.layouts)} (source {' and '.join(sources)})"
             + (", draws its actions" if model.sampled else "")
         )
@@ -85,7 +90,9 @@ def check_bundle_name(name: str) -> None:
         raise OptionError(f"name = {name!r}: expected words of small letters and digits with hyphens: ad-reference")
 
 
-def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampled: bool = False) -> Path:
+def bundle_run(
+    run: Path, name: str, track: str, folder: Path = MODELS, *, sampled: bool = False, role: str = ""
+) -> Path:
     """Copy a finished run into the bundled models and return its folder there; the track's earlier run is replaced.
 
     Args:
@@ -94,6 +101,7 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampl
         track: the track whose tasks the run plays.
         folder: folder of the bundled models.
         sampled: whether the model draws its actions by default, on all tracks.
+        role: what it is bundled for.
 
     Raises:
         OptionError: if the name is not of small letters, digits and hyphens, or if the run is not finished or its
@@ -116,5 +124,6 @@ def bundle_run(run: Path, name: str, track: str, folder: Path = MODELS, *, sampl
     Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)
     if (run / RUN_CURVES).is_file():
         shrink_picture(run / RUN_CURVES, target / RUN_CURVES)
-    (folder / name / BUNDLE).write_text(json.dumps({"sampled": sampled}) + "\n", encoding="utf-8")
+    about = {"sampled": sampled, "role": role, "date": f"{date.today()}"}
+    (folder / name / BUNDLE).write_text(json.dumps(about) + "\n", encoding="utf-8")
     return target

@@ -129,8 +129,8 @@ def collect_command(
 @click.command(
     "reference",
     epilog=examples(
-        "icrl4aht-data research reference --name ad-student",
-        "icrl4aht-data research reference --name rl2 --track teammate --out runs/reference",
+        "icrl4aht-data research reference --name ad-reference",
+        "icrl4aht-data research reference --name rl2-reference --track teammate --out runs/reference",
         "icrl4aht-data research reference --name ad-rising --teacher rl2-reference",
     ),
 )
@@ -140,13 +140,13 @@ def collect_command(
     type=shared.REFERENCE_NAME,
     multiple=True,
     required=True,
-    help="Model, such as ad-student; repeat.",
+    help="Model, such as ad-reference; repeat.",
 )
 @click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of teammate or layout.")
 @click.option(
     "--teacher",
     type=shared.EGO_NAME,
-    help="Learn from histories of this agent, such as rl2-reference, not of a new rl2.",
+    help="Learn from histories of this agent, such as rl2-reference, not of a new one.",
 )
 @click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
 @click.option(
@@ -162,9 +162,9 @@ def reference_command(
     """Make reference models, with everything that they need.
 
     Rebuilds a release of noise histories, trains, records histories of trained agents where a model learns from them,
-    and evaluates. One model for each track. The same command resumes a stopped one. rl2 learns by playing with training
-    teammates. ad-student, dpt-student: histories of rl2, labelled with its choices. ad-rising: histories of rl2 that
-    begin at random, imitated with their noise.
+    and evaluates. One model for each track. The same command resumes a stopped one. rl2-reference learns by playing
+    with training teammates. ad-reference, dpt-reference: histories of rl2-reference, labelled with its choices.
+    ad-rising: those that begin at random, imitated with their noise.
     """
     from icrl4aht_baselines.agents.bundled import bundle_run, check_bundle_name
     from icrl4aht_baselines.reference import RECIPES, check_taught, make_reference, write_bundled_card
@@ -192,8 +192,8 @@ def reference_command(
             click.echo(f"  {kind}: {folder}")
     if bundle:
         for found in outcomes:
-            sampled = not RECIPES[found.name].greedy
-            click.echo(f"bundled: {bundle_run(found.run, bundle, found.track, sampled=sampled)}")
+            sampled, role = not RECIPES[found.name].greedy, RECIPES[found.name].role
+            click.echo(f"bundled: {bundle_run(found.run, bundle, found.track, sampled=sampled, role=role)}")
         in_order = sorted(outcomes, key=lambda found: list(TRACKS).index(found.track))
         click.echo(f"card: {write_bundled_card(bundle, in_order, teacher=teacher)}")
 
@@ -288,11 +288,15 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
 def models_command() -> None:
     """List the bundled models.
 
-    Their names are agents of `evaluate`, `watch` and `collect`. One line per model and track: method, parameters,
-    context, training layouts and sources, and whether it draws its actions unless --greedy is given.
+    Their names are agents of `evaluate`, `watch` and `collect`. First what each is bundled for, its scores N on the
+    tracks and its memory control M, as on the page of results, and its date. Then a line for each track: method,
+    parameters, context, training layouts and sources, and whether it draws its actions unless --greedy is given.
     """
     from icrl4aht_baselines.agents.bundled import bundled_models, describe_model
+    from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file
 
+    stored = read_stored(results_file())
     for model in bundled_models().values():
+        click.echo(f"{model.name}: {model.role}; {describe_scores(stored, model.name)}; of {model.date}")
         for line in describe_model(model):
-            click.echo(line)
+            click.echo(f"  {line}")

@@ -279,7 +279,7 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
     found: dict[tuple[str, str], MeanInterval] = {}
     chosen = {}
     for agent, cells in results.items():
-        chosen[agent] = [cell for cell in open_cells(scales) if cell in cells] or [*cells]
+        chosen[agent] = _controlled_cells(cells, scales)
         for name, control, block in (("M", "cleared", "all"), ("P", "swapped", "last 20")):
             other = controls[control].get(agent, {})
             played = [cell for cell in chosen[agent] if cell in other]
@@ -298,6 +298,22 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
             row.append(f"{mean_of(parts):z.1f}" if parts else "–")
         body.append(row)
     return markdown_table(["model", "M", "P", *EPISODE_BLOCKS], body, right=len(EPISODE_BLOCKS))
+
+
+def _controlled_cells(cells: AgentReturns, scales: CellScales) -> list[ResultCell]:
+    return [cell for cell in open_cells(scales) if cell in cells] or [*cells]
+
+
+def describe_scores(stored: StoredResults, agent: str) -> str:
+    """Return N of an agent on each track, and M, in words; a dash for what is not stored. See tables 1 and 2."""
+    scales, cells = cell_scales(SUBMITTED_PROTOCOL), stored.returns().get(agent, {})
+    cleared = stored.returns("cleared").get(agent, {})
+    texts = []
+    for track in TRACKS:
+        score = find_score(cells, track_cells(open_cells(scales), track), scales) if cells else None
+        texts.append(f"N {_shown(score and score.total)} on track {track}")
+    played = [cell for cell in _controlled_cells(cells, scales) if cell in cleared]
+    return ", ".join([*texts, f"M {_shown(block_difference(cells, cleared, played, 'all'), 1, '+')}"])
 
 
 def mean_best(layout: str, scales: CellScales) -> float | None:

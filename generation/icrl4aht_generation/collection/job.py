@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from icrl4aht_data.overcooked.layouts import Layout, add_layouts
 from icrl4aht_generation.collection.scripted import play_histories
 from icrl4aht_generation.collection.scripted_rollout import scripted_pieces
 from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, UpdateCallback, learn_histories
@@ -64,12 +65,15 @@ class CollectionJob:
         profile: its profile.
         artefacts: folder of all artefacts.
         suite: folder of the learned teammates, if the tasks have any.
+        layouts: the profile's generated layouts. A worker has to know them all, so that programs are compiled for the
+            largest of them.
     """
 
     work: Work
     profile: Profile
     artefacts: Path
     suite: Path | None = None
+    layouts: tuple[Layout, ...] = ()
 
     @property
     def name(self) -> str:
@@ -112,6 +116,7 @@ class CollectionJob:
 
     def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
         """Make the artefact, see `jobs.job.Job`."""
+        add_layouts(self.layouts)
 
         def on_metrics(update: int, metrics: dict[str, float]) -> None:
             on_update(update + 1, metrics["steps_per_second"])

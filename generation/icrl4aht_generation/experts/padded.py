@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from icrl4aht_data.overcooked.cells import GOAL
-from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, further_layout_names, get_layout
+from icrl4aht_data.overcooked.layouts import Layout, known_layouts
 from icrl4aht_data.overcooked.state import padded_positions
 from icrl4aht_data.overcooked.tables import Tables, stack_tables
 from icrl4aht_generation.experts.oracle import oracle_params
@@ -37,18 +37,18 @@ _SIZE_CLASSES = (45, 66)
 
 
 def padded_layout(layout: Layout, by_size: bool = False) -> PaddedLayout:
-    """Return a layout padded to the largest layout that this process knows: published, registered or of a release.
+    """Return a layout padded to the largest layout that this process knows, see `known_layouts`.
 
     Args:
         layout: the layout.
         by_size: pad it only to the largest known layout of its size class; for long runs, where faster steps make up
             for one more compilation for each class.
     """
-    names = (*LAYOUTS, *further_layout_names())
+    group = known_layouts()
     if by_size:
         own = _size_class(layout)
-        names = tuple(name for name in names if _size_class(get_layout(name)) == own)
-    return _padded(layout, names)
+        group = [one for one in group if _size_class(one) == own]
+    return _padded(layout, tuple(group))
 
 
 def _size_class(layout: Layout) -> int:
@@ -61,8 +61,8 @@ def own_layout(layout: Layout) -> PaddedLayout:
 
 
 @lru_cache(maxsize=1024)
-def _padded(layout: Layout, names: tuple[str, ...]) -> PaddedLayout:
-    group = [layout, *_largest_of(names)]
+def _padded(layout: Layout, others: tuple[Layout, ...]) -> PaddedLayout:
+    group = [layout, *_largest_of(others)]
     tables = jax.tree.map(lambda leaf: leaf[0], stack_tables(group))
     facts, blank = oracle_params(group)
     oracle = jax.tree.map(lambda leaf: leaf[:1], facts), blank
@@ -70,8 +70,8 @@ def _padded(layout: Layout, names: tuple[str, ...]) -> PaddedLayout:
 
 
 @lru_cache(maxsize=8)
-def _largest_of(names: tuple[str, ...]) -> list[Layout]:
-    return largest_layouts([get_layout(name) for name in names]) if names else []
+def _largest_of(layouts: tuple[Layout, ...]) -> list[Layout]:
+    return largest_layouts(layouts) if layouts else []
 
 
 def largest_layouts(layouts: Sequence[Layout]) -> list[Layout]:

@@ -101,7 +101,7 @@ def run_job(job: Job, wait: bool, on_update: OnUpdate = lambda update, speed: No
 
 
 def run_in_worker(job: Job, wait: bool) -> Literal["done", "busy"]:
-    """Run a job in a process of its own, which has not used JAX before."""
+    """Run a job in a process that runs nothing but jobs with this number of threads."""
     request_determinism()
     if job.xla_threads:
         limit_xla_threads(job.xla_threads)

@@ -7,7 +7,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import closing
 from pathlib import Path
@@ -31,6 +31,10 @@ from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.ray_executor import run_on_ray
 
 _POLL_SECONDS = 1.0
+_JOBS_OF_A_PROCESS = 32  # then its memory is released; until then its jobs share what it compiled
+
+_Pool = tuple[int | None, ProcessPoolExecutor]
+"""Number of threads, and a pool of one process: a worker that is killed breaks its own pool only."""
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOptions) -> None:
@@ -124,28 +128,29 @@ def _run_here(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOp
 
 
 def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
-    """Run several jobs at a time, each in a process of its own, so that its memory is released."""
+    """Run several jobs at a time in processes, which keep what they compiled for their next jobs."""
     if not jobs:
         return
     before: Any = None
     if current_thread() is main_thread():
         # By default SIGTERM would end this process without a word to its workers.
         before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-    context, waiting, running = multiprocessing.get_context("spawn"), list(jobs), {}
+    waiting, running = list(jobs), {}
+    idle: list[_Pool] = []
     attempts = dict.fromkeys((job.name for job in jobs), 0)
     try:
         while waiting or running:
             while waiting and len(running) < (options.workers or 1):
                 job = waiting.pop(0)
                 attempts[job.name] += 1
-                # A pool for each job: a worker that is killed breaks its own pool only.
-                pool = ProcessPoolExecutor(1, context)
-                running[pool.submit(run_in_worker, job, wait)] = job, pool
+                future, pool = _start_job(job, wait, idle)
+                running[future] = job, pool
             ended, _ = wait_for(running, _POLL_SECONDS, FIRST_COMPLETED)
             for future in ended:
                 job, pool = running.pop(future)
-                pool.shutdown(wait=False)
                 error = future.exception()
+                if not isinstance(error, BrokenExecutor):
+                    idle.append(pool)
                 if error is None:
                     yield JobOutcome(job, future.result(), attempts[job.name])
                 elif not isinstance(error, Exception):  # the worker was told to stop
@@ -156,13 +161,29 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                     yield _failed(job, attempts[job.name], error)
             board.show_stated(job for job, _ in running.values())
     finally:
-        for _, pool in running.values():
+        for _, pool in (*(pool for _, pool in running.values()), *idle):
             pool.shutdown(wait=False, cancel_futures=True)
         if running:
             for process in multiprocessing.active_children():
                 process.terminate()
         if before is not None:
             signal.signal(signal.SIGTERM, before)
+
+
+def _start_job(job: Job, wait: bool, idle: list[_Pool]) -> tuple[Future[Any], _Pool]:
+    """Start a job in an idle process with its number of threads, or in a new one."""
+    for number, (threads, pool) in enumerate(idle):
+        if threads == job.xla_threads:
+            del idle[number]
+            try:
+                return pool.submit(run_in_worker, job, wait), (threads, pool)
+            except BrokenExecutor:  # the idle process was killed
+                break
+    if idle:  # its process holds memory that the new one may need
+        idle.pop()[1].shutdown()
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(1, context, max_tasks_per_child=_JOBS_OF_A_PROCESS)
+    return pool.submit(run_in_worker, job, wait), (job.xla_threads, pool)
 
 
 def _failed(job: Job, attempts: int, error: BaseException) -> JobOutcome:

@@ -12,6 +12,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.format.schema import KINDS, Kind
+from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import check_own_folder, process_lock
 from icrl4aht_data.utils.progress import counted, progress_bars
@@ -78,7 +79,8 @@ def build_releases(
         units, headroom, left_out = train_teammates(profile, suite, seed, console, options)
     else:
         units, headroom, left_out = profile.units_of(tasks, sources or {}), {}, []
-    jobs = [CollectionJob(work, profile, out / "artefacts", suite) for work in units]
+    generated = tuple(get_layout(name) for name in profile.layouts if name not in LAYOUTS)
+    jobs = [CollectionJob(work, profile, out / "artefacts", suite, generated) for work in units]
     run_jobs(jobs, out, console, options)
     tasks = list({work.task.task_id: work.task for work in units}.values())
     artefacts, releases = out / "artefacts", [out / kind for kind in kinds]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.methods.options import ModelOptions
+from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_generation.teammates.instances import published_task
@@ -106,7 +108,9 @@ def test_large_models_are_refused(run, tmp_path, monkeypatch):
 
 def test_the_package_bundles_models_that_play_and_have_cards():
     assert set(bundled_models(MODELS)) == {"ad-reference", "ad-rising", "dpt-reference", "rl2-reference"}
+    stored = read_stored(results_file())
     for model in bundled_models(MODELS).values():
+        assert model.role and re.fullmatch(r"M [+-]\d.*", describe_scores(stored, model.name).split(", ")[-1])
         assert (MODELS / model.name / MODEL_CARD).is_file()
         assert model.sampled == (model.name != "ad-reference")
         for track, folder in model.runs.items():
@@ -131,7 +135,10 @@ def test_parameters_of_another_model_are_refused(run, tmp_path):
 def test_models_command(models):
     result = CliRunner().invoke(cli, ["models"], catch_exceptions=False)
     assert result.exit_code == 0
-    assert "ad-tiny, track teammate: AD+mlp, " in result.output
+    assert re.search(
+        r"^ad-tiny: ; N – on track teammate, N – on track layout, M –; of 20\d\d-\d\d-\d\d\n", result.output
+    )
+    assert "\n  track teammate: AD+mlp, " in result.output
     assert "parameters, K = 6, 1 steps on demo_wide (source noise)" in result.output
 
 
