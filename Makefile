@@ -14,7 +14,7 @@ STAMP := $(VENV)/installed
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 CODE := icrl4aht_data generation baselines benchmarks tests
 
-.PHONY: help install demo generate teammates verify control test test-slow check docs format bench-env bench-collect bench-gpu bench-learn bench-loader clean
+.PHONY: help install constraints demo generate teammates verify control test test-slow check docs format bench-env bench-collect bench-gpu bench-learn bench-loader clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -27,6 +27,9 @@ $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@
+
+constraints: install ## write the versions in .venv into constraints.txt, once the tests have passed with them
+	$(BIN)/python -m pip freeze --exclude-editable | sed 's/+cpu//' > constraints.txt
 
 demo: install ## load, sample, verify, train, show what a model earns by its memory (at most 7 minutes)
 	$(BIN)/icrl4aht-data demo

@@ -61,7 +61,7 @@ train rl2 --layout demo_wide --size tiny | --size: not with rl2, which learns by
 train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: not with rl2, which learns by playing
 train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
 research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | its card states its results
-research reference --name rl2-reference --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters and digits
+research reference --name rl2-reference --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters
 results | Missing option '--out'
 submit empty --out r.json --about a | Missing option '--data'
 evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'

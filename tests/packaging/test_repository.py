@@ -1,0 +1,76 @@
+"""Files that services and tools of the repository read: workflows, issue forms, hooks, constraints, the citation."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import version
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from tests.helpers.paths import ROOT
+
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+FORMS = [ROOT / ".github" / "ISSUE_TEMPLATE" / name for name in ("bug.yml", "proposal.yml")]
+SCHEMAS = {
+    "github-workflows": WORKFLOWS,
+    "github-issue-forms": FORMS,
+    "github-issue-config": [ROOT / ".github" / "ISSUE_TEMPLATE" / "config.yml"],
+    "citation-file-format": [ROOT / "CITATION.cff"],
+}
+
+
+def requirements() -> list[Requirement]:
+    """Return the requirements of the package and its extras, without those on itself."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lists = [project["dependencies"], *project["optional-dependencies"].values()]
+    found = [Requirement(text) for texts in lists for text in texts]
+    return [one for one in found if one.name != "icrl4aht-data"]
+
+
+@pytest.mark.parametrize("schema", SCHEMAS)
+def test_files_have_their_schema(schema):
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", f"vendor.{schema}", *SCHEMAS[schema]]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_workflows_run_targets_that_exist():
+    """Each `make TARGET` is a target of the Makefile, and the matrix has the Python versions of the package."""
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    texts = [path.read_text() for path in WORKFLOWS]
+    benches = yaml.safe_load(texts[0])["jobs"]["benchmarks"]["strategy"]["matrix"]["bench"]
+    called = {name for text in texts for line in re.findall(r"make ([a-z -]+)", text) for name in line.split()}
+    called = called - {"bench-"} | {f"bench-{name}" for name in benches}
+    assert called >= {"test-slow", "demo", "check", "docs", "bench-env"} and called <= targets
+
+
+def test_hooks_are_valid():
+    command = [sys.executable, "-m", "pre_commit", "validate-config", str(ROOT / ".pre-commit-config.yaml")]
+    assert subprocess.run(command, check=False).returncode == 0
+
+
+def test_constraints_are_versions_that_the_package_allows():
+    lines = [Requirement(line) for line in (ROOT / "constraints.txt").read_text().splitlines()]
+    pinned = {canonicalize_name(one.name): str(one.specifier).removeprefix("==") for one in lines}
+    for one in requirements():
+        name = canonicalize_name(one.name)
+        if name in pinned:
+            assert pinned[name] in one.specifier, one
+        else:
+            assert "cuda" in str(one) or name == "distrax", f"{one}: no tested version; run `make constraints`"
+
+
+def test_the_lowest_jax_is_tested():
+    (jax,) = (one for one in requirements() if one.name == "jax" and not one.extras)
+    lowest = str(jax.specifier).removeprefix(">=")
+    assert f"jax=={lowest}.0" in (ROOT / ".github" / "workflows" / "tests.yml").read_text()
+
+
+def test_the_citation_has_the_version():
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version("icrl4aht-data")
