@@ -1,4 +1,5 @@
-"""Description of a release in Croissant 1.1, the metadata format of dataset search engines and loaders.
+"""Description of a release in Croissant 1.1, the metadata format of dataset search engines and loaders, and in its
+responsible-AI vocabulary 1.0.
 
 Every file is a FileObject with its SHA-256 and an address relative to croissant.json. The Parquet copies of the index
 and of the episodes are RecordSets with a description of every field. Croissant does not support HDF5, so the
@@ -13,13 +14,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from icrl4aht_data.format.info import ReleaseInfo, read_info
+from icrl4aht_data.format.index import read_index
+from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES, PARQUET_INDEX, TEXTS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, record_width
 from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.templates import card_file
-from icrl4aht_data.writing.card import card_texts, episode_texts
+from icrl4aht_data.writing.card import card_texts, episode_texts, rai_texts
 
 if TYPE_CHECKING:
     import mlcroissant
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 CROISSANT = "croissant.json"
 
 _STANDARD = "http://mlcommons.org/croissant/1.1"
+_RAI_STANDARD = "http://mlcommons.org/croissant/RAI/1.0"
 _LICENCE = "https://spdx.org/licenses/MIT.html"
 _FORMATS = {
     ".h5": "application/x-hdf5",
@@ -61,7 +64,8 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         OptionError: if mlcroissant is not installed.
     """
     mlc = import_optional("mlcroissant", "croissant.json")
-    info, texts = read_info(root), card_texts("arrays")
+    index, texts = read_index(root), card_texts("arrays")
+    info, sources = index.info, {entry.source for entry in index.entries}
     arrays = "; ".join(f"{name}: {texts[name]}" for name, field in FIELDS.items() if info.kind not in field.absent)
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)
@@ -82,7 +86,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         sets, records = zip(*_tables(context, info), strict=True)
         return mlc.Metadata(
             ctx=context,
-            conforms_to=[_STANDARD],
+            conforms_to=[_STANDARD, _RAI_STANDARD],
             name="icrl4aht_learning_histories",
             description=(
                 "Learning histories of ego agents that learn to cook in OvercookedV2 with one fixed teammate each, "
@@ -98,6 +102,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             keywords=["reinforcement learning", "in-context learning", "ad-hoc teamwork", "Overcooked"],
             distribution=[*files, *sets],
             record_sets=list(records),
+            **rai_texts(sources),
         ).to_json()
 
 

@@ -6,7 +6,7 @@ import json
 import math
 import tomllib
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -73,7 +73,7 @@ def card_texts(section: str) -> dict[str, str]:
 
     Args:
         section: "sources" (of histories), "kinds" (of release), "arrays" (`schema.FIELDS`), "index" (fields of
-            `schema.Entry`) or "episodes" (other columns of `EPISODE_COLUMNS`).
+            `schema.Entry`), "episodes" (other columns of `EPISODE_COLUMNS`) or "rai" (see `rai_texts`).
     """
     return tomllib.loads(card_file("dataset_texts.toml").read_text(encoding="utf-8"))[section]
 
@@ -82,6 +82,11 @@ def episode_texts() -> dict[str, str]:
     """Return column name -> description, for the columns of `EPISODE_COLUMNS`."""
     texts = card_texts("index") | card_texts("arrays") | card_texts("episodes")
     return {name: texts[name] for name in EPISODE_COLUMNS}
+
+
+def rai_texts(sources: Container[str]) -> dict[str, str]:
+    """Return the responsible-AI fields of a release with these sources, name in mlcroissant -> text."""
+    return card_texts("rai") | (card_texts("rai_human") if "human" in sources else {})
 
 
 def write_card(root: Path) -> None:
@@ -198,6 +203,7 @@ def facts(root: Path) -> dict[str, Any]:
         **_making(tasks),
         "least": {"rise": _LEAST_RISE, "headroom": LEAST_HEADROOM, "same": SAME_BEHAVIOUR},
         "texts": {section: card_texts(section) for section in ("sources", "kinds", "arrays")},
+        "rai": rai_texts(sources),
         "paper": {"ego": PAPER_EGO_STEPS, "teammate": PAPER_TEAMMATE_STEPS, "teammates": PAPER_TEAMMATES * 4},
         "citation": card_file("citation.bib").read_text(encoding="utf-8").strip(),
     }

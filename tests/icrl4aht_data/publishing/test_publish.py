@@ -175,7 +175,9 @@ def test_croissant_is_valid_and_its_records_equal_the_index(published):
     assert len(episodes) == 12 * 6
     content = json.loads((published / "croissant.json").read_text())
     assert content["datePublished"] == "2026-01-02"
-    assert content["conformsTo"].endswith("/1.1")
+    assert [text.rsplit("/", 1)[1] for text in content["conformsTo"]] == ["1.1", "1.0"]
+    assert content["rai:personalSensitiveInformation"] == "None."
+    assert content["rai:dataCollectionType"] == "Software Collection" and len(content["rai:dataUseCases"]) > 50
     hashed = {part["@id"]: part["sha256"] for part in content["distribution"] if "sha256" in part}
     listed = read_manifest(published)
     assert hashed == {name: listed[name] for name in listed if name != "croissant.json"}

@@ -30,6 +30,7 @@ from icrl4aht_data.writing.card import (
     card_texts,
     episode_texts,
     facts,
+    rai_texts,
     render_card,
     write_card,
 )
@@ -181,6 +182,13 @@ def test_the_bundled_card_is_short_and_current():
     assert (MINI / "README.md").read_text() == render_card(content)
     words = [word for word in (MINI / "README.md").read_text().split() if word.strip("|:-")]  # not lines of tables
     assert len(words) <= 2500
+
+
+def test_histories_of_people_change_the_datasheet():
+    assert rai_texts({"noise"})["personal_sensitive_information"] == "None."
+    people = rai_texts({"noise", "human"})
+    assert "Pseudonyms" in people["personal_sensitive_information"] and people.keys() == rai_texts({"noise"}).keys()
+    assert f"* Personal data: {people['personal_sensitive_information']}" in render_card(facts(MINI) | {"rai": people})
 
 
 def test_every_field_is_described():
