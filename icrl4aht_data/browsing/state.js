@@ -99,7 +99,8 @@ function drawShapes(pen, shapes, x, y, unit) {
   }
 }
 
-function drawState(canvas, layout, record) {
+/** Draw a state; with the window, all other cells are darker, or hidden with the recipe if only the window is known. */
+function drawState(canvas, layout, record, hides = false) {
   const height = layout.height + layout.footer;
   const unit = Math.min(canvas.parentElement.clientWidth, canvas.clientWidth) / layout.width;
   const pen = sizedPen(canvas, unit * layout.width, unit * height);
@@ -111,6 +112,7 @@ function drawState(canvas, layout, record) {
     const cell = moves ? record[anchor] : anchor;
     const x = (cell % layout.width) + 0.5;
     const y = Math.floor(cell / layout.width) + 0.5;
+    if (name === "recipe" && showsWindow && hides) continue;
     const shapes = layout.drawings[name][columns.map((column) => record[column]).join(",")];
     if (name === layout.view) {
       const [, left, top, right, bottom] = shapes[0];
@@ -119,8 +121,8 @@ function drawState(canvas, layout, record) {
     }
     drawShapes(pen, shapes, x, y, unit);
   }
-  if (showsWindow) { // all but the window gets darker
-    pen.fillStyle = "rgba(20, 24, 32, 0.42)";
+  if (showsWindow) {
+    pen.fillStyle = hides ? "rgb(20, 24, 32)" : "rgba(20, 24, 32, 0.42)";
     pen.beginPath();
     pen.rect(0, 0, layout.width * unit, layout.height * unit);
     pen.rect(...seen.map((value) => value * unit));
