@@ -13,6 +13,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.install_hints import import_optional
+from icrl4aht_data.utils.text import counted_noun
 
 _SLOTS = {"ego": EGO, "teammate": TEAMMATE}
 _PARTNER = Names("partner", lambda: ["human", *shared.EGO_NAME.valid(), "H1/t0"], checked_later)
@@ -39,7 +40,10 @@ _PARTNER = Names("partner", lambda: ["human", *shared.EGO_NAME.valid(), "H1/t0"]
 @click.option("--episodes", type=COUNT, default=10, help="Episodes of the game.")
 @click.option("--steps", type=COUNT, default=KEPT_STEPS, help="Steps of an episode.")
 @click.option(
-    "--ticks", type=click.FloatRange(0, 60), default=5, help="Steps a second; 0: a step when everyone has acted."
+    "--ticks",
+    type=click.FloatRange(0, 60),
+    default=5,
+    help="Steps a second; 0: a step when everyone has acted (the key . stays).",
 )
 @click.option(
     "--record",
@@ -99,4 +103,5 @@ def play_command(
         click.echo(f"play at http://{server.HOST}:{listener.getsockname()[1]} in {who} on this computer; Ctrl+C stops")
         server.serve_session(session, listener)
     if recorder and game.returns:
-        click.echo(f"{record}: {len(game.returns)} episodes; `icrl4aht-data show {record}` describes them")
+        played = counted_noun(len(game.returns), "episode")
+        click.echo(f"{record}: {played}; `icrl4aht-data show {record}` describes it")

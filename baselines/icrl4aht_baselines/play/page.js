@@ -1,6 +1,6 @@
 // The page of `play`: shows what the server sends, and sends keys. state.js draws states, curve.js has the axis' ticks.
 
-const KEYS = { ArrowUp: "up", ArrowDown: "down", ArrowLeft: "left", ArrowRight: "right", " ": "interact" };
+const KEYS = { ArrowUp: "up", ArrowDown: "down", ArrowLeft: "left", ArrowRight: "right", " ": "interact", ".": "stay" };
 const REPEAT_AFTER = 250; // milliseconds, so that a short press is one step
 const RETRY_AFTER = 1000;
 const TAKEN = 4000; // the server's code when all people of the game are connected
@@ -42,8 +42,17 @@ function receive(message) {
   }
   frame = message;
   for (const [part, drawings] of Object.entries(frame.drawings)) Object.assign(setup.layout.drawings[part], drawings);
+  if (frame.reward) flash(frame.reward);
   if (held && held.action !== "interact" && performance.now() - held.since > REPEAT_AFTER) act(held.action);
   show();
+}
+
+/** Show a reward for longer than its step. */
+function flash(reward) {
+  const shown = Object.assign(document.createElement("b"), { textContent: reward > 0 ? `+${reward}` : String(reward) });
+  shown.className = reward > 0 ? "good" : "bad";
+  $("reward").replaceChildren(shown);
+  setTimeout(() => shown.remove(), 2000);
 }
 
 function show() {
@@ -52,18 +61,15 @@ function show() {
   $("episode").textContent = `${episode} of ${setup.episodes}`;
   $("clock").textContent = `${frame.clock} of ${setup.steps}`;
   $("earned").textContent = String(frame.earned);
-  $("reward").textContent = frame.reward ? `${frame.reward > 0 ? "+" : ""}${frame.reward}` : "";
-  $("reward").className = frame.reward > 0 ? "good" : "bad";
-  $("cover").textContent = cover(episode);
-  $("cover").hidden = !$("cover").textContent;
+  $("next").textContent = whatNext(episode);
+  $("game").classList.toggle("over", frame.over);
   if (frame.problem) say(frame.problem);
   draw();
   $("end").hidden = !frame.over;
   if (frame.over) showEnd();
 }
 
-function cover(episode) {
-  if (frame.over) return "The game is over. Thank you!";
+function whatNext(episode) {
   if (frame.missing) return "Waiting for the other person.";
   if (!frame.waiting) return "";
   if (frame.ready) return "Waiting for the other person to press a key.";
@@ -73,9 +79,11 @@ function cover(episode) {
 
 function draw() {
   const { layout } = setup;
-  const room = Math.min($("board").clientWidth, (0.62 * window.innerHeight * layout.width) / (layout.height + layout.footer));
-  $("picture").style.width = `${Math.max(200, Math.min(room, 72 * layout.width))}px`;
-  if ($("board").clientWidth) drawState($("picture"), layout, frame.record, true);
+  const cells = $("window").checked ? setup.window : 0;
+  const [width, height] = cells ? [cells, cells] : [layout.width, layout.height + layout.footer];
+  const room = Math.min($("board").clientWidth, (0.62 * window.innerHeight * width) / height);
+  $("picture").style.width = `${Math.max(200, Math.min(room, 72 * width))}px`;
+  if ($("board").clientWidth) drawState($("picture"), layout, frame.record, cells);
 }
 
 function showEnd() {
@@ -97,8 +105,8 @@ function showEnd() {
     return returns.length ? `${name}: ${mean(returns)} an episode on average` : `${name}: cannot play this layout`;
   });
   $("means").replaceChildren(...sentences.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
-  $("end-title").textContent = setup.compared.length ? `You, and models in your place with ${setup.partner}` : "Your returns";
-  $("recorded").textContent = frame.recorded && !frame.problem ? `Recorded in ${frame.recorded}.` : "";
+  $("end-title").textContent = setup.compared.length ? `Thank you! You, and others in your place with ${setup.partner}` : "Thank you! Your returns";
+  $("recorded").textContent = frame.recorded && !frame.problem ? `Recorded in ${frame.recorded}` : "";
 }
 
 /** Draw returns by episode, one line for each player; the first one is the person's. */

@@ -28,7 +28,7 @@ from icrl4aht_data.browsing.drawings import add_drawings, layout_drawings
 from icrl4aht_data.browsing.page import page_source, page_style
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
-from icrl4aht_data.overcooked.cells import BUTTON
+from icrl4aht_data.overcooked.cells import BUTTON, WINDOW
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD, PRESS_REWARD, WRONG_DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import POT_STEPS, swapped
@@ -98,6 +98,7 @@ class PlaySession:
             "steps": game.steps,
             "actions": ACTIONS,
             "view": self._view,
+            "window": WINDOW,
             "consent": CONSENT if recorder and recorder.pseudonym is None else None,
             "compared": self.compared,
         }
@@ -149,6 +150,7 @@ class PlaySession:
             self._pause()
             await self.save()
         await self.show()
+        self._reward = 0
 
     def _pause(self) -> None:
         self._moving.clear()
