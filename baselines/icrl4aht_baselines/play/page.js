@@ -130,7 +130,7 @@ function drawChart(curves) {
   for (let episode = 0; episode < setup.episodes; episode += Math.ceil(setup.episodes / 10)) {
     pen.fillText(String(episode + 1), across(episode), box.bottom + 14);
   }
-  curves.forEach((returns, line) => {
+  [...curves.entries()].reverse().forEach(([line, returns]) => { // the person's on top
     pen.strokeStyle = colour(LINES[line]);
     pen.lineWidth = line ? 1.5 : 3;
     pen.setLineDash(DASHES[line]);
