@@ -55,8 +55,8 @@ class PolicyPlayer:
         policy: the policy.
         layout: the layout, as the policy knows it.
         slot: 0 or 1, the agent that it plays.
-        is_ego: whether it is an ego: it always sees itself as agent 0, and remembers earlier episodes. A teammate sees
-            the state as it is, and forgets them.
+        is_ego: whether it is an ego: it always sees itself as agent 0, and remembers earlier episodes. A test teammate
+            sees the state as it is, and forgets them.
     """
 
     def __init__(self, policy: Policy, layout: Layout, slot: int, *, is_ego: bool) -> None:
@@ -83,9 +83,8 @@ class PolicyPlayer:
         """
         view: Any = swapped(record) if self.is_ego and self.slot != EGO else record
         if self.policy.sees != "state":
-            canonical = self.policy.sees == "canonical_input"
-            obs = observe(self.layout, view[None], EGO if self.is_ego else self.slot, canonical)[0]
-            view = obs if self.policy.sees == "observation" else before._replace(obs=obs)
+            obs = observe(self.layout, view[None], EGO, self.policy.sees == "canonical_input")[0]
+            view = before._replace(obs=obs)
         action, self._memory = self._act(self.policy.params, self._memory, view, self._key, np.int32(t))
         return int(action)
 

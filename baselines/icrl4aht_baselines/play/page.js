@@ -8,6 +8,7 @@ const LINES = ["accent", "quiet", "other", "good"];
 const DASHES = [[], [2, 3], [8, 4], [8, 3, 2, 3]];
 
 let socket, setup, frame;
+let fading; // timer that removes the last reward
 let held = null; // {action, since} of the key or button that is down
 
 const send = (message) => socket?.readyState === WebSocket.OPEN && socket.send(JSON.stringify(message));
@@ -49,10 +50,10 @@ function receive(message) {
 
 /** Show a reward for longer than its step. */
 function flash(reward) {
-  const shown = Object.assign(document.createElement("b"), { textContent: reward > 0 ? `+${reward}` : String(reward) });
-  shown.className = reward > 0 ? "good" : "bad";
-  $("reward").replaceChildren(shown);
-  setTimeout(() => shown.remove(), 2000);
+  $("reward").textContent = reward > 0 ? `+${reward}` : String(reward);
+  $("reward").className = reward > 0 ? "good" : "bad";
+  clearTimeout(fading);
+  fading = setTimeout(() => ($("reward").textContent = ""), 2000);
 }
 
 function show() {
