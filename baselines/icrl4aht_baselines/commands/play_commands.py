@@ -103,5 +103,7 @@ def play_command(
         click.echo(f"play at http://{server.HOST}:{listener.getsockname()[1]} in {who} on this computer; Ctrl+C stops")
         server.serve_session(session, listener)
     if recorder and game.returns:
+        if recorder.written < len(game.returns):  # the disk was full, for example
+            recorder.write(game)
         played = counted_noun(len(game.returns), "episode")
         click.echo(f"{record}: {played}; `icrl4aht-data show {record}` describes it")

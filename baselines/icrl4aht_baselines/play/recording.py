@@ -74,6 +74,7 @@ class GameRecorder:
 
     Attributes:
         pseudonym: the person's, once they agreed.
+        written: number of episodes in the folder.
         views: for each finished episode, what the person saw: those of `VIEWS` that were shown in it.
 
     Raises:
@@ -82,7 +83,7 @@ class GameRecorder:
 
     def __init__(self, folder: Path, task: Task, ticks: float) -> None:
         check_target(folder, overwrite=False)
-        self.folder, self.task, self.ticks, self._has_written = folder, task, ticks, False
+        self.folder, self.task, self.ticks, self.written = folder, task, ticks, 0
         self.pseudonym: str | None = None
         self.views: list[list[str]] = []
 
@@ -107,6 +108,6 @@ class GameRecorder:
         )
         arrays = game.arrays()
         new = NewTask(self.task, made, 1, lambda: [NewHistory(0, arrays)])
-        options = {"data_version": "1.0.0", "kept_steps": game.steps, "overwrite": self._has_written}
+        options = {"data_version": "1.0.0", "kept_steps": game.steps, "overwrite": self.written > 0}
         write_release(self.folder, "lite", [new], **options)
-        self._has_written = True
+        self.written = len(arrays["episode_end_state"])

@@ -35,7 +35,7 @@ from icrl4aht_data.overcooked.state import POT_STEPS, swapped
 
 HOST = "127.0.0.1"
 
-COMPARED_EGOS = ("stay", "rl2-reference", "oracle")
+SHOWN_EGOS = ("stay", "rl2-reference", "oracle")
 """Egos that the page compares a person with."""
 
 _SEATS_TAKEN = 4000  # code of a closed websocket: all people of the game are connected
@@ -70,7 +70,7 @@ class PlaySession:
         partner: str,
         ticks: float,
         recorder: GameRecorder | None = None,
-        compared: tuple[str, ...] = COMPARED_EGOS,
+        compared: tuple[str, ...] = SHOWN_EGOS,
     ) -> None:
         self.game, self.partner, self.ticks, self.recorder = game, partner, ticks, recorder
         self.compared = () if partner == HUMAN else compared

@@ -155,6 +155,20 @@ def test_a_lost_connection_keeps_what_was_played():
             assert player.send(action="x")["kind"] == "problem"
 
 
+def test_a_failed_write_is_shown_and_repeated(tmp_path, monkeypatch):
+    session = new_session("H2/t3", episodes=2, steps=3, record=tmp_path / "record")
+    assert session.recorder
+    session.recorder.pseudonym = "someone"
+    with client_of(session) as client, browser(client) as player:
+        with monkeypatch.context() as patch:
+            patch.setattr(session.recorder, "write", lambda game: (tmp_path / "no" / "folder").touch())
+            player.act(STAY, STAY, STAY, STAY)
+        assert "Nothing is lost" in player.frame["problem"] and session.recorder.written == 0
+        player.act(STAY, STAY, STAY, STAY)
+        assert player.frame["over"] and not player.frame["problem"]
+    assert load_icrl4aht(tmp_path / "record")[0].entry.episodes == session.recorder.written == 2
+
+
 def test_two_people_see_themselves_as_the_blue_chef():
     session = new_session("human")
     with client_of(session) as client, browser(client) as one:
