@@ -80,7 +80,8 @@ def load_icrl4aht(
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
         algorithm: alias of `teammate_kind` for learned teammates, such as "fcp" or "comedi".
         source: how the histories were made: "ppo" (an ego learned by PPO), "noise" (the scripted oracle, with
-            random actions that become rarer) or "agent" (a trained agent); see docs/format.md.
+            random actions that become rarer), "agent" (a trained agent), "search" (a script that finds out the wanted
+            dish) or "human" (a person); see docs/format.md.
         label_view: what the policy behind the expert actions could see: "ego", what an ego sees, or "state", the full
             state. Older releases do not record it.
         task_id: id of a task; a task is a layout, a teammate and a seed.

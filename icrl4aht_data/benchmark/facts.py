@@ -109,10 +109,11 @@ KIND_FAMILIES = dict.fromkeys(ALGORITHMS, "rl") | HEURISTIC_KINDS
 TEAMMATE_PLUGINS = Plugins("icrl4aht.teammates", (*FAMILIES, *KIND_FAMILIES))
 """Heuristic teammates registered by other packages. Each is a separate family with the same name."""
 
-SOURCES = ("ppo", "noise", "agent", "search")
+SOURCES = ("ppo", "noise", "agent", "search", "human")
 """How histories are made. "ppo": an ego learns with PPO. "noise": a script plays, and its random actions become rarer
 (noise distillation, Zisman et al. 2024). "agent": a trained agent plays, perhaps with random actions that become
-rarer. "search": a script finds out which dish its teammate wants. Releases may name other sources."""
+rarer. "search": a script finds out which dish its teammate wants. "human": a person plays. Releases may name other
+sources."""
 
 SCRIPTED_SOURCES = ("noise", "search")
 """Sources of histories that a script plays; its actions without noise label them."""

@@ -13,6 +13,9 @@ from icrl4aht_data.overcooked.state import record_size
 
 _DIGITS = 3  # decimals of coordinates, in cells
 
+Drawings = dict[str, dict[str, list]]
+"""Name of a part -> values of its columns, joined by commas -> shapes, see `layout_drawings`."""
+
 
 class ShapeRecorder(Canvas):
     """Canvas that records shapes as lists: the kind of shape, then the arguments of the method of `Canvas`.
@@ -54,6 +57,8 @@ def _rounded(value: float) -> float:
 
 def _distinct(rows: np.ndarray) -> list[list[int]]:
     """Return the distinct rows of uint8 (N, K); much faster than `np.unique` for few columns."""
+    if len(rows) == 1:
+        return rows.tolist()
     found = np.zeros((256,) * rows.shape[1], bool)
     found[tuple(rows.T)] = True
     return np.argwhere(found).tolist()
@@ -62,6 +67,26 @@ def _distinct(rows: np.ndarray) -> list[list[int]]:
 def hex_colour(colour: Colour) -> str:
     """Return a colour in CSS notation, such as #2b303a."""
     return "#" + bytes(colour).hex()
+
+
+def add_drawings(layout: Layout, records: np.ndarray, known: Drawings) -> Drawings:
+    """Add the drawings that states need to `known`, and return those that it did not have.
+
+    Args:
+        layout: the layout.
+        records: state records uint8 (N, S).
+        known: drawings so far.
+    """
+    new: Drawings = {}
+    for part in state_parts(layout):
+        of_part = known.setdefault(part.name, {})
+        for values in _distinct(records[:, list(part.columns)]):
+            key = ",".join(map(str, values))
+            if key not in of_part:
+                recorder = ShapeRecorder()
+                part.draw(recorder, 0.0, 0.0, *values)
+                of_part[key] = new.setdefault(part.name, {})[key] = recorder.shapes
+    return new
 
 
 def layout_drawings(layout: Layout, records: np.ndarray) -> dict[str, Any]:
@@ -79,15 +104,8 @@ def layout_drawings(layout: Layout, records: np.ndarray) -> dict[str, Any]:
         drawings: name of a part -> values of its columns, joined by commas -> shapes relative to the centre of the
             cell, see `ShapeRecorder`; only for values in the records.
     """
-    drawings: dict[str, dict[str, list]] = {}
-    for part in state_parts(layout):
-        known = drawings.setdefault(part.name, {})
-        for values in _distinct(records[:, list(part.columns)]):
-            key = ",".join(map(str, values))
-            if key not in known:
-                recorder = ShapeRecorder()
-                part.draw(recorder, 0.0, 0.0, *values)
-                known[key] = recorder.shapes
+    drawings: Drawings = {}
+    add_drawings(layout, records, drawings)
     return {
         "width": layout.width,
         "height": layout.height,

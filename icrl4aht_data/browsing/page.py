@@ -239,12 +239,10 @@ def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
     }
     packed = zlib.compress(json.dumps(index, separators=(",", ":")).encode(), 9)
     data = {"index": _base64(packed), "histories": [_base64(one.data) for one in embedded]}
-    colours = {"ego": AGENT_COLOURS[EGO], "teammate": AGENT_COLOURS[TEAMMATE]}
-    style = "".join(f"--{agent}: {hex_colour(colour)}; " for agent, colour in colours.items())
-    text = Template(_source("page.html")).substitute(
+    text = Template(page_source("page.html")).substitute(
         release=escape(name),
-        style=f":root {{ {style}}}\n{_source('page.css')}",
-        script="\n".join(map(_source, ("state.js", "curve.js", "page.js"))),
+        style=page_style(),
+        script="\n".join(map(page_source, ("state.js", "curve.js", "page.js"))),
         data=json.dumps(data),  # base64 cannot contain a closing tag
     )
     return text.encode()
@@ -262,7 +260,15 @@ def _release_name(dataset: Dataset) -> str:
     return str(dataset.origin) if dataset.origin.remote else dataset.root.resolve().name
 
 
-def _source(name: str) -> str:
+def page_style() -> str:
+    """Return the style sheet of a page, with the colours of the agents as variables."""
+    colours = {"ego": AGENT_COLOURS[EGO], "teammate": AGENT_COLOURS[TEAMMATE]}
+    style = "".join(f"--{agent}: {hex_colour(colour)}; " for agent, colour in colours.items())
+    return f":root {{ {style}}}\n{page_source('page.css')}"
+
+
+def page_source(name: str) -> str:
+    """Return the text of one of the files that a page is made of, such as `state.js`."""
     return (_FILES / name).read_text(encoding="utf-8")
 
 

@@ -99,18 +99,25 @@ function drawShapes(pen, shapes, x, y, unit) {
   }
 }
 
-function drawState(canvas, layout, record) {
-  const height = layout.height + layout.footer;
-  const unit = Math.min(canvas.parentElement.clientWidth, canvas.clientWidth) / layout.width;
-  const pen = sizedPen(canvas, unit * layout.width, unit * height);
-  const showsWindow = $("window").checked;
+/** Draw a state; with `cells`, only a square of so many cells around the ego, without the recipe. */
+function drawState(canvas, layout, record, cells = 0) {
+  const width = cells || layout.width;
+  const unit = Math.min(canvas.parentElement.clientWidth, canvas.clientWidth) / width;
+  const pen = sizedPen(canvas, unit * width, unit * (cells || layout.height + layout.footer));
+  const showsWindow = $("window").checked && !cells;
+  if (cells) {
+    const ego = record[layout.parts.find(([name]) => name === layout.view)[2]];
+    const shift = (position) => (Math.floor(cells / 2) - position) * unit;
+    pen.translate(shift(ego % layout.width), shift(Math.floor(ego / layout.width)));
+  }
   let seen = null; // the ego's window
   pen.fillStyle = layout.paper;
-  pen.fillRect(0, 0, layout.width * unit, height * unit);
+  pen.fillRect(0, 0, layout.width * unit, (layout.height + (cells ? 0 : layout.footer)) * unit);
   for (const [name, moves, anchor, columns] of layout.parts) {
     const cell = moves ? record[anchor] : anchor;
     const x = (cell % layout.width) + 0.5;
     const y = Math.floor(cell / layout.width) + 0.5;
+    if (cells && (name === layout.view || name === "recipe")) continue;
     const shapes = layout.drawings[name][columns.map((column) => record[column]).join(",")];
     if (name === layout.view) {
       const [, left, top, right, bottom] = shapes[0];

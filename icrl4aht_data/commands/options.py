@@ -139,7 +139,7 @@ _FILTERS: dict[str, tuple[click.ParamType, str | None, str]] = {
     "track": (TRACK, None, "Only this track: teammate or layout."),
     "teammate-family": (FAMILY, None, "Only this family: rl (learned), H1, H2, H3 or H4."),
     "teammate-kind": (click.STRING, "KIND", "Only this kind, such as utility_greedy or fcp."),
-    "source": (click.STRING, "NAME", "Only histories of this source: ppo, noise, agent or search."),
+    "source": (click.STRING, "NAME", "Only histories of this source: ppo, noise, agent, search or human."),
     "label-view": (click.STRING, "VIEW", "Only histories whose expert sees this: ego, as an ego does, or state."),
 }
 """Option -> type, placeholder and help text."""

@@ -14,6 +14,7 @@ EXTRAS = {
     **dict.fromkeys(("jax", "flax", "optax", "jaxtyping", "safetensors"), "baselines"),
     **dict.fromkeys(("matplotlib", "pillow"), "plot"),
     **dict.fromkeys(("datasets", "pyarrow", "mlcroissant"), "hf"),
+    **dict.fromkeys(("starlette", "uvicorn", "websockets"), "play"),
     **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari")},
     "tensorboardx": "tensorboard",
     "s3fs": "s3",

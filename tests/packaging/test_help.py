@@ -18,7 +18,7 @@ from tests.packaging.test_readme import understand
 
 PUBLIC = (
     "list show browse verify download convert combine release upload doctor generate teammates layouts plan check "
-    "train evaluate report results submit models best-response adaptation-headroom control demo watch collect"
+    "train evaluate report results submit models best-response adaptation-headroom control demo watch play collect"
 )
 RESEARCH = "draws manifests diversity reference headroom sweep ablate tracks heldout-rl proof"
 

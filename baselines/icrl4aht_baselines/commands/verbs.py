@@ -16,6 +16,12 @@ VERBS = (
     Verb("submit", f"{_MODELS}:submit_command", _TRAIN, "Make a file of results for the page of `results`."),
     Verb("models", f"{_MODELS}:models_command", _TRAIN, "List the bundled models."),
     Verb("watch", f"{_CLI}:watch_command", _TRAIN, "Play an episode and draw it as a GIF."),
+    Verb(
+        "play",
+        "icrl4aht_baselines.commands.play_commands:play_command",
+        _TRAIN,
+        "Play on a web page with a policy or a person.",
+    ),
     Verb("collect", f"{_MODELS}:collect_command", _TRAIN, "Record histories of an agent with a release's teammates."),
     Verb("best-response", f"{_ADAPT}:best_response_command", _TRAIN, "Train a best response to each teammate."),
     Verb(

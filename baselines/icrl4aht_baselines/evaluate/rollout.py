@@ -24,7 +24,7 @@ from icrl4aht_data.benchmark.facts import FOUR_RECIPES, TRACKS
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, with_recipes
 
-_EGO_STEPS, _TEAMMATE_STEPS = 2, 3  # key streams within an episode, distinct from those of the agent slots
+EGO_STEPS, TEAMMATE_STEPS = 2, 3  # key streams within an episode, distinct from those of the agent slots
 
 
 class RolloutState(NamedTuple):
@@ -132,7 +132,7 @@ class EvaluationRollout:
         # Teammates restart in each episode from its key; egos keep their memory and get new keys.
         keys = self.env.episode_key(state.env)
         memories = jax.vmap(mate.init)(mate_params, _fold_all(keys, TEAMMATE))
-        ego_keys, mate_keys = _fold_all(keys, _EGO_STEPS), _fold_all(keys, _TEAMMATE_STEPS)
+        ego_keys, mate_keys = _fold_all(keys, EGO_STEPS), _fold_all(keys, TEAMMATE_STEPS)
 
         def step(carry: Any, t: Array) -> tuple[Any, Any]:
             state, memories, _ = carry

@@ -1,0 +1,239 @@
+"""Episodes that people and policies play step by step, under the NumPy rules.
+
+Starts, recipes and the randomness of policies are those of an evaluation of the same task with seed 0, see
+`icrl4aht_baselines.evaluate.rollout`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from icrl4aht_generation.env import Environment, EnvState
+from icrl4aht_generation.policy import Policy, on_layout
+from icrl4aht_generation.teammates.instances import INSTANCES, published_task
+from icrl4aht_generation.teammates.registry import build_teammate
+
+from icrl4aht_baselines.agents.egos import agent_names, find_agent
+from icrl4aht_baselines.agents.host import EgoInput
+from icrl4aht_baselines.evaluate.rollout import EGO_STEPS, TEAMMATE_STEPS
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.errors import unknown
+from icrl4aht_data.format.schema import episode_ends
+from icrl4aht_data.overcooked import rules
+from icrl4aht_data.overcooked.actions import EGO, STAY
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.overcooked.state import swapped
+
+HUMAN = "human"
+"""Name of a second person as the partner."""
+
+_STREAMS = (EGO_STEPS, TEAMMATE_STEPS)
+
+
+class _ExchangedLayout(Layout):
+    """A layout in which the two agents have exchanged their rooms."""
+
+    @cached_property
+    def agent_cells(self) -> tuple[int, ...]:
+        return super().agent_cells[::-1]
+
+
+class PolicyPlayer:
+    """A policy that plays one agent of a game.
+
+    Args:
+        policy: the policy.
+        layout: the layout, as the policy knows it.
+        slot: 0 or 1, the agent that it plays.
+        is_ego: whether it is an ego: it always sees itself as agent 0, and remembers earlier episodes. A test teammate
+            sees the state as it is, and forgets them.
+    """
+
+    def __init__(self, policy: Policy, layout: Layout, slot: int, *, is_ego: bool) -> None:
+        policy = on_layout(policy, layout) if policy.sees == "situation" else policy
+        self.policy = policy._replace(params=jax.device_put(policy.params))  # once, not in every step
+        self.layout, self.slot, self.is_ego, self._memory = layout, slot, is_ego, None
+        act = self.policy.act
+        self._act = jax.jit(lambda params, memory, view, key, t: act(params, memory, view, jax.random.fold_in(key, t)))
+
+    def begin(self, task_key: jax.Array, episode_key: jax.Array, episode: int) -> None:
+        """Prepare for an episode: egos keep their memory, except before the first one."""
+        self._key = jax.random.fold_in(episode_key, _STREAMS[self.slot])
+        if episode == 0 or not self.is_ego:
+            key = jax.random.fold_in(task_key if self.is_ego else episode_key, self.slot)
+            self._memory = self.policy.init(self.policy.params, key)
+
+    def act(self, record: np.ndarray, before: EgoInput, t: int) -> int:
+        """Return the action in step `t`, 0..5.
+
+        Args:
+            record: uint8 (S,), the state record.
+            before: outcome of the previous step, of this agent; its `obs` is not used.
+            t: number of the step in the episode, from 0.
+        """
+        view: Any = swapped(record) if self.is_ego and self.slot != EGO else record
+        if self.policy.sees != "state":
+            obs = observe(self.layout, view[None], EGO, self.policy.sees == "canonical_input")[0]
+            view = before._replace(obs=obs)
+        action, self._memory = self._act(self.policy.params, self._memory, view, self._key, np.int32(t))
+        return int(action)
+
+
+class Partner(NamedTuple):
+    """What plays with a person.
+
+    Attributes:
+        name: its name on the command line.
+        player: the policy; None for a second person.
+        task: the published task of a test teammate; None for others.
+    """
+
+    name: str
+    player: PolicyPlayer | None
+    task: Task | None = None
+
+
+def find_partner(name: str, layout: Layout, slot: int) -> Partner:
+    """Return a partner by its name: an ego of `evaluate`, a test teammate such as "H1/t0", or "human".
+
+    Args:
+        name: the name.
+        layout: the layout.
+        slot: 0 or 1, the agent that it plays.
+
+    Raises:
+        UnknownNameError: if there is none of this name, or the layout belongs to no track.
+        OptionError: if it cannot play the layout.
+    """
+    if name == HUMAN:
+        return Partner(name, None)
+    tests = [f"{family}/t{t}" for family in HEURISTIC_KINDS.values() for t in range(INSTANCES)]
+    if name in tests:
+        task = published_task(layout.name, name)
+        policy = build_teammate(layout, task.teammate, slot)
+        return Partner(name, PolicyPlayer(policy, layout, slot, is_ego=False), task)
+    if name not in agent_names() and not Path(name).is_dir():
+        raise unknown("partner", name, (HUMAN, *agent_names(), *tests))
+    if slot != EGO:
+        layout = _ExchangedLayout(**{one.name: getattr(layout, one.name) for one in fields(Layout)})
+    return Partner(name, PolicyPlayer(find_agent(name).make(layout), layout, slot, is_ego=True))
+
+
+class Game:
+    """Some episodes of two agents on one layout.
+
+    Args:
+        layout: the layout.
+        players: the policies of agents 0 and 1, None for people.
+        key: key of the task, see `icrl4aht_baselines.evaluate.rollout.task_key`.
+        episodes: number of episodes.
+        steps: steps of an episode.
+
+    Attributes:
+        record: uint8 (S,), the present state record.
+        returns: returns of the finished episodes.
+        clock: steps taken in the running episode.
+        earned: its return so far.
+    """
+
+    def __init__(
+        self, layout: Layout, players: Sequence[PolicyPlayer | None], key: jax.Array, episodes: int, steps: int
+    ) -> None:
+        self.layout, self.key, self.episodes, self.steps = layout, key, episodes, steps
+        env = Environment(layout, steps)
+
+        def begin(episode: jax.Array) -> Any:
+            state = env.init(key[None])._replace(episode=episode[None])
+            return env.first_record(state.key, state.episode)[0], env.episode_key(state)[0]
+
+        def draw(episode: jax.Array, clock: jax.Array) -> Any:
+            empty = jnp.zeros((1, 0), jnp.uint8)
+            return env.next_recipe(EnvState(key[None], episode[None], clock[None], empty))
+
+        self._begin_episode, self._draw_recipe = jax.jit(begin), jax.jit(draw)
+        self._restart(players)
+
+    def with_players(self, players: Sequence[PolicyPlayer | None]) -> Game:
+        """Return the same episodes before the first step, for other players."""
+        other = copy(self)
+        other._restart([copy(player) for player in players])
+        return other
+
+    def _restart(self, players: Sequence[PolicyPlayer | None]) -> None:
+        self.players, self.returns = list(players), list[float]()
+        self._rows, self._ends = list[tuple[np.ndarray, list[int], int]](), list[np.ndarray]()
+        self._before = (np.int32(0), np.int32(0), np.float32(0), np.bool_(False))
+        self._begin()
+
+    def _begin(self) -> None:
+        self.clock, self.earned = 0, 0
+        record, key = self._begin_episode(np.int32(len(self.returns)))
+        self.record = np.asarray(record)
+        for player in filter(None, self.players):
+            player.begin(self.key, key, len(self.returns))
+
+    @property
+    def people(self) -> list[int]:
+        """Agents that people play."""
+        return [slot for slot, player in enumerate(self.players) if player is None]
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all episodes are finished."""
+        return len(self.returns) == self.episodes
+
+    def step(self, chosen: Mapping[int, int]) -> int:
+        """Take one step and return its reward; after the last step of an episode the next one begins.
+
+        Args:
+            chosen: agent -> action, 0..5, of people; those who are missing stay.
+        """
+        *last, reward, done = self._before
+        actions = [
+            chosen.get(slot, STAY)
+            if player is None
+            else player.act(self.record, EgoInput(None, last[slot], reward, last[1 - slot], done), self.clock)
+            for slot, player in enumerate(self.players)
+        ]
+        recipe = np.asarray(self._draw_recipe(np.int32(len(self.returns)), np.int32(self.clock)))
+        outcome = rules.step(self.layout, self.record[None], np.array([actions]), recipe)
+        earned = int(outcome.reward[0])
+        self._rows.append((self.record, actions, earned))
+        self.record, self.clock, self.earned = outcome.state[0], self.clock + 1, self.earned + earned
+        done = self.clock == self.steps
+        self._before = (*np.array(actions, np.int32), np.float32(earned), np.bool_(done))
+        if done:
+            self._ends.append(self.record)
+            self.returns.append(float(self.earned))
+            if not self.is_over:
+                self._begin()
+        return earned
+
+    def play(self) -> list[float]:
+        """Return the returns of all episodes that policies play without people."""
+        while not self.is_over:
+            self.step({})
+        return self.returns
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the finished episodes as arrays of a history, see `icrl4aht_data.format.schema.FIELDS`."""
+        rows = self._rows[: len(self.returns) * self.steps]
+        state, actions, rewards = (np.array(part) for part in zip(*rows, strict=True))
+        return {
+            "state": state,
+            "actions": actions[:, 0],
+            "teammate_actions": actions[:, 1],
+            "rewards": rewards,
+            "dones": episode_ends(len(rows), self.steps),
+            "episode_end_state": np.stack(self._ends),
+        }

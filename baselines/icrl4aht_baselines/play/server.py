@@ -1,0 +1,305 @@
+"""The web server of `icrl4aht-data play`: one page and one websocket, on loopback only."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from string import Template
+from threading import Thread
+from typing import Any
+from urllib.parse import urlsplit
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from icrl4aht_baselines.play.game import HUMAN, Game, find_partner
+from icrl4aht_baselines.play.recording import CONSENT, VIEWS, GameRecorder, check_pseudonym
+from icrl4aht_data.browsing.drawings import add_drawings, layout_drawings
+from icrl4aht_data.browsing.page import page_source, page_style
+from icrl4aht_data.errors import Icrl4ahtError, OptionError
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO
+from icrl4aht_data.overcooked.cells import BUTTON, WINDOW
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.rules import DELIVERY_REWARD, PRESS_REWARD, WRONG_DELIVERY_REWARD
+from icrl4aht_data.overcooked.state import POT_STEPS, swapped
+
+HOST = "127.0.0.1"
+
+SHOWN_EGOS = ("stay", "rl2-reference", "oracle")
+"""Egos that the page compares a person with."""
+
+_SEATS_TAKEN = 4000  # code of a closed websocket: all people of the game are connected
+
+
+def how_to_play(layout: Layout) -> str:
+    """Return the line from which a person who never played learns it."""
+    button = f" Pressing ? shows the recipe and costs {-PRESS_REWARD:g}." if BUTTON in layout.kinds else ""
+    return (
+        f"You are the blue chef: move with the arrow keys; space takes, puts down, cooks and serves what is in front "
+        f"of you. Put the recipe's three ingredients into a pot, wait {POT_STEPS} steps, take the soup with a plate "
+        f"and bring it to the green bell: {DELIVERY_REWARD:+g}, a wrong soup {WRONG_DELIVERY_REWARD:g}.{button}"
+    )
+
+
+class PlaySession:
+    """A game, the people who are connected to it, and its recorder.
+
+    The game waits before each episode, and after a lost connection, until everyone who plays presses a key.
+
+    Args:
+        game: the game.
+        partner: name of the partner.
+        ticks: steps a second; with 0 a step is taken as soon as everyone has acted.
+        recorder: recorder of the game; None if it is not recorded.
+        compared: names of egos to compare the person with.
+    """
+
+    def __init__(
+        self,
+        game: Game,
+        partner: str,
+        ticks: float,
+        recorder: GameRecorder | None = None,
+        compared: tuple[str, ...] = SHOWN_EGOS,
+    ) -> None:
+        self.game, self.partner, self.ticks, self.recorder = game, partner, ticks, recorder
+        self.compared = () if partner == HUMAN else compared
+        self.references: dict[str, list[float]] = {}
+        self._sockets: dict[int, WebSocket] = {}
+        self._chosen: dict[int, int] = {}
+        self._ready: set[int] = set()
+        self._views = {VIEWS[0] if recorder else VIEWS[1]}  # shown in this episode; the last one is `_view`
+        self._view = next(iter(self._views))
+        self._reward, self._problem, self._moving = 0, "", asyncio.Event()
+        start = [game.record, swapped(game.record)]
+        self._layout = [layout_drawings(game.layout, record[None]) for record in start]
+
+    # ---- what a browser is sent
+
+    def _setup(self, slot: int) -> dict[str, Any]:
+        game, recorder = self.game, self.recorder
+        return {
+            "kind": "setup",
+            "slot": slot,
+            "layout": self._layout[slot],
+            "name": game.layout.name,
+            "partner": self.partner,
+            "episodes": game.episodes,
+            "steps": game.steps,
+            "actions": ACTIONS,
+            "view": self._view,
+            "window": WINDOW,
+            "consent": CONSENT if recorder and recorder.pseudonym is None else None,
+            "compared": self.compared,
+        }
+
+    def _frame(self, slot: int) -> dict[str, Any]:
+        game, layout = self.game, self._layout[slot]
+        record = game.record if slot == EGO else swapped(game.record)  # so that everyone is the blue chef
+        return {
+            "kind": "frame",
+            "record": record.tolist(),
+            "drawings": add_drawings(game.layout, record[None], layout["drawings"]),
+            "clock": game.clock,
+            "earned": game.earned,
+            "reward": self._reward,
+            "returns": game.returns,
+            "over": game.is_over,
+            "waiting": not self._moving.is_set(),
+            "ready": slot in self._ready,
+            "missing": len(game.people) - len(self._sockets),
+            "problem": self._problem,
+            "recorded": str(self.recorder.folder) if self.recorder else None,
+            "references": self.references,
+        }
+
+    async def show(self) -> None:
+        """Send the present state to all connected browsers."""
+        for slot, connection in list(self._sockets.items()):
+            with suppress(RuntimeError, WebSocketDisconnect):  # closed meanwhile, which `connect` notices
+                await connection.send_json(self._frame(slot))
+
+    # ---- the game
+
+    async def run(self) -> None:
+        """Take steps by the clock until the game is over."""
+        loop, due = asyncio.get_running_loop(), 0.0
+        while not self.game.is_over:
+            await self._moving.wait()
+            due = max(due + 1 / self.ticks, loop.time())  # a late step does not hurry the next ones
+            await asyncio.sleep(due - loop.time())
+            if self._moving.is_set():
+                await self.advance()
+
+    async def advance(self) -> None:
+        """Take a step with the actions that people chose since the last one, and show it."""
+        finished = len(self.game.returns)
+        self._reward = self.game.step(self._chosen)
+        self._chosen = {}
+        if len(self.game.returns) > finished:
+            self._pause()
+            await self.save()
+        await self.show()
+        self._reward = 0
+
+    def _pause(self) -> None:
+        self._moving.clear()
+        self._ready.clear()
+        self._chosen = {}
+
+    async def save(self) -> None:
+        """Write the finished episodes; a failure is shown, and the next call writes them."""
+        if self.recorder is None:
+            return
+        self.recorder.views.append(sorted(self._views))
+        self._views, self._problem = {self._view}, ""
+        try:
+            await asyncio.to_thread(self.recorder.write, self.game)
+        except (Icrl4ahtError, OSError) as error:
+            self._problem = (
+                f"The record was not written: {error}. Nothing is lost: it is tried again after each episode."
+            )
+
+    def compare(self, changed: Callable[[], Any]) -> None:
+        """Play the same episodes with egos in the person's place; takes seconds for each.
+
+        Args:
+            changed: called after each ego.
+        """
+        slot = self.game.people[0]
+        for name in self.compared:
+            returns: list[float] = []
+            with suppress(Icrl4ahtError):  # a model that cannot play this layout has no returns
+                players = list(self.game.players)
+                players[slot] = find_partner(name, self.game.layout, slot).player
+                returns = self.game.with_players(players).play()
+            self.references = self.references | {name: returns}
+            changed()
+
+    # ---- what a browser sends
+
+    async def connect(self, connection: WebSocket) -> None:
+        """Serve a browser until its connection ends."""
+        origin = connection.headers.get("origin")
+        if origin and urlsplit(origin).netloc != connection.headers.get("host"):
+            await connection.close(1008)  # a page of another site
+            return
+        await connection.accept()
+        wanted, free = connection.query_params.get("slot"), [x for x in self.game.people if x not in self._sockets]
+        if not free:
+            await connection.close(_SEATS_TAKEN)
+            return
+        slot = next((x for x in free if str(x) == wanted), free[0])
+        self._sockets[slot] = connection
+        try:
+            await connection.send_json(self._setup(slot))
+            await self.show()
+            while True:
+                await self._receive(slot, connection, await connection.receive_text())
+        except (KeyError, RuntimeError, WebSocketDisconnect):
+            pass  # closed, or sent bytes
+        finally:
+            del self._sockets[slot]
+            self._pause()
+            await self.show()
+
+    async def _receive(self, slot: int, connection: WebSocket, text: str) -> None:
+        try:
+            message = json.loads(text)
+            if (action := message.get("action")) in range(len(ACTIONS)):
+                await self._act(slot, action)
+            elif (view := message.get("view")) in VIEWS:
+                self._view = view
+                self._views.add(view)
+            elif "pseudonym" in message and message.get("agrees") is True and self.recorder:
+                self.recorder.pseudonym = self.recorder.pseudonym or check_pseudonym(message["pseudonym"])
+                await connection.send_json(self._setup(slot))
+                await self.show()
+            else:
+                raise OptionError(f"{text[:80]}: expected an action, a view, or a pseudonym with consent")
+        except (ValueError, TypeError, AttributeError, Icrl4ahtError) as error:
+            await connection.send_json({"kind": "problem", "text": str(error)})
+
+    async def _act(self, slot: int, action: int) -> None:
+        """Take the action in the next step; while the game waits it only says that someone is ready."""
+        if self.game.is_over or (self.recorder and self.recorder.pseudonym is None):
+            return
+        if not self._moving.is_set():
+            self._ready.add(slot)
+            if self._ready == set(self.game.people):
+                self._moving.set()
+            await self.show()
+            return
+        self._chosen[slot] = action
+        if self.ticks == 0 and self._chosen.keys() == set(self.game.people):
+            await self.advance()
+
+
+def play_page(layout: Layout) -> str:
+    """Return the HTML page."""
+    own = Path(__file__).parent
+    text = {name: (own / f"page.{name}").read_text(encoding="utf-8") for name in ("html", "css", "js")}
+    script = "\n".join([page_source("state.js"), page_source("curve.js"), text["js"]])
+    style = f"{page_style()}\n{text['css']}"
+    return Template(text["html"]).substitute(style=style, script=script, how_to=how_to_play(layout))
+
+
+def make_app(session: PlaySession) -> Starlette:
+    """Return the application, which plays the session's game while it runs."""
+
+    async def page(request: Request) -> HTMLResponse:
+        return HTMLResponse(play_page(session.game.layout), headers={"Cache-Control": "no-store"})
+
+    @asynccontextmanager
+    async def running(app: Starlette) -> AsyncIterator[None]:
+        loop = asyncio.get_running_loop()
+
+        def changed() -> None:
+            with suppress(RuntimeError):  # the server has stopped
+                asyncio.run_coroutine_threadsafe(session.show(), loop)
+
+        Thread(target=session.compare, args=[changed], daemon=True).start()
+        task = asyncio.create_task(session.run()) if session.ticks else None
+        yield
+        if task:
+            task.cancel()
+
+    hosts = Middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"])
+    routes = [Route("/", page), WebSocketRoute("/play", session.connect)]
+    return Starlette(routes=routes, middleware=[hosts], lifespan=running)
+
+
+def open_port(port: int) -> socket.socket:
+    """Return a listening socket on loopback; port 0 is any free one.
+
+    Raises:
+        OptionError: if the port is in use or not allowed.
+    """
+    found = socket.socket()
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        found.bind((HOST, port))
+        found.listen()
+    except OSError as error:
+        found.close()
+        raise OptionError(
+            f"port {port} of {HOST}: {error.strerror}; give another one by --port, or 0 for any free one"
+        ) from error
+    return found
+
+
+def serve_session(session: PlaySession, listener: socket.socket) -> None:
+    """Serve a session until the program is interrupted."""
+    config = uvicorn.Config(make_app(session), log_level="warning", ws="websockets-sansio", timeout_graceful_shutdown=1)
+    with suppress(KeyboardInterrupt):
+        uvicorn.Server(config).run(sockets=[listener])

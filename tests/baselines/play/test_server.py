@@ -1,0 +1,249 @@
+"""The websocket of a game, without a browser: keys, deliveries, records, lost connections, bad input."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from icrl4aht_baselines.evaluate.rollout import task_key
+from icrl4aht_baselines.play.game import Game, PolicyPlayer, find_partner
+from icrl4aht_baselines.play.recording import GameRecorder, human_task
+from icrl4aht_generation.experts.oracle import oracle
+
+from icrl4aht_data import load_icrl4aht
+from icrl4aht_data.browsing.page import make_browser_page
+from icrl4aht_data.checking.verify import verify_release
+from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.overcooked.actions import ACTIONS, EGO
+from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.overcooked.state import columns
+from icrl4aht_data.plotting import plot_learning_curves
+
+starlette = pytest.importorskip("starlette.testclient", reason="needs the extra play")
+
+from icrl4aht_baselines.play.server import PlaySession, make_app, open_port  # noqa: E402
+
+LAYOUT = get_layout("cramped_up")
+UP, DOWN, LEFT, RIGHT, STAY, INTERACT = range(6)
+ORIGIN = {"origin": "http://127.0.0.1"}
+
+
+def new_session(
+    partner: str = "stay", episodes: int = 2, steps: int = 8, record: Path | None = None, **options: Any
+) -> PlaySession:
+    """Return a session of which a test takes every step, without egos to compare with."""
+    found = find_partner(partner, LAYOUT, 1)
+    recorder, name = None, "a test"
+    if record:
+        task = human_task(found, 7)
+        recorder, name = GameRecorder(record, task, 0), task.task_id
+    game = Game(LAYOUT, [None, found.player], task_key(0, name), episodes, steps)
+    return PlaySession(game, partner, **{"ticks": 0, "recorder": recorder, "compared": ()} | options)
+
+
+class Browser:
+    """One connection: sends messages, and keeps the last state that was received."""
+
+    def __init__(self, socket: Any) -> None:
+        self.socket, self.setup = socket, socket.receive_json()
+        self.frame: dict[str, Any] = socket.receive_json()
+
+    def send(self, **message: Any) -> dict[str, Any]:
+        """Send a message, and return the answer."""
+        self.socket.send_json(message)
+        answer = self.socket.receive_json()
+        if answer["kind"] == "frame":
+            self.frame = answer
+        return answer
+
+    def act(self, *actions: int) -> None:
+        for action in actions:
+            self.send(action=action)
+
+
+@contextmanager
+def browser(client: Any, slot: str = "") -> Iterator[Browser]:
+    with client.websocket_connect(f"ws://127.0.0.1/play?slot={slot}", headers=ORIGIN) as socket:
+        yield Browser(socket)
+
+
+def client_of(session: PlaySession) -> Any:
+    return starlette.TestClient(make_app(session), base_url="http://127.0.0.1")
+
+
+def test_keys_move_the_agent():
+    session = new_session()
+    with client_of(session) as client, browser(client) as player:
+        assert "arrow keys" in client.get("/").text
+        assert player.setup["actions"] == list(ACTIONS)
+        assert (player.frame["waiting"], player.frame["clock"]) == (True, 0)
+        player.act(STAY)  # says that someone is there, and is no step
+        assert (player.frame["waiting"], player.frame["clock"]) == (False, 0)
+        for action in (LEFT, RIGHT, UP, DOWN):
+            before = np.array(player.frame["record"])
+            player.act(action)
+            after, at = np.array(player.frame["record"]), columns(LAYOUT)
+            moved = LAYOUT.moves[before[EGO], action]
+            other = before[1]
+            assert after[at.positions][EGO] == (before[EGO] if moved == other else moved)
+        assert player.frame["clock"] == 4
+
+
+def play_well(player: Browser, episodes: int, steps: int) -> None:
+    """Play with the oracle's actions, as a person with a plan would."""
+    plan = PolicyPlayer(oracle(LAYOUT), LAYOUT, EGO, is_ego=True)
+    key, before = task_key(0, "plan"), (None,) * 5
+    for episode in range(episodes):
+        plan.begin(key, key, episode)
+        player.act(STAY)
+        for t in range(steps):
+            player.act(plan.act(np.array(player.frame["record"], np.uint8), before, t))  # type: ignore[arg-type]
+
+
+def test_a_recorded_game(tmp_path):
+    """A delivery pays; the record is a release like any other, and holds what the person agreed to."""
+    session = new_session("H2/t3", episodes=2, steps=100, record=tmp_path / "record")
+    with client_of(session) as client, browser(client) as player:
+        assert "Nothing else is stored" in player.setup["consent"]
+        player.socket.send_json({"action": LEFT})  # ignored before the consent
+        assert player.send(pseudonym="a@b.org", agrees=True)["kind"] == "problem"
+        assert player.send(pseudonym="someone", agrees=False)["kind"] == "problem"
+        assert not (tmp_path / "record").exists()
+        assert player.send(pseudonym="someone", agrees=True)["consent"] is None
+        player.frame = player.socket.receive_json()
+        play_well(player, 1, 100)
+        assert load_icrl4aht(tmp_path / "record")[0].entry.episodes == 1, "each episode is written at once"
+        player.socket.send_json({"view": "whole"})
+        play_well(player, 1, 100)
+        assert player.frame["over"] and max(player.frame["returns"]) >= 20
+    report = verify_release(tmp_path / "record", level="deep")
+    assert report.ok, report.findings
+    dataset = load_icrl4aht(tmp_path / "record")
+    history = dataset[0]
+    assert (history.entry.source, history.entry.episodes, history.entry.teammate_family) == ("human", 2, "H2")
+    assert history.returns().tolist() == session.game.returns
+    made = dataset.provenance[history.entry.task_id]
+    person = {"pseudonym": "someone", "views": [["ego"], ["ego", "whole"]], "steps_per_second": 0}
+    assert made.other == {"person": person}
+    assert "a person plays" in (tmp_path / "record" / "README.md").read_text(encoding="utf-8")
+    assert make_browser_page(dataset).shown_episodes == 2
+    assert plot_learning_curves(dataset) is not None
+    assert dataset.ad(batch_size=2, length=20, seed=0)[0].target_actions.shape == (2, 20)
+    with pytest.raises(OptionError, match="record: exists"):
+        new_session("H2/t3", record=tmp_path / "record")
+
+
+def test_a_lost_connection_keeps_what_was_played():
+    session = new_session(episodes=1)
+    with client_of(session) as client:
+        with browser(client) as player:
+            player.act(STAY, LEFT, RIGHT, INTERACT)
+            record = player.frame["record"]
+        with browser(client) as player:
+            assert (player.frame["clock"], player.frame["record"]) == (3, record)
+            assert player.frame["waiting"]
+            player.act(STAY, *[STAY] * 5)
+            assert player.frame["over"] and len(player.frame["returns"]) == 1
+            player.socket.send_json({"action": LEFT})  # no step after the end
+            assert player.send(action="x")["kind"] == "problem"
+
+
+def test_a_failed_write_is_shown_and_repeated(tmp_path, monkeypatch):
+    session = new_session("H2/t3", episodes=2, steps=3, record=tmp_path / "record")
+    assert session.recorder
+    session.recorder.pseudonym = "someone"
+    with client_of(session) as client, browser(client) as player:
+        with monkeypatch.context() as patch:
+            patch.setattr(session.recorder, "write", lambda game: (tmp_path / "no" / "folder").touch())
+            player.act(STAY, STAY, STAY, STAY)
+        assert "Nothing is lost" in player.frame["problem"] and session.recorder.written == 0
+        player.act(STAY, STAY, STAY, STAY)
+        assert player.frame["over"] and not player.frame["problem"]
+    assert load_icrl4aht(tmp_path / "record")[0].entry.episodes == session.recorder.written == 2
+
+
+def test_two_people_see_themselves_as_the_blue_chef():
+    session = new_session("human")
+    with client_of(session) as client, browser(client) as one:
+        assert one.frame["missing"] == 1
+        with browser(client) as two:
+            assert (one.setup["slot"], two.setup["slot"]) == (0, 1)
+            assert one.socket.receive_json()["missing"] == 0
+            assert two.frame["record"][:2] == one.frame["record"][1::-1]
+            with pytest.raises(starlette.WebSocketDisconnect) as closed, browser(client):
+                pass
+            assert closed.value.code == 4000
+            assert one.send(action=STAY)["ready"]
+            assert two.socket.receive_json()["waiting"], "until both have pressed a key"
+            assert not two.send(action=STAY)["waiting"]
+            assert one.socket.receive_json()["clock"] == 0
+            one.socket.send_json({"action": UP})
+            assert two.send(action=DOWN)["clock"] == 1
+            assert one.socket.receive_json()["clock"] == 1
+        lost = one.socket.receive_json()
+        assert (lost["missing"], lost["waiting"], lost["clock"]) == (1, True, 1)
+        with browser(client, slot="1") as two:
+            assert two.setup["slot"] == 1
+
+
+def test_steps_by_the_clock_and_their_latency():
+    """A step takes 50 ms or less from the key to the new state; without keys the game goes on."""
+    session = new_session("H1/t0", episodes=1, steps=40)
+    session.game.with_players(session.game.players).step({})  # as the command does before it serves
+    with client_of(session) as client, browser(client) as player:
+        player.act(STAY, STAY)
+        seconds = []
+        for _ in range(20):
+            begun = time.perf_counter()
+            player.act(LEFT)
+            seconds.append(time.perf_counter() - begun)
+        assert np.median(seconds) < 0.05
+    with client_of(new_session(episodes=1, steps=5, ticks=50)) as client, browser(client) as player:
+        player.act(STAY)
+        while not player.frame["over"]:
+            player.frame = player.socket.receive_json()
+        assert player.frame["clock"] == 5
+
+
+def test_comparison_with_egos():
+    session = new_session("H4/t0", compared=("stay", "oracle"), episodes=1, steps=100)
+    session.compare(lambda: None)
+    assert session.references["stay"] == [0.0]
+    assert session.references["oracle"][0] > 0
+
+
+def test_pages_of_other_sites_are_refused():
+    with client_of(new_session()) as client:
+        with (
+            pytest.raises(starlette.WebSocketDisconnect),
+            client.websocket_connect("ws://127.0.0.1/play", headers={"origin": "http://evil.example"}),
+        ):
+            pass
+        assert client.get("/", headers={"host": "evil.example"}).status_code == 400
+
+
+def failing(*words: str) -> str:
+    result = CliRunner().invoke(cli, ["play", *words])
+    assert isinstance(result.exception, (SystemExit, OptionError, ValueError)), result.output
+    return f"{result.output}{result.exception}"
+
+
+def test_bad_input(tmp_path, monkeypatch):
+    with open_port(0) as taken:
+        port = str(taken.getsockname()[1])
+        assert f"port {port} of 127.0.0.1" in failing("--with", "stay", "--port", port)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").touch()
+    assert "full: exists" in failing("--record", str(tmp_path / "full"))
+    assert "only test teammates" in failing("--with", "oracle", "--record", str(tmp_path / "new"))
+    assert "a history is of the ego" in failing("--slot", "teammate", "--record", str(tmp_path / "new"))
+    assert "unknown partner 'H9/t9'" in failing("--with", "H9/t9")
+    monkeypatch.setitem(__import__("sys").modules, "uvicorn", None)
+    assert "play needs uvicorn: pip install 'icrl4aht-data[play]'" in failing()
