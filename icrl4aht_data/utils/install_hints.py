@@ -15,7 +15,7 @@ EXTRAS = {
     **dict.fromkeys(("matplotlib", "pillow"), "plot"),
     **dict.fromkeys(("datasets", "pyarrow", "mlcroissant"), "hf"),
     **dict.fromkeys(("starlette", "uvicorn", "websockets"), "play"),
-    **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari")},
+    **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari", "wandb", "trackio")},
     "tensorboardx": "tensorboard",
     "s3fs": "s3",
     "ray": "cluster",
