@@ -142,8 +142,13 @@ seed_option = click.option(
 suite_option = click.option(
     "--suite", type=Folder("`icrl4aht-data teammates`"), metavar="FOLDER", help="Folder of learned teammates."
 )
-tensorboard_option = click.option(
-    "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
+log_option = click.option(
+    "--log",
+    "log_to",
+    type=Names("logger", lazy_attribute("icrl4aht_baselines.training.loggers", "LOGGER_NAMES")),
+    multiple=True,
+    default=("json",),
+    help="Also log for tensorboard, wandb or trackio, into OUT; repeat. json is metrics.jsonl, always written.",
 )
 gifs_option = click.option(
     "--gifs/--no-gifs", default=True, help="The first and last episode with each family on the page."
