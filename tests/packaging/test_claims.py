@@ -49,7 +49,6 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, record_size
 from tests.helpers.paths import ROOT
-from tests.packaging.test_docs import rows
 
 TINY_SIZE = SIZES["tiny"]
 SEEDED = get_protocol("seeded")
@@ -212,6 +211,19 @@ def tiny_size() -> tuple[int, int, int]:
     return TINY_SIZE.layers, TINY_SIZE.width, TINY_SIZE.context
 
 
+def behaviours_of_tests() -> tuple[int, ...]:
+    """Return the behaviours and tasks of all cells, then the behaviours of the cells that the protocol names."""
+    by_id = {task.task_id: task for task in tasks("test")}
+    counts = Counter((task.layout.name, task.teammate_family) for task in by_id.values())
+    for first, *others in alike_tasks():
+        counts[by_id[first].layout.name, by_id[first].teammate_family] -= len(others)
+    total = sum(counts.values())
+    assert {counts.pop(cell) for cell in list(counts) if cell[1] == "H4"} == {1}
+    named = counts.pop(("cramped_down", "H1")), counts.pop(("test_wide", "H2"))
+    (rest,) = set(counts.values())
+    return total, len(by_id), *named, rest
+
+
 def uncooperative_modes() -> int:
     return TERRITORY.choices["behavior_mode"] - 1  # all but the normal one
 
@@ -236,9 +248,15 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/evaluating", "of {} episodes with {} steps each", lambda: (SEEDED.episodes, SEEDED.steps)),
     ("docs/evaluating", "canonical channels, the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
     ("docs/evaluating", "more than `stay` in {} of the {} cells", cells_without_headroom),
-    ("docs/protocol", "--split validation`): up to {} [drawn", validation_by_layout),
+    ("docs/protocol", "choices.md)): up to {} [drawn", validation_by_layout),
     ("docs/protocol", "scripts of {} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),
     ("docs/protocol", "{} of its modes do not cooperate", uncooperative_modes),
+    (
+        "docs/protocol",
+        "have {} behaviours of {} tasks (`cards/behaviours.json`). All instances of H4 are one on every layout. Of the "
+        "others, H1 has {} behaviours on cramped_down, H2 has {} on test_wide, and all other cells have {}.",
+        behaviours_of_tests,
+    ),
     ("docs/protocol", "canonical channels takes (5, 5, {})", lambda: len(CANONICAL_CHANNELS)),
     ("docs/protocol", "its oldest {} is dropped", lambda: dropped_steps(500) / 500),
     ("docs/protocol", "*No headroom*: {} of the {} cells", cells_without_headroom),
@@ -253,8 +271,8 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/protocol", "{} on attention weights (App. E.5)", lambda: ModelOptions().dropout),
     (
         "docs/protocol",
-        "the best {} of {} | in `small` the best {} of the {} of {} learners, if its end exceeds its start by {}; "
-        "tasks that rise by less than {}",
+        "the best {} of {} streams | in `small` the best {} of the {} of {} learners, if its end exceeds its start "
+        "by {}; tasks that rise by less than {}",
         streams_of_profiles,
     ),
     ("docs/protocol", "{} GRU layers of {}", lambda: (ModelOptions().recurrent_layers, ModelOptions().width)),
@@ -314,30 +332,6 @@ def test_stated_numbers_are_those_of_code_and_data(page, claim, compute):
         decimals = len(text.partition(".")[2]) if text not in WORDS else 3
         number = WORDS[text] if text in WORDS else float(text.replace(",", ""))
         assert number == pytest.approx(round(value, decimals)), f"{page}.md: {claim!r}: {text}, computed {value}"
-
-
-def behaviours_of_tests() -> dict[str, dict[str, int]]:
-    """Return family -> test layout -> number of behaviours, as docs/protocol.md states them."""
-    layouts = [name for splits in TRACKS.values() for name in splits["test"]]
-    return {
-        family: dict(zip(layouts, map(int, counts), strict=True)) for family, *counts in rows("protocol", "behaviours")
-    }
-
-
-def test_behaviours_of_the_test_tasks_are_added_up():
-    counts = behaviours_of_tests()
-    total = sum(sum(row.values()) for row in counts.values())
-    assert stated_numbers("docs/protocol", "{} behaviours of {} tasks") == [str(total), str(len(tasks("test")))]
-    assert list(counts) == list(HEURISTICS)
-
-
-def test_behaviours_of_the_test_tasks():
-    by_id = {task.task_id: task for task in tasks("test")}
-    found = Counter((task.layout.name, task.teammate_family) for task in by_id.values())
-    for first, *others in alike_tasks():
-        found[by_id[first].layout.name, by_id[first].teammate_family] -= len(others)
-    stated = {(name, family): count for family, row in behaviours_of_tests().items() for name, count in row.items()}
-    assert found == stated
 
 
 @pytest.mark.slow
