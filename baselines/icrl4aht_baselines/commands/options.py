@@ -196,18 +196,7 @@ def add_options(command: Any, options: Iterable[Callable[[Any], Any]]) -> Any:
     return functools.reduce(lambda decorated, option: option(decorated), reversed([*options]), command)
 
 
-_NO_FILTERS = (
-    "order",
-    "queries",
-    "labels",
-    "every",
-    "first",
-    "held_out",
-    "channels",
-    "mirror",
-    "rename",
-    "hide_recipe",
-)
+_NO_FILTERS = ("order", "queries", "labels", "every", "first", "held_out", "channels", "mirror", "hide_recipe")
 history_filters = dataclass_options(HistoryOptions, "filters", exclude=_NO_FILTERS)
 """Options that filter histories; the command receives them as the dict `filters`."""
 
@@ -363,7 +352,7 @@ def variant_names(command: str) -> Names:
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
 
 
-_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "first", "mirror", "rename", "hide_recipe")
+_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "first", "mirror", "hide_recipe")
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:
