@@ -117,6 +117,7 @@ class ProofJob:
     options: ProofOptions
     out: Path
     xla_threads: int | None = 1
+    is_quick: bool = False
 
     @property
     def name(self) -> str:
