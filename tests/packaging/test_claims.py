@@ -248,7 +248,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/evaluating", "of {} episodes with {} steps each", lambda: (SEEDED.episodes, SEEDED.steps)),
     ("docs/evaluating", "canonical channels, the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
     ("docs/evaluating", "more than `stay` in {} of the {} cells", cells_without_headroom),
-    ("docs/protocol", "choices.md)): up to {} [drawn", validation_by_layout),
+    ("docs/protocol", "choices.md): up to {} [drawn", validation_by_layout),
     ("docs/protocol", "scripts of {} families with {} parameter sets", lambda: (len(HEURISTICS), INSTANCES)),
     ("docs/protocol", "{} of its modes do not cooperate", uncooperative_modes),
     (
