@@ -12,7 +12,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 # Files keep their fixtures on one worker and start in order of collection: what compiles most comes first.
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
-CODE := icrl4aht_data generation baselines benchmarks tests
+CODE := icrl4aht_data generation baselines benchmarks tests docs/hooks.py
 
 .PHONY: help install constraints demo generate teammates verify control test test-slow check docs format bench-env bench-collect bench-gpu bench-learn bench-loader clean
 .DEFAULT_GOAL := help

@@ -19,7 +19,7 @@ from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES, PARQUET_INDEX, TEXTS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, record_width
-from icrl4aht_data.utils.install_hints import import_optional
+from icrl4aht_data.utils.install_hints import AUTHORS, import_optional, project_url
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.card import card_texts, episode_texts, rai_texts
 
@@ -97,8 +97,9 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             version=info.data_version,
             date_published=datetime.datetime.combine(published, datetime.time.min),
             license=[_LICENCE],
+            url=project_url(),
             cite_as=card_file("citation.bib").read_text(encoding="utf-8").strip(),
-            creators=[mlc.Organization(ctx=context, name="The icrl4aht-data authors")],
+            creators=[mlc.Organization(ctx=context, name=AUTHORS)],
             keywords=["reinforcement learning", "in-context learning", "ad-hoc teamwork", "Overcooked"],
             distribution=[*files, *sets],
             record_sets=list(records),

@@ -1,8 +1,13 @@
-"""Commands that install missing optional packages. pip adds an extra to the installed copy, wherever it came from."""
+"""Facts of the installed distribution: its address, and commands that install missing optional packages.
+
+pip adds an extra to the installed copy, wherever it came from.
+"""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, metadata
 from typing import Any
 
 from icrl4aht_data.errors import OptionError
@@ -10,12 +15,15 @@ from icrl4aht_data.errors import OptionError
 PACKAGE = "icrl4aht-data"
 """Name of the distribution that contains icrl4aht_data, icrl4aht_generation and icrl4aht_baselines."""
 
+AUTHORS = "The icrl4aht-data authors"
+"""The authors of the package and of the bundled release, as in pyproject.toml and CITATION.cff."""
+
 EXTRAS = {
     **dict.fromkeys(("jax", "flax", "optax", "jaxtyping", "safetensors"), "baselines"),
     **dict.fromkeys(("matplotlib", "pillow"), "plot"),
     **dict.fromkeys(("datasets", "pyarrow", "mlcroissant"), "hf"),
     **dict.fromkeys(("starlette", "uvicorn", "websockets"), "play"),
-    **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari")},
+    **{name: name for name in ("pandas", "grain", "torch", "pettingzoo", "jaxmarl", "minari", "wandb", "trackio")},
     "tensorboardx": "tensorboard",
     "s3fs": "s3",
     "ray": "cluster",
@@ -27,6 +35,14 @@ _DISTRIBUTIONS = {"pil": "pillow"}  # module -> distribution, where their names 
 
 RESTORE = f"pip install --force-reinstall --no-deps {PACKAGE}, or in a checkout git checkout ."
 """Command that restores missing files of this package."""
+
+
+def project_url() -> str | None:
+    """Return the address of the repository, `Repository` in pyproject.toml; None as long as it has none."""
+    with suppress(PackageNotFoundError):  # a folder of sources that was not installed
+        urls = dict(line.split(", ", 1) for line in metadata(PACKAGE).get_all("Project-URL") or [])
+        return urls.get("Repository")
+    return None
 
 
 def install_command(*extras: str) -> str:

@@ -52,6 +52,7 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import files_below, write_json
+from icrl4aht_data.utils.install_hints import project_url
 from icrl4aht_data.utils.templates import card_file, markdown_table
 from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_data.writing.proof import proof_table, read_proof
@@ -174,6 +175,7 @@ def facts(root: Path) -> dict[str, Any]:
     sources = Counter(entry.source for entry in entries)
     return {
         "info": info,
+        "url": project_url(),
         "files": files,
         "configs": _viewer_configs(entries, files),
         "has_states": info.kind in KINDS,

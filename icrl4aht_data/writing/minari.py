@@ -32,7 +32,8 @@ from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import History
-from icrl4aht_data.utils.install_hints import import_optional
+from icrl4aht_data.utils.install_hints import AUTHORS, import_optional
+from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_data.writing.convert import HistoryProgress
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 
@@ -77,17 +78,25 @@ def to_minari(
     about = _describe(dataset)
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
         (folder / "data").mkdir()
+        environment = _environment(dataset, about["tasks"], canonical)
         storage = storage_module.MinariStorage.new(
             folder / "data",
             spaces.Box(0, 255, observation_shape(dataset.layouts[0], canonical), np.uint8),
             spaces.Discrete(len(ACTIONS)),
-            _environment(dataset, about["tasks"], canonical),
+            environment,
+        )
+        several = (
+            "; there is no single environment to recover, episodes name their tasks" if environment is None else ""
         )
         metadata = {
             "dataset_id": target.name,
             "minari_version": minari.__version__,
             "algorithm_name": ", ".join(sorted({entry.source for entry in dataset.entries})),
-            "description": f"ICRL4AHT learning histories, data version {dataset.info.data_version}",
+            "author": {AUTHORS},
+            "description": (
+                f"ICRL4AHT learning histories, data version {dataset.info.data_version}: {len(dataset)} histories of "
+                f"{counted_noun(len(about['tasks']), 'task')}{several}"
+            ),
             "icrl4aht": about,
         }
         storage.update_metadata(metadata)

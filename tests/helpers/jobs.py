@@ -22,6 +22,7 @@ class FileJob:
     killed: bool = False
     updates: int = 1
     xla_threads: int | None = 1
+    is_quick: bool = True
 
     @property
     def label(self) -> str:

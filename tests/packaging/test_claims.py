@@ -228,8 +228,15 @@ def uncooperative_modes() -> int:
     return TERRITORY.choices["behavior_mode"] - 1  # all but the normal one
 
 
+def size_of_the_bundle() -> tuple[int, ...]:
+    size = sum(path.stat().st_size for path in MINI.rglob("*") if path.is_file())
+    layouts, tasks_ = {entry.layout for entry in histories()}, {entry.task_id for entry in histories()}
+    return len(histories()), len(tasks_), len(layouts), sum(entry.T for entry in histories()), round(size / 1e6)
+
+
 CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("README", "Of the {} bundled histories, {} earn at least {} more", rising_histories),
+    ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", size_of_the_bundle),
     ("README", "a delivery is worth {}.", lambda: DELIVERY_REWARD),
     ("README", "more than `stay` in {} of the {} cells", cells_without_headroom),
     ("docs/index", "the benchmark's {} test tasks", lambda: len(tasks("test"))),

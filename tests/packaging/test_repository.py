@@ -74,3 +74,11 @@ def test_the_lowest_jax_is_tested():
 
 def test_the_citation_has_the_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version("icrl4aht-data")
+
+
+def test_the_address_is_the_same_everywhere():
+    """pyproject.toml has the repository's address, once there is one; README, the citation and the site repeat it."""
+    url = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"].get("Repository")
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text()).get("repository-code") == url
+    assert re.findall(r"^repo_url: (.*)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE) == ([url] if url else [])
+    assert url is None or url in (ROOT / "README.md").read_text()

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.chromium import CHROMIUM, NEEDS_CHROMIUM
 from tests.helpers.paths import ROOT
 from tests.packaging.test_docs import DOCS, PAGES, rows
 
@@ -81,3 +82,18 @@ def test_the_site_loads_nothing_from_other_hosts(site):
         assert not re.findall(r"<(?:script|img|link|iframe)[^>]+(?:src|href)=\"(?:https?:)?//[^>]*>", html), page
     assert 'id="icrl4aht_data.load_icrl4aht"' in pages["api/datasets.html"]
     assert "min_expert_return" in pages["api/datasets.html"], "signatures"
+    assert 'href="notebooks/explore.html"' in pages["notebooks.html"], "a page, not JSON"
+    assert 'id="one-history"' in pages["notebooks/explore.html"] and "data:image/png" in pages["notebooks/explore.html"]
+
+
+@NEEDS_CHROMIUM
+def test_pages_on_a_disk_can_be_searched(site):
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.goto((site / "start.html").as_uri())
+        page.fill("input.md-search__input", "headroom")
+        page.wait_for_selector(".md-search-result__item", state="attached", timeout=60_000)
+        browser.close()

@@ -315,3 +315,8 @@ def test_the_installed_size_is_limited(installed, capsys):
     assert 0 < release <= RELEASE_BYTES
     assert len(models) == 8 and all(0 < model <= MODEL_BYTES for model in models)
     assert sum(sizes.values()) <= ENVIRONMENT_BYTES
+    page = (ROOT / "docs" / "start.md").read_text(encoding="utf-8")
+    stated = re.search(r"(\d+) MB\s+installed, (\d+) MB with the required dependencies", page)
+    assert stated, "docs/start.md states both sizes"
+    for said, found in zip(stated.groups(), (own, sum(sizes.values())), strict=True):
+        assert abs(1e6 * int(said) - found) <= 0.1 * found, f"docs/start.md: {said} MB"

@@ -50,7 +50,10 @@ class HostAgent(Protocol):
         ...
 
     def act(self, ego_input: EgoInput) -> np.ndarray:
-        """Return actions, integers (B,) in 0..5, for an `EgoInput` of arrays (B, ...): obs is uint8 (B, 5, 5, C)."""
+        """Return actions, integers (B,) in 0..5, for an `EgoInput` of arrays (B, ...): obs is uint8 (B, 5, 5, C).
+
+        The arrays are copies, which the agent may keep and change.
+        """
         ...
 
 
@@ -81,7 +84,7 @@ def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout]
 
         def call(*ego_input) -> np.ndarray:
             batch = len(ego_input[1])
-            actions = np.asarray(agent.act(EgoInput(*(np.asarray(part) for part in ego_input))))
+            actions = np.asarray(agent.act(EgoInput(*map(np.array, ego_input))))
             if actions.shape != (batch,) or not np.issubdtype(actions.dtype, np.integer):
                 raise OptionError(
                     f"the agent's act returned {actions.dtype} of shape {actions.shape}, expected integers ({batch},)"

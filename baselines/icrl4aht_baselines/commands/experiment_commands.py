@@ -182,7 +182,7 @@ def proof_command(
 
     Trains small models on the release alone, AD and DPT, and evaluates them on validation tasks: of the track
     preference with their memory and with it cleared before each episode, and of the track teammate beside
-    rl2-reference. About 10 minutes each on one core. Writes OUT/proof.json, which the release's card shows; finished
+    rl2-reference. About 35 minutes each on one core. Writes OUT/proof.json, which the release's card shows; finished
     trainings are kept, stopped ones resume.
     """
     options = read_queue_options(queue)

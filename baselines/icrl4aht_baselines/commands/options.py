@@ -142,8 +142,13 @@ seed_option = click.option(
 suite_option = click.option(
     "--suite", type=Folder("`icrl4aht-data teammates`"), metavar="FOLDER", help="Folder of learned teammates."
 )
-tensorboard_option = click.option(
-    "--tensorboard", is_flag=True, help="Also log for TensorBoard, into the run's folder."
+log_option = click.option(
+    "--log",
+    "log_to",
+    type=Names("logger", lazy_attribute("icrl4aht_baselines.training.loggers", "LOGGER_NAMES")),
+    multiple=True,
+    default=("json",),
+    help="Also log for tensorboard, wandb or trackio, into OUT; repeat. json is metrics.jsonl, always written.",
 )
 gifs_option = click.option(
     "--gifs/--no-gifs", default=True, help="The first and last episode with each family on the page."
@@ -191,18 +196,7 @@ def add_options(command: Any, options: Iterable[Callable[[Any], Any]]) -> Any:
     return functools.reduce(lambda decorated, option: option(decorated), reversed([*options]), command)
 
 
-_NO_FILTERS = (
-    "order",
-    "queries",
-    "labels",
-    "every",
-    "first",
-    "held_out",
-    "channels",
-    "mirror",
-    "rename",
-    "hide_recipe",
-)
+_NO_FILTERS = ("order", "queries", "labels", "every", "first", "held_out", "channels", "mirror", "hide_recipe")
 history_filters = dataclass_options(HistoryOptions, "filters", exclude=_NO_FILTERS)
 """Options that filter histories; the command receives them as the dict `filters`."""
 
@@ -358,7 +352,7 @@ def variant_names(command: str) -> Names:
     return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
 
 
-_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "first", "mirror", "rename", "hide_recipe")
+_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "first", "mirror", "hide_recipe")
 
 
 def experiment_options(out: str) -> Callable[[Any], Any]:

@@ -210,7 +210,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
 @topic(
     "Run",
     click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD"),
-    shared.tensorboard_option,
+    shared.log_option,
 )
 @shared.process_options
 def train_command(
@@ -225,7 +225,7 @@ def train_command(
     histories: dict[str, Any],
     play: dict[str, Any],
     manifests: tuple[Path, ...],
-    tensorboard: bool,
+    log_to: tuple[str, ...],
     **machines: Any,
 ) -> None:
     """Train a model on learning histories.
@@ -248,7 +248,7 @@ def train_command(
     click.echo(description)
     params, steps = None if init is None else start_from(init, job.method, job.about), job.options.steps
     with progress_bars(unit="steps") as show:
-        job.train(folder, params=params, tensorboard=tensorboard, done=show_steps(show, method, steps))
+        job.train(folder, params=params, log_to=log_to, done=show_steps(show, method, steps))
     trained = counted_noun(steps, "step")
     click.echo(f"{trained} in {folder}; `icrl4aht-data evaluate --agent {folder} --out ...` plays it")
     if not can_draw():

@@ -1,8 +1,7 @@
-"""Changes of what an ego sees, the same in all steps of a task: mirrored windows, renamed ingredients, hidden recipes.
+"""Changes of what an ego sees, the same in all steps of a task: mirrored windows, and hidden recipe indicators.
 
-The game has no preferred direction, so a mirrored task is another task of the same kind, played on the mirrored layout;
-and no preferred ingredient, so a task with renamed ingredients is one with other dishes, on a layout with other piles.
-Models that are tested on other layouts than they are trained on learn from changed tasks, too. A hidden recipe
+The game has no preferred direction, so a mirrored task is another task of the same kind, played on the mirrored layout.
+Models that are tested on other layouts than they are trained on learn from mirrored tasks, too. A hidden recipe
 indicator looks like a counter, as on layouts without an indicator.
 
 `B` denotes any leading axes. Observations have the canonical channels.
@@ -11,10 +10,8 @@ indicator looks like a counter, as on layouts without an indicator.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from itertools import permutations
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from icrl4aht_generation.learners.encoder import CompactView
@@ -22,23 +19,12 @@ from jaxtyping import Array, Bool, Int, Num
 
 from icrl4aht_baselines.methods.tokens import BatchView
 from icrl4aht_data.overcooked.actions import DOWN, INTERACT, LEFT, RIGHT, STAY, UP
-from icrl4aht_data.overcooked.cells import CANONICAL_TYPES
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
 from icrl4aht_data.overcooked.layouts import Layout
 
 _INDICATOR, _WALL = (CANONICAL_CHANNELS.index(name) for name in ("recipe_indicator", "wall"))
 _IS_WALL = np.arange(len(CANONICAL_CHANNELS)) == _WALL
 _RECIPE = np.array([name.startswith("recipe_") for name in CANONICAL_CHANNELS])
-_INGREDIENTS = [
-    CANONICAL_CHANNELS.index(f"{of}_0")
-    for of in ("self_ingredient", "other_ingredient", "pile", "item_ingredient", "recipe_ingredient")
-]
-"""Where the channels of the four ingredients begin, of each kind of thing that is an ingredient or holds some."""
-NAMINGS = np.array(
-    [[CANONICAL_TYPES - 1 - one for one in reversed(way)] for way in permutations(range(CANONICAL_TYPES))]
-)
-"""Ways to rename ingredients, int64 (24, 4): the ingredient that each one was before. Number 0 renames none, and the
-first n! rename only the first n ingredients."""
 _ROWS, _COLUMNS = -3, -2
 _MIRRORED_ACTIONS = np.array(
     [
@@ -49,8 +35,6 @@ _MIRRORED_ACTIONS = np.array(
     ]
 )
 """Number of the mirroring, see `changed_view` -> action in the mirrored view for each action."""
-MIRRORINGS = len(_MIRRORED_ACTIONS)
-"""Number of ways to mirror a task, none included."""
 
 
 class ViewChange(NamedTuple):
@@ -60,22 +44,19 @@ class ViewChange(NamedTuple):
         hidden: bool (*B,), whether recipe indicators look like counters.
         upside_down: bool (*B,), whether up and down are exchanged.
         sideways: bool (*B,), whether left and right are exchanged.
-        naming: int32 (*B,), how ingredients are renamed: a row of `NAMINGS`.
     """
 
     hidden: Bool[Array, "*B"]
     upside_down: Bool[Array, "*B"]
     sideways: Bool[Array, "*B"]
-    naming: Int[Array, "*B"]
 
     def observations(self, obs: Num[Array, "*B 5 5 46"]) -> Num[Array, "*B 5 5 46"]:
         """Return the observations as the ego sees them."""
-        hidden, rows, columns = (flag[..., None, None, None] for flag in self[:3])
+        hidden, rows, columns = (flag[..., None, None, None] for flag in self)
         # `.at[..., _WALL].max` would be a scatter, which takes several times as long as all else here.
         walls = jnp.maximum(obs, obs[..., _INDICATOR, None])
         counters = jnp.where(_RECIPE, 0, jnp.where(_IS_WALL, walls, obs))
         obs = jnp.where(hidden, counters, obs)
-        obs = _renamed(obs, self.naming)
         obs = jnp.where(rows, _exchanged(jnp.flip(obs, _ROWS), "up", "down"), obs)
         return jnp.where(columns, _exchanged(jnp.flip(obs, _COLUMNS), "left", "right"), obs)
 
@@ -86,19 +67,6 @@ class ViewChange(NamedTuple):
     def at_each_step(self, steps: int, axis: int) -> ViewChange:
         """Return the changes with an axis of steps inserted."""
         return ViewChange(*(jnp.repeat(jnp.expand_dims(flag, axis), steps, axis) for flag in self))
-
-
-def _renamed(obs: Array, naming: Array) -> Array:
-    """Return observations with renamed ingredients.
-
-    A product with a matrix is much faster than a gather of channels.
-    """
-    before = jax.nn.one_hot(NAMINGS, CANONICAL_TYPES, axis=-2, dtype=obs.dtype)[naming]
-    for first in _INGREDIENTS:
-        channels = slice(first, first + CANONICAL_TYPES)
-        renamed = jnp.einsum("...rci,...ij->...rcj", obs[..., channels], before)
-        obs = obs.at[..., channels].set(renamed)
-    return obs
 
 
 def _exchanged(obs: Array, one: str, other: str) -> Array:
@@ -129,14 +97,14 @@ def mirrored_action(actions: np.ndarray, mirroring: np.ndarray) -> np.ndarray:
 def no_change(*shape: int) -> ViewChange:
     """Return changes of shape (*B,) that change nothing."""
     no: Any = jnp.zeros(shape, bool)
-    return ViewChange(no, no, no, jnp.zeros(shape, jnp.int32))
+    return ViewChange(no, no, no)
 
 
 def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> BatchView:
-    """Return the view of batches of state records whose ego sees hidden recipe indicators, or a changed game.
+    """Return the view of batches of state records whose ego sees hidden recipe indicators, or a mirrored game.
 
-    The number of a row's layout in a batch says all of it: number n of N layouts, N times the number of the mirroring,
-    0 for none, 1 for upside down, 2 for sideways, 3 for both, and 4 N times the number of the naming, see `NAMINGS`.
+    The number of a row's layout in a batch says both: number n of N layouts, and N times the number of the mirroring, 0
+    for none, 1 for upside down, 2 for sideways, 3 for both.
 
     Args:
         layouts: the N layouts.
@@ -147,10 +115,9 @@ def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> Bat
 
     def view(records: Any, numbers: Any) -> Any:
         variant = jnp.zeros(records.shape[0], jnp.int32) if numbers is None else jnp.asarray(numbers)
-        number, mirroring = variant % len(layouts), variant // len(layouts) % MIRRORINGS
+        number, mirroring = variant % len(layouts), variant // len(layouts)
         obs: Any = compact(records, number if len(layouts) > 1 else None)
-        naming = variant // (len(layouts) * MIRRORINGS)
-        change = ViewChange(hides[number], mirroring % 2 > 0, mirroring // 2 > 0, naming)
+        change = ViewChange(hides[number], mirroring % 2 > 0, mirroring // 2 > 0)
         within = (1,) * (records.ndim - 2)
         return ViewChange(*(flag.reshape(-1, *within) for flag in change)).observations(obs)
 

@@ -131,6 +131,7 @@ class TrainingJob:
     options: ResponseOptions
     out: Path
     xla_threads: int | None = 1
+    is_quick: bool = False
 
     @property
     def name(self) -> str:

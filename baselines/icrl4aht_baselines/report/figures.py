@@ -17,7 +17,7 @@ import numpy as np
 from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, in_order
 from icrl4aht_baselines.report.scores import cell_scales, cell_scores
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
-from icrl4aht_baselines.report.tables import describe_conditions, mean_of
+from icrl4aht_baselines.report.tables import mean_of
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.plotting import return_limits, running_mean
@@ -78,7 +78,7 @@ class Chart(NamedTuple):
     """A figure of the page: bars of cells, or panels of curves, on shared axes.
 
     Attributes:
-        title, caption: texts above and below the figure.
+        title, caption: texts above and below the figure; the caption may be empty.
         series: number and label of each run in it, with marks for overlap of its training data with these tasks.
         x_ticks, y_ticks: labelled positions of the axes; bars have no vertical axis.
         bars: layout -> rows of bars.
@@ -174,8 +174,7 @@ def _bar_chart(
         bars[cell.layout].append(BarRow(family_title(cell.family), drawn, ranges.get(cell, "")))
     several = any(bar.interval for rows in bars.values() for row in rows for bar in row.bars)
     lines = ["Lines: 95 % intervals over the instances."] * several
-    caption = " ".join([describe_conditions(shown.values(), cells), *lines, about]).rstrip()
-    return Chart(title, caption, _series(shown, cells), scale.ticks(), bars=bars)
+    return Chart(title, " ".join([*lines, about]).rstrip(), _series(shown, cells), scale.ticks(), bars=bars)
 
 
 def _bar(number: int, run: EvaluationRun, cell: ResultCell, found: MeanInterval, scale: _Scale, digits: int) -> Bar:
@@ -229,9 +228,7 @@ def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) ->
     }
     x_ticks = [Tick(x.position(number), str(number)) for number in dict.fromkeys((1, (episodes + 1) // 2, episodes))]
     y_ticks = [Tick(round(100 - tick.position, 2), tick.label) for tick in y.ticks()]
-    return Chart(
-        title, describe_conditions(runs.values(), cells), _series(runs, cells), x_ticks, y_ticks, panels=panels
-    )
+    return Chart(title, "", _series(runs, cells), x_ticks, y_ticks, panels=panels)
 
 
 def _curve(number: int, smooth: np.ndarray, raw: np.ndarray, x: _Scale, y: _Scale) -> Curve:

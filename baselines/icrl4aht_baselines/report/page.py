@@ -28,7 +28,7 @@ from icrl4aht_baselines.report.results import (
     family_title,
 )
 from icrl4aht_baselines.report.scores import add_scales
-from icrl4aht_baselines.report.tables import find_headlines, read_published, returns_tables
+from icrl4aht_baselines.report.tables import describe_conditions, find_headlines, read_published, returns_tables
 from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import atomic_write, json_hash
@@ -188,6 +188,7 @@ def _page_values(
         "title": f"{names}, protocol{'s' if len(protocols) > 1 else ''} {' and '.join(protocols)}",
         "version": version("icrl4aht-data"),
         "headlines": [headline for run in runs for headline in find_headlines(run)],
+        "conditions": [describe_conditions(run for run in runs if run.protocol == protocol) for protocol in protocols],
         "legend": overlap_legend({name for run in runs for name in run.overlaps(run.cells)}),
         "notes": notes,
         "smoothing": SMOOTHING,

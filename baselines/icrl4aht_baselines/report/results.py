@@ -188,8 +188,11 @@ class ResultSource(NamedTuple):
     def conditions(self) -> str:
         """Text with protocol, seeds, episodes and steps of the evaluation, and a model's way of playing."""
         protocol, seeds = self.settings["protocol"], self.settings["seeds"]
+        listed = ", ".join(map(str, seeds))
+        if len(seeds) > 2 and seeds == list(range(seeds[0], seeds[0] + len(seeds))):
+            listed = f"{seeds[0]} to {seeds[-1]}"
         return (
-            f"protocol {protocol['name']}, {counted_noun(len(seeds), 'seed')} ({', '.join(map(str, seeds))}), "
+            f"protocol {protocol['name']}, {counted_noun(len(seeds), 'seed')} ({listed}), "
             f"{counted_noun(protocol['episodes'], 'episode')} of {counted_noun(protocol['steps'], 'step')}"
             + (f", {self.detail('acting')} acting" if self.detail("acting") else "")
             + (", sampled actions" if self.detail("sampled") else "")

@@ -64,8 +64,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
     dataset, validation = _load(histories)
     split = hold_out(dataset, histories.held_out, validation=validation)
     hidden = [get_layout(one).name for one in histories.hide_recipe]
-    changed = [f"{name} = True" for name in ("mirror", "rename") if getattr(histories, name)]
-    view, canonical = _view(dataset, changed, hidden), dataset.channels == "canonical"
+    view, canonical = _view(dataset, histories.mirror, hidden), dataset.channels == "canonical"
     method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, view, canonical))
     labels: Labels | None = histories.labels or ("expert" if method.data == "dpt" else None)
     if labels is not None and not method.takes_labels:
@@ -79,7 +78,6 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
             _sampler(method, selection, options, model, histories, labels),
             dataset.layouts,
             histories.mirror,
-            histories.rename,
         )
         for part, selection in parts.items()
         if selection is not None
@@ -113,9 +111,9 @@ def history_settings(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def _view(dataset: Dataset, changed: Sequence[str], hidden: Sequence[str]) -> BatchView | None:
+def _view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
     """Return the view of a training's batches; None for the default one, of state records."""
-    changed = [*changed] + [f"hide_recipe = {', '.join(hidden)}"] * bool(hidden)
+    changed = [f"mirror = {mirror}"] * mirror + [f"hide_recipe = {', '.join(hidden)}"] * bool(hidden)
     if changed and (dataset.obs != "state" or dataset.channels != "canonical"):
         raise OptionError(
             f"{changed[0]}: expected state records and canonical channels, found {dataset.obs} and {dataset.channels} "

@@ -180,9 +180,6 @@ class HistoryOptions:
     mirror: Annotated[
         bool, Option("Mirror histories at random, up and down or left and right exchanged, to learn of more layouts.")
     ] = False
-    rename: Annotated[
-        bool, Option("Rename the ingredients of histories at random, to learn of more dishes and places of piles.")
-    ] = False
     hide_recipe: Annotated[
         tuple[str, ...], Option("The model does not see the recipe indicators of this layout; repeat for several.")
     ] = ()

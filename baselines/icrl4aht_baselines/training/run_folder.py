@@ -1,4 +1,4 @@
-"""Run folders: config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/, perhaps tensorboard/.
+"""Run folders: config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/, folders of loggers.
 
 Checkpoints, logs and resuming are those of `icrl4aht_generation.learners.resume`. This module has a run's settings.
 """
@@ -12,6 +12,7 @@ from typing import Any
 import jax
 from icrl4aht_generation.learners.resume import METRICS, TIMING, Checkpoints, differing_settings
 
+from icrl4aht_baselines.training.loggers import LOGGER_NAMES
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.utils.files import atomic_write, check_own_folder, parse_json, read_text, write_json
 
@@ -19,8 +20,8 @@ RUN_FORMAT = 4
 """Version of the layout of run folders: 2 since checkpoints are safetensors files, 3 since config.json has
 `trained_on`, 4 since it has `channels`."""
 
-CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD = "config.json", "curves.png", "checkpoints", "tensorboard"
-_FILES = {CONFIG, RUN_CURVES, CHECKPOINTS, TENSORBOARD, METRICS, TIMING}
+CONFIG, RUN_CURVES, CHECKPOINTS = "config.json", "curves.png", "checkpoints"
+_FILES = {CONFIG, RUN_CURVES, CHECKPOINTS, METRICS, TIMING, *LOGGER_NAMES}
 
 
 def format_versions() -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
@@ -25,10 +25,10 @@ from jaxtyping import Array, Int
 
 from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.plotting import plot_training_log
+from icrl4aht_baselines.training.loggers import check_loggers, open_loggers, write_lines
 from icrl4aht_baselines.training.options import SAVE_MINUTES, TrainOptions
-from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, TENSORBOARD, format_versions, open_run
+from icrl4aht_baselines.training.run_folder import CHECKPOINTS, RUN_CURVES, format_versions, open_run
 from icrl4aht_baselines.training.stopping import TrainingStopped, stop_signals
-from icrl4aht_baselines.training.tensorboard import TensorBoardLog, check_installed
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.sampling.batches import Batches
@@ -223,7 +223,7 @@ class TrainingTask(NamedTuple):
         folder: Path,
         *,
         params: Any = None,
-        tensorboard: bool = False,
+        log_to: Sequence[str] = (),
         done: StepProgress = lambda step, loss: None,
     ) -> Any:
         """Train to the end, from the start or from the last checkpoint in the folder.
@@ -235,7 +235,7 @@ class TrainingTask(NamedTuple):
             folder: receives config.json, metrics.jsonl (a function of the settings), timing.jsonl, checkpoints/ and, if
                 matplotlib is installed, curves.png.
             params: initial parameters, such as those of another run; drawn by the seed by default.
-            tensorboard: whether to write the log for TensorBoard as well, into tensorboard/.
+            log_to: loggers that get the numbers of metrics.jsonl as well, see `loggers.LOGGER_NAMES`.
             done: called after every step, see `StepProgress`.
 
         Returns:
@@ -243,12 +243,11 @@ class TrainingTask(NamedTuple):
 
         Raises:
             OptionError: if the folder has a run with other settings, or with another number of XLA threads, with which
-                the resumed training would give different bits; if tensorboardX is required and not installed.
+                the resumed training would give different bits; if the library of a logger is not installed.
             BusyError: if another process trains in the folder.
             TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
         """
-        if tensorboard:
-            check_installed()
+        check_loggers(log_to)
         options, trainer = self.options, self.trainer or Trainer(self.method, self.options)
         config = {**format_versions(), "method": self.method.name, **self.about, "train": asdict(options)}
         with ExitStack() as stack:
@@ -270,9 +269,7 @@ class TrainingTask(NamedTuple):
             first = int(state.step)
             # Lines after the checkpoint are dropped, since their steps are computed again.
             log = stack.enter_context(closing(RunLog(folder, lambda line: line["step"] <= first)))
-            events = TensorBoardLog(folder / TENSORBOARD, folder / METRICS) if tensorboard and writes else None
-            if events:
-                stack.callback(events.close)
+            loggers = stack.enter_context(open_loggers(log_to if writes else (), folder / METRICS, config))
             batches = stack.enter_context(trainer.batches(self.data.train, first, options.steps))
             stop = stack.enter_context(stop_signals())  # entered last: what came before ends by a signal as usual
             before = first, time.perf_counter(), 0.0
@@ -295,8 +292,7 @@ class TrainingTask(NamedTuple):
                     speed = {"steps_per_second": round(steps / seconds, 4), "loader_wait": round(waited / seconds, 4)}
                     log.write(*lines, timing={"step": step, **speed})
                     before = now
-                    if events:
-                        events.add(lines)
+                    write_lines(loggers, lines)
                 saves, stopped_by = agree_on_stop(save.due(step), stop[0] if stop else 0)
                 if saves or stopped_by:
                     log.sync()  # a checkpoint whose log was lost could never get these lines again

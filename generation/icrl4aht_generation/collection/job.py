@@ -105,6 +105,11 @@ class CollectionJob:
         """Threads of the profile."""
         return self.profile.xla_threads
 
+    @property
+    def is_quick(self) -> bool:
+        """Whether a script plays."""
+        return self.work.source != "ppo"
+
     def is_finished(self) -> bool:
         """Return whether the artefact is complete and unchanged."""
         return is_task_finished(self.folder, self.work, self.profile)

@@ -47,6 +47,12 @@ class Job(Protocol):
         """Threads of XLA on a CPU, on which its bits depend; None for all cores."""
         ...
 
+    @property
+    def is_quick(self) -> bool:
+        """Whether it takes seconds. Quick jobs share a process and what it compiled; others have their own process, so
+        that its memory is released."""
+        ...
+
     def is_finished(self) -> bool:
         """Return whether its result is complete and unchanged."""
         ...

@@ -31,7 +31,7 @@ from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.ray_executor import run_on_ray
 
 _POLL_SECONDS = 1.0
-_JOBS_OF_A_PROCESS = 32  # then its memory is released; until then its jobs share what it compiled
+_QUICK_JOBS = 32  # of a process, until its memory is released
 
 _Pool = tuple[int | None, ProcessPoolExecutor]
 """Number of threads, and a pool of one process: a worker that is killed breaks its own pool only."""
@@ -128,7 +128,7 @@ def _run_here(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOp
 
 
 def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
-    """Run several jobs at a time in processes, which keep what they compiled for their next jobs."""
+    """Run several jobs at a time in processes; quick ones share processes, see `Job.is_quick`."""
     if not jobs:
         return
     before: Any = None
@@ -149,8 +149,10 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
             for future in ended:
                 job, pool = running.pop(future)
                 error = future.exception()
-                if not isinstance(error, BrokenExecutor):
+                if job.is_quick and not isinstance(error, BrokenExecutor):
                     idle.append(pool)
+                else:
+                    pool[1].shutdown(wait=False)
                 if error is None:
                     yield JobOutcome(job, future.result(), attempts[job.name])
                 elif not isinstance(error, Exception):  # the worker was told to stop
@@ -182,7 +184,7 @@ def _start_job(job: Job, wait: bool, idle: list[_Pool]) -> tuple[Future[Any], _P
     if idle:  # its process holds memory that the new one may need
         idle.pop()[1].shutdown()
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(1, context, max_tasks_per_child=_JOBS_OF_A_PROCESS)
+    pool = ProcessPoolExecutor(1, context, max_tasks_per_child=_QUICK_JOBS)
     return pool.submit(run_in_worker, job, wait), (job.xla_threads, pool)
 
 

@@ -210,6 +210,7 @@ class PopulationJob:
     population: PopulationRun
     suite: Path
     xla_threads: int | None = None
+    is_quick: bool = False
 
     @property
     def name(self) -> str:

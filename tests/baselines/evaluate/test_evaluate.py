@@ -159,6 +159,7 @@ def test_host_agents_receive_observations_and_rewards():
     played = list(play_tasks(from_host(watcher), SIMPLE, protocol))
     record, actions, reward = (np.concatenate([np.asarray(p[k]) for p in played], axis=1) for k in range(3))
     assert len(watcher.seen) == 200
+    assert all(part.flags.writeable for part in watcher.seen[0]), "torch.from_numpy takes them without a warning"
     layout = LAYOUTS["coord_simple"]
     for t, ego_input in enumerate(watcher.seen):
         np.testing.assert_array_equal(ego_input.obs, observe(layout, record[:, t], 0))

@@ -167,7 +167,7 @@ def test_a_stopped_training_resumes_bit_for_bit(trainer, through, tmp_path):
 def test_a_first_step_is_not_mirrored(layers):
     """Zeros mean "no previous action" at a task's first step, so mirroring keeps them."""
     flags = jnp.array([True, True])
-    change = ViewChange(~flags, flags, flags, jnp.zeros(flags.shape, jnp.int32))
+    change = ViewChange(~flags, flags, flags)
     zero = jnp.zeros(2, jnp.int32)
     steps = StepInput(jnp.zeros((2, 5, 5, 46), jnp.uint8), zero, jnp.zeros(2), zero)
     seen = seen_steps(change, steps, jnp.array([False, True]))

@@ -87,14 +87,11 @@ def test_names_are_escaped_in_all_reports(tmp_path):
     assert "<br>episodes 1: 10.0, " in text, "line breaks in cells stay"
 
 
-def test_figures_name_conditions_and_mark_overlaps(tmp_path):
+def test_the_page_names_conditions_once_and_marks_overlaps(tmp_path):
     record = [{"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["00"]}]
     runs = [evaluated_run("AD", trained_on=record), evaluated_run("mine", trained_on=None)]
     text = unescape(write_page(runs, tmp_path / "report.html").read_text())
-    captions = re.findall("<figcaption>([^<]*)</figcaption>", text)
-    assert len(captions) == 2
-    for caption in captions:
-        assert caption.startswith("Evaluated under protocol seeded, 1 seed (0), 40 episodes of 100 steps; 5 instances")
+    assert text.count("Evaluated under protocol seeded, 1 seed (0), 40 episodes of 100 steps; 5 instances") == 1
     assert text.count('<i class="key"></i>AD †</span>') == text.count('<i class="key"></i>mine ?</span>') == 2
     (chart,) = bar_charts(dict(enumerate(runs)), "seeded")  # of returns, no best response is measured
     marks = [[bar.text.lstrip("-0123456789.") for bar in row.bars] for row in chart.bars["demo_wide"]]
@@ -102,6 +99,15 @@ def test_figures_name_conditions_and_mark_overlaps(tmp_path):
     short = evaluated_run("DPT", steps=20)
     text = unescape(write_page([*runs, short], tmp_path / "report.html").read_text())
     assert "Evaluated AD and mine under protocol seeded, 1 seed (0), 40 episodes of 100 steps; DPT under" in text
+
+
+def test_without_scores_there_are_no_columns_of_scores(tmp_path):
+    runs = [evaluated_run(name) for name in ("one", "two")]
+    source = runs[0].sources[0]
+    runs[0] = dataclasses.replace(runs[0], sources=(source._replace(settings=source.settings | {"seeds": [0, 1, 2]}),))
+    text = write_page(runs, tmp_path / "report.html").read_text()
+    assert 'data-label="return"' in text and 'data-label="score"' not in text and ">regret<" not in text
+    assert "one under protocol seeded, 3 seeds (0 to 2), 40 episodes" in text
 
 
 def test_bars_run_from_stay_to_the_score(measured, tmp_path):

@@ -50,13 +50,14 @@ def test_local_processes(tmp_path):
     assert (tmp_path / "bad").read_text() == str(os.getpid())
 
 
-def test_processes_run_several_jobs(tmp_path):
-    """They share what the processes compiled. A job with another number of threads of XLA needs another process."""
+def test_quick_jobs_share_processes(tmp_path):
+    """A job with another number of threads of XLA, or one that is not quick, has a process of its own."""
     jobs = [FileJob(tmp_path, f"{number}") for number in range(5)] + [FileJob(tmp_path, "other", xla_threads=2)]
+    jobs += [FileJob(tmp_path, name, xla_threads=3, is_quick=False) for name in ("long", "longer")]
     run(jobs, tmp_path, workers=2)
     pids = [(tmp_path / job.name).read_text() for job in jobs]
     assert len({*pids[:5]}) <= 2
-    assert pids[5] not in pids[:5]
+    assert len({pids[0], *pids[5:]}) == 4
 
 
 def test_a_stopped_training_can_be_passed_between_processes():

@@ -78,6 +78,14 @@ def test_other_facts_are_in_minaris_metadata(lite, converted):
     assert {task["task_id"] for task in about["tasks"]} == about["provenance"].keys() == set(release.column("task_id"))
 
 
+def test_minari_shows_author_size_and_why_there_is_no_environment(converted):
+    opened = minari.MinariDataset(converted / "data")
+    assert opened.env_spec is None
+    shown = opened.storage.metadata
+    assert shown["author"] == {"The icrl4aht-data authors"} and shown["dataset_size"] > 0
+    assert "4 tasks; there is no single environment to recover" in shown["description"]
+
+
 def test_the_command(lite, tmp_path, monkeypatch):
     def run(*arguments: str) -> int:
         monkeypatch.setattr(sys, "argv", ["icrl4aht-data", "convert", "--quiet", *arguments])
