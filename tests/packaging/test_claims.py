@@ -253,8 +253,8 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/protocol", "{} of its modes do not cooperate", uncooperative_modes),
     (
         "docs/protocol",
-        "have {} behaviours of {} tasks (`cards/behaviours.json`). All instances of H4 are one on every layout. Of the "
-        "others, H1 has {} behaviours on cramped_down, H2 has {} on test_wide, and all other cells have {}.",
+        "have {} behaviours of {} tasks (`cards/behaviours.json`). All instances of H4 are one on every layout. H1 "
+        "has {} behaviours on cramped_down, H2 has {} on test_wide, and all other cells have {}.",
         behaviours_of_tests,
     ),
     ("docs/protocol", "canonical channels takes (5, 5, {})", lambda: len(CANONICAL_CHANNELS)),
