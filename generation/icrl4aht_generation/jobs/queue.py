@@ -31,7 +31,7 @@ from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.ray_executor import run_on_ray
 
 _POLL_SECONDS = 1.0
-_QUICK_JOBS = 32  # of a process, until its memory is released
+_QUICK_JOBS = 256  # of a process, until its memory is released
 
 _Pool = tuple[int | None, ProcessPoolExecutor]
 """Number of threads, and a pool of one process: a worker that is killed breaks its own pool only."""
