@@ -36,6 +36,19 @@ function curveScales() {
   return { box, low, high, across, down, episodeAt };
 }
 
+/** Draw the ticks of returns between two values, and choose the font of further texts. */
+function drawTicks(pen, box, low, high, down) {
+  pen.font = "12px system-ui, sans-serif";
+  pen.textBaseline = "middle";
+  pen.textAlign = "right";
+  for (const tick of ticks(low, high)) {
+    pen.fillStyle = colour("line");
+    pen.fillRect(box.left, Math.round(down(tick)), box.right - box.left, 1);
+    pen.fillStyle = colour("quiet");
+    pen.fillText(String(Number(tick.toPrecision(6))), box.left - 7, down(tick));
+  }
+}
+
 function drawCurve() {
   const { returns, shown } = currentFacts();
   const canvas = $("curve");
@@ -49,15 +62,7 @@ function drawCurve() {
     values.forEach((value, episode) => pen.lineTo(across(episode), down(value)));
     pen.stroke();
   };
-  pen.font = "12px system-ui, sans-serif";
-  pen.textBaseline = "middle";
-  pen.textAlign = "right";
-  for (const tick of ticks(low, high)) {
-    pen.fillStyle = colour("line");
-    pen.fillRect(box.left, Math.round(down(tick)), box.right - box.left, 1);
-    pen.fillStyle = colour("quiet");
-    pen.fillText(String(Number(tick.toPrecision(6))), box.left - 7, down(tick));
-  }
+  drawTicks(pen, box, low, high, down);
   const lastTick = returns.length > 1 ? [0, returns.length - 1] : [0];
   for (const episode of lastTick) {
     pen.textAlign = episode ? "right" : "left";

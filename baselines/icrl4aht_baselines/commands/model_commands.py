@@ -295,8 +295,9 @@ def models_command() -> None:
     from icrl4aht_baselines.agents.bundled import bundled_models, describe_model
     from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file
 
-    stored = read_stored(results_file())
-    for model in bundled_models().values():
-        click.echo(f"{model.name}: {model.role}; {describe_scores(stored, model.name)}; of {model.date}")
+    models = bundled_models()
+    scores = describe_scores(read_stored(results_file()), models)
+    for model in models.values():
+        click.echo(f"{model.name}: {model.role}; {scores[model.name]}; of {model.date}")
         for line in describe_model(model):
             click.echo(f"  {line}")

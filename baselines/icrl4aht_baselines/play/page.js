@@ -118,15 +118,7 @@ function drawChart(curves) {
   const [low, high] = [Math.min(0, ...curves.flat()), Math.max(20, ...curves.flat())];
   const across = (episode) => box.left + ((box.right - box.left) * (episode + 0.5)) / setup.episodes;
   const down = (value) => box.bottom - ((box.bottom - box.top) * (value - low)) / (high - low);
-  pen.font = "12px system-ui, sans-serif";
-  pen.textBaseline = "middle";
-  for (const tick of ticks(low, high)) {
-    pen.fillStyle = colour("line");
-    pen.fillRect(box.left, Math.round(down(tick)), box.right - box.left, 1);
-    pen.fillStyle = colour("quiet");
-    pen.textAlign = "right";
-    pen.fillText(String(tick), box.left - 7, down(tick));
-  }
+  drawTicks(pen, box, low, high, down);
   pen.textAlign = "center";
   for (let episode = 0; episode < setup.episodes; episode += Math.ceil(setup.episodes / 10)) {
     pen.fillText(String(episode + 1), across(episode), box.bottom + 14);

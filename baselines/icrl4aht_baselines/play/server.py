@@ -38,7 +38,7 @@ HOST = "127.0.0.1"
 SHOWN_EGOS = ("stay", "rl2-reference", "oracle")
 """Egos that the page compares a person with."""
 
-_SEATS_TAKEN = 4000  # code of a closed websocket: all people of the game are connected
+_ALL_CONNECTED = 4000  # code of a closed websocket: all people of the game are connected
 
 
 def how_to_play(layout: Layout) -> str:
@@ -47,7 +47,8 @@ def how_to_play(layout: Layout) -> str:
     return (
         f"You are the blue chef: move with the arrow keys; space takes, puts down, cooks and serves what is in front "
         f"of you. Put the recipe's three ingredients into a pot, wait {POT_STEPS} steps, take the soup with a plate "
-        f"and bring it to the green bell: {DELIVERY_REWARD:+g}, a wrong soup {WRONG_DELIVERY_REWARD:g}.{button}"
+        f"and bring it to the green bell. The right soup earns {DELIVERY_REWARD:+g}, a wrong one "
+        f"{WRONG_DELIVERY_REWARD:g}.{button}"
     )
 
 
@@ -197,7 +198,7 @@ class PlaySession:
         await connection.accept()
         wanted, free = connection.query_params.get("slot"), [x for x in self.game.people if x not in self._sockets]
         if not free:
-            await connection.close(_SEATS_TAKEN)
+            await connection.close(_ALL_CONNECTED)
             return
         slot = next((x for x in free if str(x) == wanted), free[0])
         self._sockets[slot] = connection

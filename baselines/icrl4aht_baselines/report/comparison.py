@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gzip
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -304,16 +304,19 @@ def _controlled_cells(cells: AgentReturns, scales: CellScales) -> list[ResultCel
     return [cell for cell in open_cells(scales) if cell in cells] or [*cells]
 
 
-def describe_scores(stored: StoredResults, agent: str) -> str:
-    """Return N of an agent on each track, and M, in words; a dash for what is not stored. See tables 1 and 2."""
-    scales, cells = cell_scales(SUBMITTED_PROTOCOL), stored.returns().get(agent, {})
-    cleared = stored.returns("cleared").get(agent, {})
-    texts = []
-    for track in TRACKS:
-        score = find_score(cells, track_cells(open_cells(scales), track), scales) if cells else None
-        texts.append(f"N {_shown(score and score.total)} on track {track}")
-    played = [cell for cell in _controlled_cells(cells, scales) if cell in cleared]
-    return ", ".join([*texts, f"M {_shown(block_difference(cells, cleared, played, 'all'), 1, '+')}"])
+def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, str]:
+    """Return agent -> its N on each track, and M, in words; a dash for what is not stored. See tables 1 and 2."""
+    scales, results, controls = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), stored.returns("cleared")
+    found = {}
+    for agent in agents:
+        cells, cleared, texts = results.get(agent, {}), controls.get(agent, {}), []
+        for track in TRACKS:
+            score = find_score(cells, track_cells(open_cells(scales), track), scales) if cells else None
+            texts.append(f"N {_shown(score and score.total)} on track {track}")
+        played = [cell for cell in _controlled_cells(cells, scales) if cell in cleared]
+        texts.append(f"M {_shown(block_difference(cells, cleared, played, 'all'), 1, '+')}")
+        found[agent] = ", ".join(texts)
+    return found
 
 
 def mean_best(layout: str, scales: CellScales) -> float | None:

@@ -124,7 +124,7 @@ def check_loggers(names: Iterable[str]) -> None:
 
     Raises:
         UnknownNameError: for a name that is not among `LOGGER_NAMES`.
-        OptionError: for a logger whose library is not installed; with the command that installs it.
+        OptionError: if the library of a logger is not installed; the message has the command that installs it.
     """
     for name in names:
         check_choice("logger", name, LOGGER_NAMES)
@@ -149,7 +149,8 @@ def open_loggers(names: Iterable[str], metrics: Path, config: Mapping[str, Any])
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir()
                 opened.append(_LOGGERS[name][1](folder, config))
-        write_lines(opened, map(json.loads, metrics.read_text(encoding="utf-8").splitlines()))
+        if opened:
+            write_lines(opened, map(json.loads, metrics.read_text(encoding="utf-8").splitlines()))
         yield opened
     finally:
         for logger in opened:

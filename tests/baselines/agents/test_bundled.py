@@ -108,9 +108,9 @@ def test_large_models_are_refused(run, tmp_path, monkeypatch):
 
 def test_the_package_bundles_models_that_play_and_have_cards():
     assert set(bundled_models(MODELS)) == {"ad-reference", "ad-rising", "dpt-reference", "rl2-reference"}
-    stored = read_stored(results_file())
+    scores = describe_scores(read_stored(results_file()), bundled_models(MODELS))
     for model in bundled_models(MODELS).values():
-        assert model.role and re.fullmatch(r"M [+-]\d.*", describe_scores(stored, model.name).split(", ")[-1])
+        assert model.role and re.fullmatch(r"M [+-]\d.*", scores[model.name].split(", ")[-1])
         assert (MODELS / model.name / MODEL_CARD).is_file()
         assert model.sampled == (model.name != "ad-reference")
         for track, folder in model.runs.items():
