@@ -26,7 +26,7 @@ from icrl4aht_data.commands.options import (
     json_option,
     overwrite_option,
 )
-from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
+from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -36,7 +36,6 @@ from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
 from icrl4aht_generation.layouts.sheet import save_sheet
 from icrl4aht_generation.learners.config import EncoderKind
-from icrl4aht_generation.teammates.instances import published_tasks
 
 if TYPE_CHECKING:
     from icrl4aht_generation.profiles import Profile  # loads JAX
@@ -269,17 +268,16 @@ def check(a: Path, b: Path, as_json: bool) -> None:
 )
 @overwrite_option
 def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
-    """Write the manifests of all tasks in the package.
+    """Write the manifests of drawn tasks in the package.
 
-    Makes TRACK_test.jsonl from the published parameter sets, and TRACK_validation.jsonl, TRACK_diverse_train.jsonl and
-    TRACK_diverse_validation.jsonl from the drawn teammates that `draws` measured, and those of the track preference.
-    Files that have these tasks are kept.
+    Makes TRACK_validation.jsonl, TRACK_diverse_train.jsonl and TRACK_diverse_validation.jsonl from the drawn teammates
+    that `draws` measured, and those of the track preference. Files that have these tasks are kept. TRACK_test.jsonl are
+    the published tasks, whose ids hash their parameters.
     """
     from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
     from icrl4aht_generation.teammates.preference import preference_tasks
 
-    made = [(manifest_path(track, "test"), published_tasks(track)) for track in TRACKS]
-    made += [(manifest_path(track, "validation"), validation_tasks(track)) for track in TRACKS]
+    made = [(manifest_path(track, "validation"), validation_tasks(track)) for track in TRACKS]
     made += [
         (manifest_path(track, split, "diverse"), diverse_tasks(track, split))
         for track in TRACKS
@@ -292,7 +290,7 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
             different = read_tasks(path) != tasks
             if different and (check or not overwrite):
                 remedy = "run `icrl4aht-data research manifests --overwrite`" if check else "replace it by --overwrite"
-                raise TaskFormatError(f"{path}: differs from the parameter sets or draws; {remedy}")
+                raise TaskFormatError(f"{path}: differs from the draws; {remedy}")
         if not check:
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(path) as partial:
@@ -327,8 +325,7 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
 
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or list(TESTED_ON)
     for name in names:
-        if name not in TESTED_ON:
-            raise unknown("training layout", name, TESTED_ON)
+        check_choice("training layout", name, TESTED_ON)
     path = out or (SPREAD_TABLE if spread else DRAWS_TABLE)
     with progress_bars(unit="layouts") as show:
         fill_table(path, names, lambda done, name: show("draws", done, len(names), name), overwrite, spread=spread)

@@ -18,7 +18,7 @@ from icrl4aht_data.benchmark.facts import (
     layout_number,
     track_layouts,
 )
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
@@ -67,8 +67,7 @@ def build_suite(
         UnknownNameError: for an unknown algorithm.
     """
     for name in chain(*algorithms.values()):
-        if name not in ALGORITHMS:
-            raise unknown("algorithm", name, ALGORITHMS)
+        check_choice("algorithm", name, ALGORITHMS)
     config = profile.teammates
     runs = population_runs(profile, algorithms, seed)
     jobs = [PopulationJob(run, suite, profile.xla_threads) for run in runs]

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Key, UInt8
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, LAYOUT_NAMES, SAME_BEHAVIOUR, TESTED_ON
-from icrl4aht_data.errors import unknown
+from icrl4aht_data.errors import check_choice
 from icrl4aht_data.format.provenance import NearestTest
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
@@ -100,8 +100,7 @@ def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T
     Raises:
         UnknownNameError: if the layout is not one of the benchmark.
     """
-    if layout.name not in LAYOUT_NAMES:
-        raise unknown("layout", layout.name, LAYOUT_NAMES)
+    check_choice("layout", layout.name, LAYOUT_NAMES)
     families = [family for _, family in stacked_families(instance_policies(layout))]
     tables, expert, positions = padded_layout(layout)
     play = _play_tests(tuple(family._replace(params=()) for family in families), episodes)
