@@ -30,11 +30,11 @@ from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.plotting import plot_layouts, save_figure
 from icrl4aht_data.utils.files import atomic_write, check_output
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
-from icrl4aht_generation.layouts.sheet import save_sheet
 from icrl4aht_generation.learners.config import EncoderKind
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
     is_flag=True,
     help="Play each: exit with 1 if the oracle, or a pair of them, delivers no soup in 400 steps.",
 )
-@click.option("--out", type=NewFile(".png"), metavar="FILE", help="Draw a sheet of pictures here.")
+@click.option("--out", type=NewFile(".png"), metavar="FILE", help="Draw pictures of them here.")
 @overwrite_option
 @json_option
 def layouts(
@@ -187,7 +187,8 @@ def layouts(
         check_output(out, overwrite)
     found = generate_layouts(family, seed, count, split=split)
     if out:
-        save_sheet(out, found)
+        titles = [f"{layout.name}\n{split_of(layout)}, {len(layout.recipes)} recipes" for layout in found]
+        save_figure(plot_layouts(found, titles), out)
     delivered = [None] * count
     if check:
         from icrl4aht_generation.layouts.playable import layouts_delivered
@@ -319,6 +320,8 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     and oracle earn with it. With --spread, chooses widely different teammates for the profiles' tasks.spread. Layouts
     that the table has are kept, so that a stopped command resumes.
     """
+    import pandas as pd
+
     from icrl4aht_generation.teammates.draws import DRAWS_TABLE, read_measured
     from icrl4aht_generation.teammates.measuring import fill_table
     from icrl4aht_generation.teammates.spread import SPREAD_TABLE, LayoutSpread, spread_rows
@@ -330,13 +333,8 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     with progress_bars(unit="layouts") as show:
         fill_table(path, names, lambda done, name: show("draws", done, len(names), name), overwrite, spread=spread)
     if spread:
-        rows = spread_rows(read_measured(path, LayoutSpread))
-        from rich.table import Table
-
-        table = Table(*(name.replace("_", " ") for name in rows[0]))
-        for row in rows:
-            table.add_row(*(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
-        console.print(table)
+        rows = pd.DataFrame(spread_rows(read_measured(path, LayoutSpread)))
+        console.print(rows.to_string(index=False, float_format="{:.3f}".format))
     console.print(f"wrote {path}")
 
 

@@ -7,8 +7,8 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
-from rich.table import Table
 
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
@@ -145,7 +145,9 @@ def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool
     returns = play_matrix(suite, layout, algorithm, greedy)
     diagonal = np.eye(len(returns), dtype=bool)
     title = f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps"
-    _show_matrix(console, title, [f"m{k}" for k in range(len(returns))], ("ego", "teammate"), returns)
+    console.print(
+        title, "rows: egos, columns: teammates", _matrix_text([f"m{k}" for k in range(len(returns))], returns), sep="\n"
+    )
     self_play = returns[diagonal].mean()
     cross_play = returns[~diagonal].mean() if len(returns) > 1 else float("nan")
     console.print(f"self-play {self_play:.1f}, cross-play {cross_play:.1f}, gap {self_play - cross_play:.1f}")
@@ -163,15 +165,9 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], co
         policies += [build_teammate(layout, {"family": kind, "theta": theta}) for theta in thetas]
     distances = family_distances(hamming_distances(actions_on_common_states(layout, policies)), families)
     title = f"{layout.name}: mean Hamming distance of families"
-    _show_matrix(console, title, list(families), ("family", "family"), distances)
+    console.print(title, _matrix_text(list(families), distances), sep="\n")
 
 
-def _show_matrix(console: Console, title: str, names: Sequence[str], axes: tuple[str, str], values: np.ndarray) -> None:
-    """Print a square matrix with the same names for rows and columns."""
-    table = Table(title=title)
-    table.add_column(" \\ ".join(axes))
-    for name in names:
-        table.add_column(name, justify="right")
-    for name, row in zip(names, values, strict=True):
-        table.add_row(name, *(f"{value:.2f}" for value in row))
-    console.print(table)
+def _matrix_text(names: list[str], values: np.ndarray) -> str:
+    """Return a square matrix as text, with the same names for rows and columns."""
+    return pd.DataFrame(values, names, names).to_string(float_format="{:.2f}".format)
