@@ -144,10 +144,11 @@ def report_diversity(
 def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:
     returns = play_matrix(suite, layout, algorithm, greedy)
     diagonal = np.eye(len(returns), dtype=bool)
-    title = f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps"
-    console.print(
-        title, "rows: egos, columns: teammates", _matrix_text([f"m{k}" for k in range(len(returns))], returns), sep="\n"
+    title = (
+        f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps, egos in "
+        f"rows, teammates in columns"
     )
+    console.print(title, _matrix_text([f"m{k}" for k in range(len(returns))], returns), sep="\n")
     self_play = returns[diagonal].mean()
     cross_play = returns[~diagonal].mean() if len(returns) > 1 else float("nan")
     console.print(f"self-play {self_play:.1f}, cross-play {cross_play:.1f}, gap {self_play - cross_play:.1f}")
