@@ -32,8 +32,6 @@ from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
     FIELDS,
     OBSERVATIONS,
-    PROVENANCE,
-    TASKS,
     Kind,
     episode_ends,
     held_fields,
@@ -84,8 +82,7 @@ def to_published(
     target = as_path(target)
     kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
     names = {entry.task_id for entry in dataset.entries}
-    recorded = read_provenance(dataset.origin.file(PROVENANCE))
-    provenance = {name: of_task for name, of_task in recorded.items() if name in names}
+    provenance = {name: of_task for name, of_task in dataset.provenance.items() if name in names}
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
         with _new_hdf5(folder / HISTORIES_H5) as new, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
@@ -96,7 +93,7 @@ def to_published(
                 line["env_idx"] += history.entry.learner * _streams_each(provenance.get(history.entry.task_id))
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
                 advance(number + 1, len(dataset))
-        tasks = [task for task in read_tasks(dataset.origin.file(TASKS)) if task.task_id in names]
+        tasks = [task for name, task in dataset.tasks.items() if name in names]
         if tasks:
             write_tasks(folder / "tasks.jsonl", tasks)
         write_json(folder / "provenance.json", {name: of_task.to_json() for name, of_task in provenance.items()})

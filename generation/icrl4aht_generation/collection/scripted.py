@@ -23,7 +23,6 @@ from icrl4aht_data.format.schema import curve_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_generation.collection.curate import stream_returns
-from icrl4aht_generation.collection.record import SCRIPT_ARRAYS, array_shapes, arrays_bytes
 from icrl4aht_generation.collection.scripted_rollout import (
     Piece,
     ScriptedEpisodes,
@@ -32,7 +31,14 @@ from icrl4aht_generation.collection.scripted_rollout import (
     scripted_pieces,
 )
 from icrl4aht_generation.collection.task import TEAMMATE_NOISE, UpdateCallback
-from icrl4aht_generation.collection.task_folder import ArrayWriter, finish_artefact, reserve_disk
+from icrl4aht_generation.collection.task_folder import (
+    SCRIPT_ARRAYS,
+    ArrayWriter,
+    array_shapes,
+    arrays_bytes,
+    finish_artefact,
+    reserve_disk,
+)
 from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.teammates.registry import build_teammate

@@ -23,8 +23,8 @@ from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.system import usable_cores
-from icrl4aht_generation.collection.record import array_shapes, arrays_bytes
 from icrl4aht_generation.collection.scripted import scripted_bytes
+from icrl4aht_generation.collection.task_folder import array_shapes, arrays_bytes
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.learners.network import ActorCritic

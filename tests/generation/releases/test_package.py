@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_generation.collection.curate import oracle_labels
-from icrl4aht_generation.collection.record import HistoryArrays
-from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA
+from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA, HistoryArrays
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.releases import measures
 from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unhosted_families
