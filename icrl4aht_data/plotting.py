@@ -17,7 +17,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.layouts_file import layout_title
 from icrl4aht_data.overcooked.actions import DOWN
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.overcooked.render import draw_frame
+from icrl4aht_data.overcooked.render import draw_frame, encode_episode
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
 from icrl4aht_data.overcooked.state import start
 from icrl4aht_data.utils.files import atomic_write
@@ -131,6 +131,25 @@ def plot_history(returns: np.ndarray, title: str, expert_return: float | None = 
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, frameon=False)
     return figure
+
+
+def animate_episode(
+    layout: Layout, records: np.ndarray, rewards: np.ndarray, title: str, *, cell: int = 32, fps: int = 8
+) -> Picture:
+    """Return an episode as an animated GIF, which notebooks play.
+
+    Args:
+        layout: the layout.
+        records: state records uint8 (T, S) in order.
+        rewards: real (T,), the reward of the step from each record.
+        title: what the animation shows, in words.
+        cell: side of a map cell in pixels, 16 to 128.
+        fps: frames per second, 1 to 50.
+
+    Raises:
+        OptionError: for an impossible `cell` or `fps`, or if Pillow is not installed.
+    """
+    return Picture(title, encode_episode(layout, records, rewards, cell=cell, fps=fps))
 
 
 def plot_learning_curves(dataset: Iterable[Any], path: Path | None = None) -> Figure:

@@ -13,8 +13,7 @@ from icrl4aht_data.errors import LabelsMissingError, NotStoredError, OptionError
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind, episode_returns
 from icrl4aht_data.overcooked.channels import Channels, observation_shape, to_canonical
 from icrl4aht_data.overcooked.fast_observe import fast_observe
-from icrl4aht_data.overcooked.render import encode_episode
-from icrl4aht_data.plotting import Picture, plot_history
+from icrl4aht_data.plotting import Picture, animate_episode, plot_history
 from icrl4aht_data.reading.episodes import Episodes, FieldArrays
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.options import check_int
@@ -186,5 +185,4 @@ class History(FieldArrays):
             NotStoredError: for a release without state records.
         """
         chosen = self.episodes[check_int("episode", episode, -(2**63))]
-        drawn = encode_episode(self._shard.layout, chosen.state, chosen.rewards, cell=cell, fps=fps)
-        return Picture(repr(chosen), drawn)
+        return animate_episode(self._shard.layout, chosen.state, chosen.rewards, repr(chosen), cell=cell, fps=fps)
