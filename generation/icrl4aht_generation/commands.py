@@ -322,8 +322,8 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     """
     import pandas as pd
 
+    from icrl4aht_generation.teammates.distances import fill_table
     from icrl4aht_generation.teammates.draws import DRAWS_TABLE, read_measured
-    from icrl4aht_generation.teammates.measuring import fill_table
     from icrl4aht_generation.teammates.spread import SPREAD_TABLE, LayoutSpread, spread_rows
 
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or list(TESTED_ON)
