@@ -131,8 +131,9 @@ def roll_out(
         outcome = env.step(carry.env, actions)
         state = restart(outcome.state, outcome.done)
         returns = carry.returns + outcome.reward
+        # The memory of a new episode, in the slots whose environment is done.
         memories = tuple(
-            _reset_memory(player, memory, state, outcome.done)
+            select_rows(outcome.done[player.agent_slots % n], player.init(state), memory)
             for player, (_, memory) in zip(players, acted, strict=True)
         )
         played = Rollout(
@@ -148,11 +149,6 @@ def roll_out(
         return RolloutCarry(state, outcome.done, memories, jnp.where(outcome.done, 0.0, returns)), played
 
     return jax.lax.scan(step, carry, jax.random.split(key, steps))
-
-
-def _reset_memory(player: Player, memory: Any, state: EnvState, done: Bool[Array, " N"]) -> Any:
-    """Return the player's memory, with that of a new episode in the slots whose environment is `done`."""
-    return select_rows(done[player.agent_slots % done.shape[0]], player.init(state), memory)
 
 
 def select_rows(which: Bool[Array, " N"], one: Any, other: Any) -> Any:
