@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -25,6 +24,7 @@ from icrl4aht_data.commands.options import (
     examples,
     json_option,
     overwrite_option,
+    print_result,
 )
 from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
@@ -32,7 +32,7 @@ from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.plotting import plot_layouts, save_figure
 from icrl4aht_data.utils.files import atomic_write, check_output
-from icrl4aht_data.utils.progress import progress_bars
+from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
 from icrl4aht_generation.learners.config import EncoderKind
@@ -193,7 +193,8 @@ def layouts(
     if check:
         from icrl4aht_generation.layouts.playable import layouts_delivered
 
-        delivered = layouts_delivered(found).tolist()
+        with progress_bars(unit="layouts") as show:
+            delivered = layouts_delivered(found, counted(show, "check", count)).tolist()
     rows = [
         {
             "name": layout.name,
@@ -205,13 +206,11 @@ def layouts(
         | ({"delivered": one} if check else {})
         for layout, one in zip(found, delivered, strict=True)
     ]
-    if as_json:
-        click.echo(json.dumps(rows))
-    else:
-        for layout, row in zip(found, rows, strict=True):
-            size = f"{layout.width}x{layout.height}"
-            fault = "  no soup delivered" if row.get("delivered") is False else ""
-            click.echo(f"{layout.name:<20} {row['split']:<10} {size:<5} {len(layout.recipes):>2} recipes{fault}")
+    lines = []
+    for layout, one in zip(found, delivered, strict=True):
+        size, fault = f"{layout.width}x{layout.height}", "  no soup delivered" if one is False else ""
+        lines.append(f"{layout.name:<20} {split_of(layout):<10} {size:<5} {len(layout.recipes):>2} recipes{fault}")
+    print_result(rows, "\n".join(lines), as_json)
     if out:
         click.echo(f"wrote {out}", err=as_json)
     sys.exit(int(False in delivered))
@@ -229,11 +228,7 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
     from icrl4aht_generation.planning.plan import estimate_cost
 
     cost = estimate_cost(_profile_with_threads(profile_name, None), devices)
-    if as_json:
-        click.echo(json.dumps(asdict(cost), indent=2))
-    else:
-        for name, value in cost.rows():
-            click.echo(f"{name:<28} {value}")
+    print_result(asdict(cost), "\n".join(f"{name:<28} {value}" for name, value in cost.rows()), as_json)
 
 
 @click.command(epilog=examples("icrl4aht-data check build/smoke build/again"))
@@ -249,16 +244,13 @@ def check(a: Path, b: Path, as_json: bool) -> None:
     from icrl4aht_generation.releases.check import compare_rebuilds
 
     compared = compare_rebuilds(a, b)
-    if as_json:
-        click.echo(json.dumps({"equal": not compared.differences, **asdict(compared)}, indent=2))
-    else:
-        for name, difference in compared.differences.items():
-            click.echo(f"{name}: {difference}")
-        verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
-        for folder, threads in zip((a, b), compared.xla_threads, strict=True):
-            numbers = " and ".join(map(str, threads)) or "an unknown number of"
-            click.echo(f"{folder}: made with {numbers} XLA thread{'' if threads == [1] else 's'}")
-        click.echo(f"{a} and {b}: {compared.files} files compared, {verdict}")
+    lines = [f"{name}: {difference}" for name, difference in compared.differences.items()]
+    for folder, threads in zip((a, b), compared.xla_threads, strict=True):
+        numbers = " and ".join(map(str, threads)) or "an unknown number of"
+        lines.append(f"{folder}: made with {numbers} XLA thread{'' if threads == [1] else 's'}")
+    verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
+    lines.append(f"{a} and {b}: {compared.files} files compared, {verdict}")
+    print_result({"equal": not compared.differences, **asdict(compared)}, "\n".join(lines), as_json)
     sys.exit(1 if compared.differences else 0)
 
 
