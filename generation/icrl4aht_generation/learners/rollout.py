@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.state import swapped
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.learners.encoder import CompactView
@@ -241,15 +240,6 @@ def policy_player(
         return Choice(action, jnp.zeros(len(played)), jnp.zeros(len(played))), memory
 
     return Player(agent * envs + played, init, act)
-
-
-def random_player(agent: int, envs: int) -> Player:
-    """Return a player that draws uniformly from the six actions, as one agent of every environment."""
-
-    def act(memory, state: EnvState, key):
-        return Choice(jax.random.randint(key, (envs,), 0, len(ACTIONS)), jnp.zeros(envs), jnp.zeros(envs)), memory
-
-    return Player(agent * envs + np.arange(envs), lambda state: (), act)
 
 
 def slot_records(record: UInt8[Array, "*B N S"], agent_slots: np.ndarray) -> UInt8[Array, "*B M S"]:

@@ -6,11 +6,11 @@ the hyper-parameters. Stored figures suffice for the speed of the environment an
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from timeit import repeat
 from typing import Any
 
 import jax
@@ -205,11 +205,10 @@ def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
 
 
 def _seconds(function: Any, *arguments: Any) -> float:
-    """Return the time of the fastest of a few calls, after one that compiles."""
-    jax.block_until_ready(function(*arguments))
-    times = []
-    for _ in range(3):  # the fastest of a few, since other programs may slow some down
-        started = time.perf_counter()
+    """Return the time of the fastest of a few calls, after one that compiles; other programs may slow some down."""
+
+    def call() -> None:
         jax.block_until_ready(function(*arguments))
-        times.append(time.perf_counter() - started)
-    return min(times)
+
+    call()
+    return min(repeat(call, number=1, repeat=3))

@@ -27,7 +27,7 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
-from icrl4aht_generation.learners.rollout import init_rollout, policy_player, random_player, roll_out
+from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR
 from icrl4aht_generation.populations.select import TeammateSelection, select_teammates, write_manifests
@@ -42,7 +42,7 @@ from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.teammates.distances import act_along, hamming_distances
 from icrl4aht_generation.teammates.instances import published_thetas
 from icrl4aht_generation.teammates.learned import build_learned
-from icrl4aht_generation.teammates.references import stacked_families
+from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_families
 from icrl4aht_generation.teammates.registry import build_teammate
 
 _EPISODES = 2  # of each policy, whose states are compared
@@ -215,7 +215,8 @@ def _visited_records(env: Environment, numbers: list[int], family: Policy, key: 
     @jax.jit
     def play(params, key):
         own = jax.tree.map(lambda leaf: jnp.repeat(leaf, _EPISODES, axis=0), params)
-        players = [random_player(EGO, n), policy_player(env, family, own, TEAMMATE, n, own_params=True)]
+        ego = policy_player(env, REFERENCE_EGOS["random"], (), EGO, n)
+        players = [ego, policy_player(env, family, own, TEAMMATE, n, own_params=True)]
         carry = init_rollout(env, players, jax.random.split(key, n))
         return roll_out(env, players, carry, env.max_steps, key)[1].record
 

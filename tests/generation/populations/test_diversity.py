@@ -61,7 +61,7 @@ def actions(every_program_is_kept) -> np.ndarray:
 def records(every_program_is_kept) -> jax.Array:
     """(T, episodes, S) of random agents."""
     env = build.Environment(LAYOUT, STEPS)
-    players = [build.random_player(agent, 3) for agent in (0, 1)]
+    players = [build.policy_player(env, build.REFERENCE_EGOS["random"], (), agent, 3) for agent in (0, 1)]
     carry = build.init_rollout(env, players, jax.random.split(jax.random.key(0), 3))
     play = jax.jit(lambda carry: build.roll_out(env, players, carry, STEPS, jax.random.key(1))[1].record)
     return play(carry)
