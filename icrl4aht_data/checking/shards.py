@@ -1,4 +1,4 @@
-"""Checks of shards: their HDF5 structure, and of each history checksums, ranges, episodes, index values and the rules."""
+"""Checks of shards: HDF5 structure, and of each history checksums, ranges, episodes, index values and the rules."""
 
 from __future__ import annotations
 
