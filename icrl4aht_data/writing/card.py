@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from rich.console import Console
 
@@ -290,7 +291,7 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
                 "sources": sorted({one.first.source for one in own}),
                 "references": references and references.returns,
                 "matters": references and references.matters,
-                "nearest_test": nearest and asdict(nearest),
+                "nearest_test": nearest and msgspec.structs.asdict(nearest),
             }
         )
     order = {name: number for number, name in enumerate((*layouts, *SPLITS))}
@@ -416,7 +417,7 @@ def _kinds_table(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[li
 def _distinct(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
     """Return the distinct values of a field of the tasks' provenance."""
     values = (getattr(task.made, name) for task in tasks)
-    found = {json.dumps(value, default=asdict): value for value in values if value is not None}
+    found = {json.dumps(value, default=msgspec.structs.asdict): value for value in values if value is not None}
     return [found[text] for text in sorted(found)]
 
 

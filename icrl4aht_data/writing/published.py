@@ -15,11 +15,12 @@ import io
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
+import msgspec
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -237,7 +238,7 @@ def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenanc
         return provenance
     rows = get_layout(history.line["layout"]).height
     notes = {"obs_shape": history.line["obs_shape"], "padding": PADDING.format(rows=rows)}
-    return replace(provenance, other={**provenance.other, "published": notes})
+    return msgspec.structs.replace(provenance, other={**provenance.other, "published": notes})
 
 
 def _stored_names(file: h5py.File, group: str) -> set[str] | None:
