@@ -35,6 +35,7 @@ from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError, UnknownNameError
+from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import evaluated_run
 
 TINY = {"steps": 2, "batch_size": 2, "context": 20}
@@ -151,11 +152,11 @@ def test_a_model_is_bundled_with_all_tracks(tmp_path, monkeypatch):
         "--bundle-as",
         "rl2-reference",
     ]
-    result = CliRunner().invoke(cli, [*command, "--track", "layout", "--track", "teammate"], catch_exceptions=False)
-    assert result.exit_code == 0 and copied == [("rl2-reference", "layout"), ("rl2-reference", "teammate")]
+    run_cli(*command, "--track", "layout", "--track", "teammate")
+    assert copied == [("rl2-reference", "layout"), ("rl2-reference", "teammate")]
     assert [found.track for found in cards[0]] == ["teammate", "layout"]
-    result = CliRunner().invoke(cli, [*command, "--track", "layout"])
-    assert result.exit_code == 2 and "expected one --name of all tracks" in " ".join(result.output.split())
+    printed = run_cli(*command, "--track", "layout", code=2)
+    assert "expected one --name of all tracks" in " ".join(printed.split())
 
 
 def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):

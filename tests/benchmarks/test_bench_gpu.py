@@ -10,7 +10,6 @@ from typing import Any
 
 import jax
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import learned
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout
@@ -30,12 +29,12 @@ from benchmarks.bench_gpu import (
     context_length,
     ego_learner,
     h4_tasks,
-    main,
     measure_training,
 )
 from benchmarks.harness import product_flops
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.overcooked.actions import TEAMMATE
+from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
 
 MEASURED = {
@@ -73,18 +72,16 @@ def test_the_command():
 
 
 def test_cases_without_time_are_reported_as_skipped():
-    result = CliRunner().invoke(main, ["--minutes", "0"], catch_exceptions=False)
-    assert result.exit_code == 0
-    found = lines_of(result.output)
+    printed = run_cli("--minutes", "0")
+    found = lines_of(printed)
     assert found.keys() == CASES.keys()
     assert all(line["skipped"] for line in found.values())
 
 
 def test_an_error_is_reported_and_ends_the_process(monkeypatch):
     monkeypatch.setitem(CASES, "product", lambda sizes: 1 / 0)
-    result = CliRunner().invoke(main, ["--here", "--part", "product", "--part", "loader"], catch_exceptions=False)
-    assert result.exit_code == 1
-    assert lines_of(result.output) == {
+    printed = run_cli("--here", "--part", "product", "--part", "loader", code=1)
+    assert lines_of(printed) == {
         "product": {"benchmark": "gpu", "case": "product", "error": "ZeroDivisionError: division by zero"}
     }
 

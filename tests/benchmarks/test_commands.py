@@ -17,13 +17,13 @@ from benchmarks.bench_learn import published_batches
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import to_published
+from tests.helpers.commands import run_cli
 
 
 def run(module: Any, options: str) -> list[dict[str, Any]]:
     """Run a benchmark and return its JSON lines."""
-    result = CliRunner().invoke(module.main, options.split(), catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return [json.loads(line) for line in result.stdout.splitlines() if line.startswith("{")]
+    printed = run_cli(*options.split())
+    return [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
 
 
 def check_ratio(line: dict[str, Any], peer: str) -> None:
@@ -153,6 +153,5 @@ def test_sequence_models(monkeypatch):
 
 
 def test_the_peer_needs_its_file():
-    result = CliRunner().invoke(bench_learn.main, ["--part", "jaxmarl"])
-    assert result.exit_code == 2
-    assert "--peer FILE" in result.output
+    printed = run_cli("--part", "jaxmarl", code=2)
+    assert "--peer FILE" in printed

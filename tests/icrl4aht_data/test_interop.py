@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,8 +17,6 @@ from torch.utils.data import DataLoader
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, torch_loader
-from icrl4aht_data.utils.install_hints import install_command
-from icrl4aht_data.writing.parquet import to_parquet
 from tests.helpers.batches import assert_equal
 from tests.helpers.paths import ROOT
 
@@ -213,18 +209,3 @@ def test_losses_take_the_targets_of_a_plain_data_loader(lite):
     assert (batch.target_actions.dtype, batch.prev_actions.dtype) == (torch.int64, torch.int32)
     assert functional.cross_entropy(torch.zeros(3, 6, 9), batch.target_actions) > 0
     assert functional.cross_entropy(torch.zeros(3, 6), queries.query_target) > 0
-
-
-@pytest.mark.parametrize(
-    ("module", "call", "extra"),
-    [
-        ("datasets", lambda sampler: hf_index(sampler.dataset), "hf"),
-        ("torch.utils.data", torch_loader, "torch"),
-        ("pandas", lambda sampler: sampler.dataset.to_pandas(), "pandas"),
-        ("pyarrow", lambda sampler: to_parquet(sampler.dataset, Path("never.parquet")), "hf"),
-    ],
-)
-def test_a_missing_library_names_its_extra(sampler, monkeypatch, module, call, extra):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(Exception, match=re.escape(install_command(extra))):
-        call(sampler)

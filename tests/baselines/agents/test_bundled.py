@@ -27,6 +27,7 @@ from PIL import Image
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
+from tests.helpers.commands import run_cli
 
 MODEL = ModelOptions(layers=1, width=8, heads=2, encoder="mlp")
 OPTIONS = TrainOptions(steps=1, batch_size=2, context=6)
@@ -133,13 +134,10 @@ def test_parameters_of_another_model_are_refused(run, tmp_path):
 
 
 def test_models_command(models):
-    result = CliRunner().invoke(cli, ["models"], catch_exceptions=False)
-    assert result.exit_code == 0
-    assert re.search(
-        r"^ad-tiny: ; N – on track teammate, N – on track layout, M –; of 20\d\d-\d\d-\d\d\n", result.output
-    )
-    assert "\n  track teammate: AD+mlp, " in result.output
-    assert "parameters, K = 6, 1 steps on demo_wide (source noise)" in result.output
+    printed = run_cli("models")
+    assert re.search(r"^ad-tiny: ; N – on track teammate, N – on track layout, M –; of 20\d\d-\d\d-\d\d\n", printed)
+    assert "\n  track teammate: AD+mlp, " in printed
+    assert "parameters, K = 6, 1 steps on demo_wide (source noise)" in printed
 
 
 class TestPlayMode:

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import get_protocol
@@ -42,12 +41,12 @@ from icrl4aht_generation.teammates.instances import published_task
 from icrl4aht_generation.teammates.registry import build_teammate, sample_teammate
 
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import start
+from tests.helpers.commands import run_cli
 
 LAYOUT = get_layout("cramped_up")
 MODEL = ModelOptions(width=16, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05)
@@ -391,9 +390,8 @@ class TestCommand:
             "cramped_up",
         ]
         arguments = ["train", "rl2", *choice, "--out", str(out), *sizes]
-        result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-        assert "each an episode of 2 tasks" in result.output
+        printed = run_cli(*arguments)
+        assert "each an episode of 2 tasks" in printed
         trained = read_trained(out)
         assert (trained.label, trained.step, trained.channels) == ("RL2+TA+mlp", 1, "canonical")
         assert {cell["labels"] for cell in trained.trained_on} == {"oracle"}

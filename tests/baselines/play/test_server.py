@@ -235,7 +235,7 @@ def failing(*words: str) -> str:
     return f"{result.output}{result.exception}"
 
 
-def test_bad_input(tmp_path, monkeypatch):
+def test_bad_input(tmp_path):
     with open_port(0) as taken:
         port = str(taken.getsockname()[1])
         assert f"port {port} of 127.0.0.1" in failing("--with", "stay", "--port", port)
@@ -245,5 +245,3 @@ def test_bad_input(tmp_path, monkeypatch):
     assert "only test teammates" in failing("--with", "oracle", "--record", str(tmp_path / "new"))
     assert "a history is of the ego" in failing("--slot", "teammate", "--record", str(tmp_path / "new"))
     assert "unknown partner 'H9/t9'" in failing("--with", "H9/t9")
-    monkeypatch.setitem(__import__("sys").modules, "uvicorn", None)
-    assert "play needs uvicorn: pip install 'icrl4aht-data[play]'" in failing()

@@ -24,6 +24,7 @@ from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
+from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
 GIF = b"GIF89a"  # the page does not decode the image
@@ -219,9 +220,8 @@ def test_commands_with_a_custom_manifest(tmp_path, monkeypatch):
     )
     assert summary in result.output
     arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert f"* {summary}" in result.stdout
+    printed = run_cli(*arguments)
+    assert f"* {summary}" in printed
     text = (tmp_path / "report.html").read_text()
     assert Elements(text).images.count("data:image/gif") == 2
     (task,) = read_tasks(tmp_path / "own.jsonl")

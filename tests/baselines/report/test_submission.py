@@ -20,6 +20,7 @@ from icrl4aht_baselines.report.submission import (
 
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
+from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS, write_results
 
 CURVE = [0.0, *[10.0] * 4, *[20.5] * 95]
@@ -113,13 +114,12 @@ def test_the_commands(submitted, tmp_path, monkeypatch):
     folder = str(write_results(tmp_path / "mine", "mine", CURVE))
     said = ["--about", "a rule", "--data", "none", "--labels", "none", "--core-hours", "1.5", "--name", "my rule"]
     runner = CliRunner()
-    result = runner.invoke(cli, ["submit", folder, *said, "--out", str(tmp_path / "mine.json")], catch_exceptions=False)
-    assert result.exit_code == 0 and "mine.json: my rule, layout;" in result.output
+    printed = run_cli("submit", folder, *said, "--out", tmp_path / "mine.json")
+    assert "mine.json: my rule, layout;" in printed
     assert read_submission(tmp_path / "mine.json").facts.core_hours == 1.5
-    assert json.loads(runner.invoke(cli, ["submit", "--schema"]).output)["$defs"]["AgentFacts"]
+    assert json.loads(run_cli("submit", "--schema"))["$defs"]["AgentFacts"]
     page = ["results", str(submitted), str(tmp_path / "mine.json"), "--out", str(tmp_path / "page")]
-    result = runner.invoke(cli, page, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    run_cli(*page)
     text = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
     assert "| `my rule` | none | none | – | 1.5 |" in text and "| `rule` † |" in text
     result = runner.invoke(cli, [*page, "--overwrite", "--store"], catch_exceptions=False)

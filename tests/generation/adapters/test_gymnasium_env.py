@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from dataclasses import asdict
@@ -17,10 +16,9 @@ from icrl4aht_generation.adapters.gymnasium_env import TaskEnv, published_enviro
 from icrl4aht_generation.teammates.instances import published_task, published_tasks
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.environments import TASK_ENVIRONMENT, make_environment
+from icrl4aht_data.environments import TASK_ENVIRONMENT
 from icrl4aht_data.errors import NotStoredError, OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.paths import ROOT
 
 NAME = "icrl4aht/demo_wide-H4-t0-v0"
@@ -206,9 +204,3 @@ def test_wrong_use_is_an_error():
             TaskEnv(task, **wrong)
     with pytest.raises(UnknownNameError, match="unknown teammate 'H9/t0'"):
         published_environment("demo_wide", "H9/t0")
-
-
-def test_without_gymnasium_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(OptionError, match=re.escape("needs gymnasium: " + install_command("gym"))):
-        make_environment(task={})

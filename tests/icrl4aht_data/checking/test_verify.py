@@ -11,11 +11,9 @@ import sys
 import h5py
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.format.chunks import chunk_table_name
@@ -27,6 +25,7 @@ from icrl4aht_data.writing import release
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.shard_writer import metadata_lines
+from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import SHARD, make_tasks, random_history, random_release
 from tests.helpers.spoiled import problems, spoil
 
@@ -313,21 +312,18 @@ def test_an_endless_heap_in_a_shard(damaged, heap):
 
 class TestCommand:
     def test_valid(self, lite):
-        result = CliRunner().invoke(cli, ["verify", "--deep", str(lite[0])])
-        assert result.exit_code == 0
-        assert "valid; checked 9 files, 84 chunks, 12 histories, 1,440 transitions and their physics" in result.output
+        printed = run_cli("verify", "--deep", lite[0])
+        assert "valid; checked 9 files, 84 chunks, 12 histories, 1,440 transitions and their physics" in printed
 
     def test_damaged(self, damaged):
         path = damaged / SHARD
         data = bytearray(path.read_bytes())
         data[int(np.load(damaged / chunk_table_name(SHARD))["offset"][0])] ^= 1
         path.write_bytes(data)
-        result = CliRunner().invoke(cli, ["verify", str(damaged)])
-        assert result.exit_code == 1
-        assert "chunk 0 of state in history 0" in result.output
-        as_json = CliRunner().invoke(cli, ["verify", "--json", str(damaged)])
-        assert as_json.exit_code == 1
-        content = json.loads(as_json.output)
+        printed = run_cli("verify", damaged, code=1)
+        assert "chunk 0 of state in history 0" in printed
+        printed = run_cli("verify", "--json", damaged, code=1)
+        content = json.loads(printed)
         assert not content["ok"]
         assert {finding["file"] for finding in content["findings"]} == {SHARD}
 

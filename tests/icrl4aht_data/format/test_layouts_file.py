@@ -26,6 +26,7 @@ from icrl4aht_data.overcooked import layouts as known_layouts
 from icrl4aht_data.overcooked.layouts import Layout, add_layouts, get_layout
 from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.utils.text import listed_names
+from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import make_tasks, random_release
 
 ROWS = ("WPWWW", "0A A1", "W   W", "WBWXW")
@@ -107,9 +108,8 @@ class TestRelease:
 
     def test_commands_take_their_names(self, root):
         """The names of a release's layouts are known once it is read, and those of the package's own tasks always."""
-        result = CliRunner().invoke(cli, ["list", str(root), "--layout", "mine-3-5"])
-        assert result.exit_code == 0, result.output
-        assert "mine-3-5" in result.output and "coord_simple" not in result.output
+        printed = run_cli("list", root, "--layout", "mine-3-5")
+        assert "mine-3-5" in printed and "coord_simple" not in printed
         assert isinstance(
             CliRunner().invoke(cli, ["list", str(root), "--layout", "nowhere"]).exception, UnknownNameError
         )
