@@ -52,18 +52,6 @@ class TestPasses:
         for i, obs in zip((2, 5, 8), found, strict=True):
             np.testing.assert_array_equal(obs, sampler[i].obs)
 
-    def test_grain_continues_and_resumes_over_passes(self, sampler):
-        import grain
-
-        numbers = grain.MapDataset.range(3 * len(sampler)).map(sampler.batch)
-        iterator, n = iter(numbers.to_iter_dataset()), len(sampler)
-        for _ in range(n + 1):
-            next(iterator)
-        state = iterator.get_state()
-        again = iter(numbers.to_iter_dataset())
-        again.set_state(state)
-        assert_equal(next(again), sampler[n + 1])
-
 
 class TestGrain:
     def test_any_number_of_threads_gives_the_same_order(self, sampler):

@@ -26,9 +26,8 @@ from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, U
 from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.utils.files import atomic_write, parse_json, resolve_inside
-from tests.robustness.hostile.cases import CASES
+from tests.robustness.hostile.cases import CASES, TERABYTE
 from tests.robustness.hostile.run import bound_process, make_bases, run_case
-from tests.robustness.hostile.spoil import TERABYTE
 
 SECONDS = 400
 """Time for one case."""

@@ -19,13 +19,8 @@ from icrl4aht_data.commands.summaries import id_ranges
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import FORMAT_VERSION
-from tests.helpers.commands import run_cli
+from tests.helpers.commands import run_cli, run_python
 from tests.helpers.paths import ROOT
-
-
-def run(*arguments: str) -> subprocess.CompletedProcess:
-    """Run the installed command in a subprocess."""
-    return subprocess.run([sys.executable, "-m", "icrl4aht_data", *arguments], capture_output=True, text=True)
 
 
 def test_list(lite):
@@ -192,5 +187,4 @@ def test_a_closed_pipe_ends_a_command_quietly(program):
 
 
 def test_version():
-    result = subprocess.run([sys.executable, "-m", "icrl4aht_data", "--version"], capture_output=True, text=True)
-    assert result.stdout == f"icrl4aht-data {version('icrl4aht-data')}\n"
+    assert run_python("-m", "icrl4aht_data", "--version") == f"icrl4aht-data {version('icrl4aht-data')}\n"

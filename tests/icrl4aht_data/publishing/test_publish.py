@@ -21,7 +21,6 @@ from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release
-from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.commands import run_cli
@@ -101,17 +100,6 @@ def test_it_contains_the_source_and_is_valid(release, published):
     }
     for name in ("LICENSE", "CITATION.cff"):
         assert (published / name).read_bytes() == (ROOT / name).read_bytes()
-
-
-def test_a_combination_has_a_new_card(published, tmp_path):
-    random_release(tmp_path / "other", "full", ("demo_wide",))
-    both = combine_releases(tmp_path / "both", [published, tmp_path / "other"])
-    card = (both / "README.md").read_text()
-    tasks = len((both / "meta/tasks.jsonl").read_text().splitlines())
-    assert f"* {len(load_icrl4aht(both)):,} histories of {tasks} tasks" in card
-    assert "![" not in card
-    assert verify_release(both).ok
-    assert verify_release(build_release(both, tmp_path / "out")).ok
 
 
 def test_an_invalid_source_is_refused(damaged, tmp_path):
