@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines import experiments
 from icrl4aht_baselines.evaluate import protocols
 from icrl4aht_baselines.evaluate.results import read_result
@@ -34,7 +33,6 @@ from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import Checkpoints
 
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -337,7 +335,6 @@ def test_invalid_plans(release, tmp_path):
     learned: dict[str, Any] = {"root": None, "histories": {"teammate_family": ("rl",)}, "layouts": ("coord_simple",)}
     absent = "no training histories of teammate_family rl on coord_simple; it has asymm_both, coord_ring, cramped_up"
     fails(EmptySelectionError, absent, **learned)
-    result = CliRunner().invoke(cli, ["research", "sweep", "context", "--context", "9"])
-    assert "context = 9: `sweep context` sets it; choose by --only, such as K250" in str(result.exception)
-    result = CliRunner().invoke(cli, ["research", "sweep", "sizes"])
-    assert "unknown sweep 'sizes'; valid: context, size. Did you mean 'size'" in result.output
+    with pytest.raises(OptionError, match="context = 9: `sweep context` sets it; choose by --only, such as K250"):
+        run_cli("research sweep context --context 9")
+    assert "unknown sweep 'sizes'; valid: context, size. Did you mean 'size'" in run_cli("research sweep sizes", code=2)
