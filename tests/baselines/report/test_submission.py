@@ -118,7 +118,7 @@ def test_the_commands(submitted, tmp_path, monkeypatch):
     page = ["results", str(submitted), str(tmp_path / "mine.json"), "--out", str(tmp_path / "page")]
     run_cli(*page)
     text = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
-    assert "| `my rule` | none | none | – | 1.5 |" in text and "| `rule` † |" in text
+    assert "| `my rule` | none | none | 1.5 core-hours |" in text and "| `rule` † |" in text
     run_cli(*page, "--overwrite", "--store")
     assert list(comparison.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
     said = ["submit", folder, *said[:-1], "Rule", "--out", str(tmp_path / "again.json")]
@@ -147,7 +147,7 @@ def test_another_way_of_playing_is_added(tmp_path):
     shown = later.with_other_ways(later.returns())
     assert list(shown) == ["mine", "mine (sampled)"]
     table = comparison.agents_table(later, shown, {})
-    assert "| `mine` | none | none | – | – | – |" in table and "| `mine (sampled)` |  |  |  |  | – |" in table
+    assert "| `mine` | none | none | – | – | – |" in table and "| `mine (sampled)` |  |  |  | – |" in table
     page = comparison.render_comparison(later)
     assert "Not measured for: none." in page and "Not measured for: `mine`." in comparison.render_comparison(stored)
     replaced = comparison.add_submission(later, make_submission([own], FACTS, update=True))
