@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import re
 from functools import partial
 from typing import Any
 
@@ -34,8 +33,7 @@ from benchmarks.bench_gpu import (
 from benchmarks.harness import product_flops
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.overcooked.actions import TEAMMATE
-from tests.helpers.commands import run_cli
-from tests.helpers.paths import ROOT
+from tests.helpers.commands import run_cli, run_python
 
 MEASURED = {
     "device": {"device", "jax", "commit", "date", "xla_threads"},
@@ -50,7 +48,7 @@ MEASURED = {
 
 
 def lines_of(output: str) -> dict[str, dict[str, Any]]:
-    return {line["case"]: line for line in map(json.loads, output.splitlines())}
+    return {line["case"]: line for line in map(json.loads, re.findall("^{.*", output, re.MULTILINE))}
 
 
 @pytest.mark.slow
@@ -59,10 +57,7 @@ def test_the_command():
     cases = ["device", "product", "learner/mlp", "act/tiny", "loader/tiny", "train/tiny/mlp/bfloat16", "attention"]
     assert {case.split("/")[0] for case in cases} == set(PARTS)
     options = [word for case in cases for word in ("--case", case)]
-    command = [sys.executable, "-m", "benchmarks.bench_gpu", *options, "--seconds", "0.01"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    found = lines_of(done.stdout)
+    found = lines_of(run_python("-m", "benchmarks.bench_gpu", *options, "--seconds", "0.01"))
     assert list(found) == cases
     for case, line in found.items():
         assert MEASURED[case.split("/")[0]] <= line.keys(), case
@@ -72,15 +67,14 @@ def test_the_command():
 
 
 def test_cases_without_time_are_reported_as_skipped():
-    printed = run_cli("--minutes", "0")
-    found = lines_of(printed)
+    found = lines_of(run_cli("--minutes 0", program=bench_gpu.main))
     assert found.keys() == CASES.keys()
     assert all(line["skipped"] for line in found.values())
 
 
 def test_an_error_is_reported_and_ends_the_process(monkeypatch):
     monkeypatch.setitem(CASES, "product", lambda sizes: 1 / 0)
-    printed = run_cli("--here", "--part", "product", "--part", "loader", code=1)
+    printed = run_cli("--here --part product --part loader", code=1, program=bench_gpu.main)
     assert lines_of(printed) == {
         "product": {"benchmark": "gpu", "case": "product", "error": "ZeroDivisionError: division by zero"}
     }

@@ -7,21 +7,23 @@ import subprocess
 import sys
 from pathlib import Path
 
+from click import Command
 from click.testing import CliRunner
 
 from icrl4aht_data.commands.cli import cli
 from tests.helpers.paths import ROOT
 
 
-def run_cli(*words: object, code: int = 0) -> str:
+def run_cli(*words: object, code: int = 0, program: Command = cli) -> str:
     """Run a command of the program, check its exit code, and return what it prints; errors of the package are raised.
 
     Args:
         words: the command and its arguments, or one text of them.
         code: exit code of the program.
+        program: the program, if it is another one.
     """
     arguments = words[0].split() if len(words) == 1 and isinstance(words[0], str) else [str(word) for word in words]
-    result = CliRunner().invoke(cli, arguments)
+    result = CliRunner().invoke(program, arguments)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     assert result.exit_code == code, result.output

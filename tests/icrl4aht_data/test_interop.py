@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +15,7 @@ from torch.utils.data import DataLoader
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, torch_loader
 from tests.helpers.batches import assert_equal
-from tests.helpers.paths import ROOT
+from tests.helpers.commands import run_python
 
 
 @pytest.fixture
@@ -114,15 +111,8 @@ def test_pytorch_workers(lite, tmp_path, combinations):
     """Runs in a separate process, since a process that has run JAX must not fork."""
     script = tmp_path / "loader.py"
     script.write_text(TORCH)
-    run = subprocess.run(
-        [sys.executable, "-W", "error", "-W", ONE_CORE, str(script), str(lite[0]), json.dumps(combinations)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert run.returncode == 0, run.stderr
-    assert len(run.stdout.splitlines()) == len(combinations)
+    printed = run_python("-W", "error", "-W", ONE_CORE, script, lite[0], json.dumps(combinations))
+    assert len(printed.splitlines()) == len(combinations)
 
 
 class TestHuggingFace:

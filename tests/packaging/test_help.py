@@ -13,7 +13,7 @@ import pytest
 
 from icrl4aht_data.commands.cli import VerbGroup, all_verbs, cli
 from icrl4aht_data.commands.verbs import Verb
-from tests.helpers.commands import run_cli
+from tests.helpers.commands import run_cli, run_python
 from tests.packaging.test_readme import understand
 
 PUBLIC = (
@@ -54,9 +54,8 @@ def test_the_programs_help_imports_no_command():
     """No JAX either; it takes less than half a second of CPU time on one core, mostly for NumPy."""
     code = "import sys; from icrl4aht_data.commands.cli import cli; cli(['--help'], standalone_mode=False); "
     code += "print('loaded:', *sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    text, _, loaded = done.stdout.partition("loaded: ")
-    assert all(f"\n  {name} " in text for name in PUBLIC.split()), done
+    text, _, loaded = run_python("-c", code).partition("loaded: ")
+    assert all(f"\n  {name} " in text for name in PUBLIC.split()), text
     targets = {verb.target.partition(":")[0] for verb in all_verbs().values()}
     assert not {*targets, "jax", "h5py", "rich", "icrl4aht_data.dataset"} & {*loaded.split()}
 

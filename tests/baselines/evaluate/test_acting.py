@@ -104,8 +104,8 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["model"].items() >= {"layers": 1, "width": 16, "heads": 2, "encoder": "words"}.items()
     assert (config["train"]["steps"], config["train"]["batch_size"]) == (1, 2)
-    assert "size tiny, the default on a CPU: layers 1, width 16, encoder words" in result.output
-    assert "K = 4, steps 1, batch size 2" in result.output
+    assert "size tiny, the default on a CPU: layers 1, width 16, encoder words" in printed
+    assert "K = 4, steps 1, batch size 2" in printed
     assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
     (cell,) = config["trained_on"]
     named = {"layout": "demo_wide", "split": "train", "family": "H4", "algorithm": "utility_greedy", "source": "ppo"}

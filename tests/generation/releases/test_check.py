@@ -26,7 +26,7 @@ def test_different_thread_counts_are_reported(tmp_path):
         (tmp_path / name / "meta").mkdir(parents=True)
         (tmp_path / name / "meta/provenance.json").write_text(json.dumps(records))
     assert compare_rebuilds(tmp_path / "a", tmp_path / "b").xla_threads == ([1, 2], [])
-    output = run_cli("check", tmp_path / "a", tmp_path / "b")
+    output = run_cli("check", tmp_path / "a", tmp_path / "b", code=1)
     assert f"{tmp_path / 'a'}: made with 1 and 2 XLA threads" in output
     assert f"{tmp_path / 'b'}: made with an unknown number of XLA threads" in output
 

@@ -24,8 +24,7 @@ from tests.helpers.paths import ROOT
 
 
 def test_list(lite):
-    result = CliRunner().invoke(cli, ["list", "--json", str(lite[0])])
-    rows = json.loads(result.output)
+    rows = json.loads(run_cli("list", "--json", lite[0]))
     assert [(row["layout"], row["histories"], row["transitions"]) for row in rows] == [
         ("coord_simple", 3, 360),
         ("coord_simple", 3, 360),

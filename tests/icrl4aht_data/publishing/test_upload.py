@@ -225,6 +225,6 @@ def test_a_changed_repository_gets_no_tag(hub, published, tmp_path):
 
 
 def test_the_hubs_library_reads_the_metadata_of_cards(published):
-    assert DatasetCard.load(published / "README.md", ignore_metadata_errors=False).data.license == "mit"
+    assert DatasetCard.load(published / "README.md", ignore_metadata_errors=False).data.to_dict()["license"] == "mit"
     names = re.findall(r"\$([a-z_]+)", card_file("baseline.md").read_text())
     assert ModelCard(fill_template("baseline.md", **dict.fromkeys(names, "name") | {"datasets": ""})).data.to_dict()
