@@ -30,8 +30,8 @@ from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks
-from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.writing.convert import to_release
 from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import evaluated_run
 
@@ -115,7 +115,7 @@ def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):
 
 @pytest.fixture
 def small(monkeypatch, tmp_path) -> Path:
-    """Use recipes that take seconds and the bundled release instead of a rebuilt one."""
+    """Use recipes that take seconds and a part of the bundled release instead of a rebuilt one."""
     for name, recipe in RECIPES.items():
         sizes: dict[str, Any] = TINY if recipe.data else {"steps": 1, "batch_size": 8}
         model = MODEL if recipe.data else MODEL | {"recurrent_layers": 1, "dropout": 0.0}
@@ -124,10 +124,15 @@ def small(monkeypatch, tmp_path) -> Path:
     monkeypatch.setattr(reference, "OWN_HISTORIES", NoiseConfig(1, 10, start=(0.0, 0.0)))
     monkeypatch.setitem(reference.TRACK_PLAY, "layout", {"rearranged": 1})
     diverse = read_tasks(manifest_path("layout", "train", "diverse"))
-    few = [next(task for task in diverse if task.layout.name == layout) for layout in TRACKS["layout"]["train"]]
+    few = [
+        next(task for task in diverse if (task.layout.name, task.teammate_family) == (layout, "H1"))
+        for layout in TRACKS["layout"]["train"]
+    ]
     monkeypatch.setattr(reference, "read_tasks", lambda path: few)
+    # Of one family: for each another program is compiled.
+    histories = load_icrl4aht(layout=list(TRACKS["layout"]["train"]), teammate_family="H1", source="noise")
     (tmp_path / "noise").mkdir()
-    (tmp_path / "noise" / "lite").symlink_to(MINI)
+    to_release(histories, tmp_path / "noise" / "lite", "lite")
     return tmp_path
 
 

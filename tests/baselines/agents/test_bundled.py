@@ -108,12 +108,13 @@ def test_the_package_bundles_models_that_play_and_have_cards():
         assert model.role and re.fullmatch(r"M [+-]\d.*", scores[model.name].split(", ")[-1])
         assert (MODELS / model.name / MODEL_CARD).is_file()
         assert model.sampled == (model.name != "ad-reference")
+        agent = find_agent(model.name)
         for track, folder in model.runs.items():
             size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
             assert size < 2.1e6, folder
             trained = read_trained(folder)
             for layout in {"teammate": ("demo_wide", "coord_ring"), "layout": ("asymm_right", "cramped_down")}[track]:
-                policy = find_agent(model.name).make(get_layout(layout))
+                policy = agent.make(get_layout(layout))
                 assert policy.sees == "canonical_input" and trained.channels == "canonical"
 
 

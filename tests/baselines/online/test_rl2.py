@@ -62,7 +62,9 @@ def teammates(count: int) -> list[Any]:
 @pytest.fixture(scope="module")
 def trainer() -> PlayTrainer:
     groups = make_groups({(LAYOUT, "assembly_line"): teammates(2)}, 8, {LAYOUT.name: 1.0})
-    return PlayTrainer(METHOD, OPTIONS, PLAY, groups, mirror=True)
+    made = PlayTrainer(METHOD, OPTIONS, PLAY, groups, mirror=True)
+    made.init = jax.jit(made._initial_state)  # compiled once
+    return made
 
 
 @pytest.fixture(scope="module")
