@@ -4,9 +4,10 @@ A step plays one episode of every task, then learns from all of them. After an e
 recurrent state, or ends by chance; a new task with the same teammate then begins. Returns include the rewards of later
 episodes, so the model is rewarded for exploration that helps later.
 
-Learning starts from imitation: the loss contains the cross-entropy of the scripted oracle's actions in the states that
-the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The
-oracle knows what the model has to find out, so imitation alone is not the goal.
+Learning starts from imitation: the loss contains the cross-entropy of a script's actions in the states that the model
+visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The scripted oracle
+knows what the model has to find out, so imitation alone is not the goal. The searcher does not know which dish is
+wanted: it judges by what the model delivered in the task so far, and shows how to find out.
 
 Shapes: `B` tasks, `T` steps of an episode, `S` size of the recurrent state.
 """
@@ -24,7 +25,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from icrl4aht_generation.collection.curate import follow_oracle
+from icrl4aht_generation.collection.curate import follow_script
+from icrl4aht_generation.experts.oracle import oracle
+from icrl4aht_generation.experts.search import searcher
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.ppo import PPO, Sequences, ppo_optimizer
 from icrl4aht_generation.learners.rollout import select_rows
@@ -56,12 +59,14 @@ class PlayerMemory(NamedTuple):
         state: float32 (S,), its recurrent state.
         started: bool (), whether a step of the task was played; before it the outcome of the previous step is zero.
         partner: int32 (), number of the teammate, for a model that is told; None for others.
+        teacher: memory of the script that is imitated, if it remembers the task; None otherwise.
     """
 
     change: ViewChange
     state: Float[Array, " S"]
     started: Bool[Array, ""]
     partner: Int[Array, ""] | None = None
+    teacher: Any = None
 
 
 class PlayState(NamedTuple):
@@ -180,13 +185,23 @@ class _Player:
             np.array([number[layout] for layout in played]) if several else None,
         )
         self.mates = self.rollout.teammate_params
+        self._remembers = play.teacher == "search"
+        self._teacher = (searcher if self._remembers else oracle)(self.rollout.layout)
         self.compiled: Any = jax.jit(self.episode)
 
     def start(self, key: Key[Array, ""]) -> RolloutState:
         """Return the state before the first episode of all tasks."""
         env_key, change_key = jax.random.split(key)
         state = self.rollout.start(jax.random.split(env_key, self.tasks))
-        return state._replace(ego=state.ego._replace(change=self._draw_change(change_key), partner=self._partners))
+        drawn, teacher = self._draw_change(change_key), self._new_teacher(key)
+        return state._replace(ego=state.ego._replace(change=drawn, partner=self._partners, teacher=teacher))
+
+    def _new_teacher(self, key: Key[Array, ""]) -> Any:
+        """Return the script's memories before a task, leaves (B, ...); None for a script that remembers no task."""
+        if not self._remembers:
+            return None
+        keys = jax.random.split(jax.random.fold_in(key, 1), self.tasks)
+        return jax.vmap(self._teacher.init, in_axes=(None, 0))(self._teacher.params, keys)
 
     def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
         change = no_change(self.tasks)._replace(hidden=jnp.asarray(self._hidden))
@@ -202,16 +217,20 @@ class _Player:
         change_key, end_key = jax.random.split(key)
         after, played = self.rollout.episode(params, mates, state)
         ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
-        sequences = self._sequences(params, state, after, played, ended)
+        sequences, teacher = self._sequences(params, state, after, played, ended)
+        if self._remembers:
+            teacher = select_rows(ended, self._new_teacher(key), teacher)
         # Where a task ends, a new one begins with the same teammate: another view, an empty state, no previous step.
         begun = select_rows(ended, self._draw_change(change_key), after.ego.change)
-        memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended, state.ego.partner)
+        own = jnp.where(ended[:, None], 0.0, after.ego.state)
+        memory = PlayerMemory(begun, own, ~ended, state.ego.partner, teacher if self._remembers else None)
         before = select_rows(ended, no_outcome(self.tasks), after.before)
         return RolloutState(after.env, memory, before), sequences, played.reward.sum(axis=-1)
 
     def _sequences(
         self, params: Any, state: RolloutState, after: RolloutState, played: EpisodeBatch, ended: Bool[Array, " B"]
-    ) -> Sequences:
+    ) -> tuple[Sequences, Any]:
+        """Return the episode for learning, and the script's memories after it."""
         env, change = self.rollout.env, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
         taken, theirs = actions[..., EGO], actions[..., TEAMMATE]
@@ -237,7 +256,11 @@ class _Player:
         own = change.at_each_step(len(record), 0)
         action = own.actions(taken)
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits[:-1]), action[..., None], axis=-1)[..., 0]
-        return Sequences(
+        # The script acts in the environment's view; its actions are learned in the model's.
+        expert, teacher = follow_script(
+            self._teacher, self.rollout.layout, record, taken, state.env.layout, state.ego.teacher
+        )
+        sequences = Sequences(
             seen=jax.tree.map(lambda leaf: leaf[:-1], seen),
             reset=jnp.zeros(reward.shape, bool),  # the recurrent state is never reset within an episode
             action=action,
@@ -250,9 +273,9 @@ class _Player:
             partner=jnp.zeros((1, self.tasks), jnp.int32),  # one value function for all teammates
             weight=jnp.ones((1, self.tasks)),
             last_value=value[-1][None],
-            # The oracle acts in the environment's view; its actions are learned in the model's.
-            expert=own.actions(follow_oracle(self.rollout.layout, record, taken, state.env.layout)),
+            expert=own.actions(expert),
         )
+        return sequences, teacher
 
 
 def make_players(groups: Sequence[TaskGroup], method: Method, play: PlayOptions, mirror: bool) -> list[_Player]:

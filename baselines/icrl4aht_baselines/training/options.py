@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
@@ -59,7 +59,11 @@ class PlayOptions:
     gae_lambda: Annotated[Share, Option("Decay of the advantage estimate's trace.")] = 0.95
     entropy: Annotated[NotNegative, Option("Weight of the entropy bonus.")] = 0.01
     task_end: Annotated[float, Meta(gt=0, le=1), Option("Chance that a task ends after an episode.")] = 1 / 16
-    imitation: Annotated[NotNegative, Option("Weight of imitating the oracle at the start.")] = 1.0
+    imitation: Annotated[NotNegative, Option("Weight of imitating a script at the start.")] = 1.0
+    teacher: Annotated[
+        Literal["oracle", "search"],
+        Option("That script: oracle knows what its teammate wants, search finds it out over the episodes of a task."),
+    ] = "oracle"
     imitation_end: Annotated[Positive, Option("Share of the steps at which that weight has fallen to 0.")] = 0.5
     rearranged: Annotated[
         int,
