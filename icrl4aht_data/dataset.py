@@ -142,7 +142,7 @@ class Dataset(Selection):
     @property
     def knows_tasks(self) -> bool:
         """Whether the release contains its tasks; a release of observations may not."""
-        return self.has_states or bool(self._tasks)
+        return self.has_states or bool(self.tasks)
 
     def sort(self, *names: str, reverse: bool = False) -> Self:
         """Return this selection sorted by index fields; the sort is stable.
@@ -244,7 +244,8 @@ class Dataset(Selection):
         return Picture(f"Returns of {counted_histories(len(self))} by episode", plot_learning_curves(self))
 
     @cached_property
-    def _tasks(self) -> dict[str, Task]:
+    def tasks(self) -> dict[str, Task]:
+        """The tasks of the release by id; a release of observations may have none."""
         return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
 
     def recover_environment(self, history_id: int, episode: int = 0, **options: Any) -> gymnasium.Env:
@@ -320,7 +321,7 @@ class Dataset(Selection):
             history_id: a history of the release, whether selected or not.
         """
         entry = self.index.entry(history_id)
-        task = self._tasks.get(entry.task_id)
+        task = self.tasks.get(entry.task_id)
         layout = get_layout(entry.layout) if task is None else task.layout
         return {
             "layout": layout.name,
@@ -368,9 +369,9 @@ class Dataset(Selection):
                 f"only family {entry.teammate_family} and kind {entry.teammate_kind}; convert again with tasks.jsonl "
                 f"in the folder"
             )
-        if entry.task_id not in self._tasks:
-            raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self._tasks)
-        return self._tasks[entry.task_id]
+        if entry.task_id not in self.tasks:
+            raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self.tasks)
+        return self.tasks[entry.task_id]
 
     def ad(
         self,

@@ -233,18 +233,26 @@ def _mean_by_episode(histories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.nd
     return np.sqrt(starts[:-1] * (starts[1:] - 1.0)), means.mean(axis=0), low, high
 
 
-def plot_layouts(layouts: Sequence[Layout]) -> Figure:
+def plot_layouts(layouts: Sequence[Layout], titles: Sequence[str] | None = None) -> Figure:
     """Draw the layouts at the start of an episode: agents on their cells in the map, ego blue, teammate red.
+
+    Args:
+        layouts: the layouts; more than `MOST_PANELS` are drawn smaller.
+        titles: a title for each; by default both names of the layout.
 
     Raises:
         OptionError: if matplotlib or Pillow is not installed.
     """
-    figure, grid = _panels(len(layouts), (4.6, 3.3), columns=2 if len(layouts) == 4 else min(3, len(layouts)))
-    for axes, layout in zip(grid, layouts, strict=True):
+    size, columns = (4.6, 3.3), 2 if len(layouts) == 4 else min(3, len(layouts))
+    if len(layouts) > MOST_PANELS:
+        size, columns = (2.3, 2.0), 6
+    figure, grid = _panels(len(layouts), size, columns)
+    titles = titles or [f"{layout.name} ({layout.alias})" for layout in layouts]
+    for axes, layout, title in zip(grid, layouts, titles, strict=True):
         positions = np.array([layout.agent_cells], np.uint8)
         (record,) = start(layout, positions, np.full((1, 2), DOWN, np.uint8), layout.recipe_items[:1])
         axes.imshow(draw_frame(layout, record, view=False))
-        axes.set_title(f"{layout.name} ({layout.alias})", fontsize=9)
+        axes.set_title(title, fontsize=9)
         axes.set_axis_off()
     return figure
 

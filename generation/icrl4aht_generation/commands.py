@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -25,18 +24,18 @@ from icrl4aht_data.commands.options import (
     examples,
     json_option,
     overwrite_option,
+    print_result,
 )
-from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
+from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.plotting import plot_layouts, save_figure
 from icrl4aht_data.utils.files import atomic_write, check_output
-from icrl4aht_data.utils.progress import progress_bars
+from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_generation.jobs.options import queue_options, read_queue_options
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS, generate_layouts, split_of
-from icrl4aht_generation.layouts.sheet import save_sheet
 from icrl4aht_generation.learners.config import EncoderKind
-from icrl4aht_generation.teammates.instances import published_tasks
 
 if TYPE_CHECKING:
     from icrl4aht_generation.profiles import Profile  # loads JAX
@@ -172,7 +171,7 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
     is_flag=True,
     help="Play each: exit with 1 if the oracle, or a pair of them, delivers no soup in 400 steps.",
 )
-@click.option("--out", type=NewFile(".png"), metavar="FILE", help="Draw a sheet of pictures here.")
+@click.option("--out", type=NewFile(".png"), metavar="FILE", help="Draw pictures of them here.")
 @overwrite_option
 @json_option
 def layouts(
@@ -188,12 +187,14 @@ def layouts(
         check_output(out, overwrite)
     found = generate_layouts(family, seed, count, split=split)
     if out:
-        save_sheet(out, found)
+        titles = [f"{layout.name}\n{split_of(layout)}, {len(layout.recipes)} recipes" for layout in found]
+        save_figure(plot_layouts(found, titles), out)
     delivered = [None] * count
     if check:
         from icrl4aht_generation.layouts.playable import layouts_delivered
 
-        delivered = layouts_delivered(found).tolist()
+        with progress_bars(unit="layouts") as show:
+            delivered = layouts_delivered(found, counted(show, "check", count)).tolist()
     rows = [
         {
             "name": layout.name,
@@ -205,13 +206,11 @@ def layouts(
         | ({"delivered": one} if check else {})
         for layout, one in zip(found, delivered, strict=True)
     ]
-    if as_json:
-        click.echo(json.dumps(rows))
-    else:
-        for layout, row in zip(found, rows, strict=True):
-            size = f"{layout.width}x{layout.height}"
-            fault = "  no soup delivered" if row.get("delivered") is False else ""
-            click.echo(f"{layout.name:<20} {row['split']:<10} {size:<5} {len(layout.recipes):>2} recipes{fault}")
+    lines = []
+    for layout, one in zip(found, delivered, strict=True):
+        size, fault = f"{layout.width}x{layout.height}", "  no soup delivered" if one is False else ""
+        lines.append(f"{layout.name:<20} {split_of(layout):<10} {size:<5} {len(layout.recipes):>2} recipes{fault}")
+    print_result(rows, "\n".join(lines), as_json)
     if out:
         click.echo(f"wrote {out}", err=as_json)
     sys.exit(int(False in delivered))
@@ -229,11 +228,7 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
     from icrl4aht_generation.planning.plan import estimate_cost
 
     cost = estimate_cost(_profile_with_threads(profile_name, None), devices)
-    if as_json:
-        click.echo(json.dumps(asdict(cost), indent=2))
-    else:
-        for name, value in cost.rows():
-            click.echo(f"{name:<28} {value}")
+    print_result(asdict(cost), "\n".join(f"{name:<28} {value}" for name, value in cost.rows()), as_json)
 
 
 @click.command(epilog=examples("icrl4aht-data check build/smoke build/again"))
@@ -249,16 +244,13 @@ def check(a: Path, b: Path, as_json: bool) -> None:
     from icrl4aht_generation.releases.check import compare_rebuilds
 
     compared = compare_rebuilds(a, b)
-    if as_json:
-        click.echo(json.dumps({"equal": not compared.differences, **asdict(compared)}, indent=2))
-    else:
-        for name, difference in compared.differences.items():
-            click.echo(f"{name}: {difference}")
-        verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
-        for folder, threads in zip((a, b), compared.xla_threads, strict=True):
-            numbers = " and ".join(map(str, threads)) or "an unknown number of"
-            click.echo(f"{folder}: made with {numbers} XLA thread{'' if threads == [1] else 's'}")
-        click.echo(f"{a} and {b}: {compared.files} files compared, {verdict}")
+    lines = [f"{name}: {difference}" for name, difference in compared.differences.items()]
+    for folder, threads in zip((a, b), compared.xla_threads, strict=True):
+        numbers = " and ".join(map(str, threads)) or "an unknown number of"
+        lines.append(f"{folder}: made with {numbers} XLA thread{'' if threads == [1] else 's'}")
+    verdict = f"{len(compared.differences)} differ" if compared.differences else "bit-equal"
+    lines.append(f"{a} and {b}: {compared.files} files compared, {verdict}")
+    print_result({"equal": not compared.differences, **asdict(compared)}, "\n".join(lines), as_json)
     sys.exit(1 if compared.differences else 0)
 
 
@@ -269,17 +261,16 @@ def check(a: Path, b: Path, as_json: bool) -> None:
 )
 @overwrite_option
 def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
-    """Write the manifests of all tasks in the package.
+    """Write the manifests of drawn tasks in the package.
 
-    Makes TRACK_test.jsonl from the published parameter sets, and TRACK_validation.jsonl, TRACK_diverse_train.jsonl and
-    TRACK_diverse_validation.jsonl from the drawn teammates that `draws` measured, and those of the track preference.
-    Files that have these tasks are kept.
+    Makes TRACK_validation.jsonl, TRACK_diverse_train.jsonl and TRACK_diverse_validation.jsonl from the drawn teammates
+    that `draws` measured, and those of the track preference. Files that have these tasks are kept. TRACK_test.jsonl are
+    the published tasks, whose ids hash their parameters.
     """
     from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
     from icrl4aht_generation.teammates.preference import preference_tasks
 
-    made = [(manifest_path(track, "test"), published_tasks(track)) for track in TRACKS]
-    made += [(manifest_path(track, "validation"), validation_tasks(track)) for track in TRACKS]
+    made = [(manifest_path(track, "validation"), validation_tasks(track)) for track in TRACKS]
     made += [
         (manifest_path(track, split, "diverse"), diverse_tasks(track, split))
         for track in TRACKS
@@ -292,7 +283,7 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
             different = read_tasks(path) != tasks
             if different and (check or not overwrite):
                 remedy = "run `icrl4aht-data research manifests --overwrite`" if check else "replace it by --overwrite"
-                raise TaskFormatError(f"{path}: differs from the parameter sets or draws; {remedy}")
+                raise TaskFormatError(f"{path}: differs from the draws; {remedy}")
         if not check:
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(path) as partial:
@@ -321,25 +312,21 @@ def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: b
     and oracle earn with it. With --spread, chooses widely different teammates for the profiles' tasks.spread. Layouts
     that the table has are kept, so that a stopped command resumes.
     """
+    import pandas as pd
+
+    from icrl4aht_generation.teammates.distances import fill_table
     from icrl4aht_generation.teammates.draws import DRAWS_TABLE, read_measured
-    from icrl4aht_generation.teammates.measuring import fill_table
     from icrl4aht_generation.teammates.spread import SPREAD_TABLE, LayoutSpread, spread_rows
 
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or list(TESTED_ON)
     for name in names:
-        if name not in TESTED_ON:
-            raise unknown("training layout", name, TESTED_ON)
+        check_choice("training layout", name, TESTED_ON)
     path = out or (SPREAD_TABLE if spread else DRAWS_TABLE)
     with progress_bars(unit="layouts") as show:
         fill_table(path, names, lambda done, name: show("draws", done, len(names), name), overwrite, spread=spread)
     if spread:
-        rows = spread_rows(read_measured(path, LayoutSpread))
-        from rich.table import Table
-
-        table = Table(*(name.replace("_", " ") for name in rows[0]))
-        for row in rows:
-            table.add_row(*(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()))
-        console.print(table)
+        rows = pd.DataFrame(spread_rows(read_measured(path, LayoutSpread)))
+        console.print(rows.to_string(index=False, float_format="{:.3f}".format))
     console.print(f"wrote {path}")
 
 

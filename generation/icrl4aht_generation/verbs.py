@@ -12,6 +12,6 @@ VERBS = (
     Verb("plan", f"{_CLI}:plan", "Generate", "Estimate the cost of a rebuild."),
     Verb("check", f"{_CLI}:check", "Generate", "Compare two rebuilds bit for bit."),
     Verb("research draws", f"{_CLI}:draws", _TASKS, "Measure the heuristic teammates that tasks may draw."),
-    Verb("research manifests", f"{_CLI}:manifests", _TASKS, "Write the manifests of all tasks in the package."),
+    Verb("research manifests", f"{_CLI}:manifests", _TASKS, "Write the manifests of drawn tasks in the package."),
     Verb("research diversity", f"{_CLI}:diversity", _TASKS, "Report how much the teammates of a suite differ."),
 )

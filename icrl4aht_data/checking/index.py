@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from itertools import islice
 from operator import attrgetter, eq, ge, le, lt
 from typing import Any
@@ -182,16 +184,12 @@ def _faults(made: Provenance, entries: Sequence[Entry], seed: int | None) -> Ite
             name = f"history {stream.history_id}: env_idx"
             checks.append((name, stream.env_idx, lt, environments, "less than the {} environments of a learner"))
     if made.filter is not None:
-        after = made.filter.after
+        after, is_close = made.filter.after, partial(math.isclose, rel_tol=0, abs_tol=_ROUNDING)
         checks.append(("filter.before.streams", made.filter.before.streams, eq, recorded, "{}"))
         checks.append(("filter.after.streams", after.streams, eq, kept, "{}"))
         for name in ("return_start", "return_end") if after.streams == count else ():
             mean = np.mean([getattr(entry, name) for entry in entries])
-            checks.append((f"filter.after.{name}", getattr(after, name), _is_close, mean, "the index's {:.3f}"))
+            checks.append((f"filter.after.{name}", getattr(after, name), is_close, mean, "the index's {:.3f}"))
     for name, value, relation, bound, words in checks:
         if value is not None and bound is not None and not relation(value, bound):
             yield f"{name}: expected {words.format(bound)}, found {value!r}"
-
-
-def _is_close(value: float, mean: float) -> bool:
-    return abs(value - mean) <= _ROUNDING

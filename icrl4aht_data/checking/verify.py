@@ -13,10 +13,9 @@ import numpy as np
 
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.checking.files import check_files, check_references, check_remote_sizes
-from icrl4aht_data.checking.histories import check_chunks, check_history
 from icrl4aht_data.checking.index import check_index, check_provenance
 from icrl4aht_data.checking.report import Level, NamedProgress, Report
-from icrl4aht_data.checking.structure import check_structure
+from icrl4aht_data.checking.shards import check_chunks, check_history, check_structure
 from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, check_choice

@@ -113,11 +113,6 @@ def read_tasks_and_layouts(path: Path) -> list[Task]:
     return read_tasks(path)
 
 
-def write_layouts(root: Path, layouts: Iterable[Layout]) -> None:
-    """Write the layouts that the benchmark does not have to a release, see `write_layouts_file`."""
-    write_layouts_file(root / LAYOUTS_FILE, layouts)
-
-
 def write_layouts_file(path: Path, layouts: Iterable[Layout]) -> None:
     """Write the layouts that the benchmark does not have to a file; no file if there are none.
 

@@ -139,15 +139,10 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
 
 
 def check_meta(root: Path) -> None:
-    """Check the files of meta/ except chunk tables; see `check_against_manifest`.
-
-    meta/source_card.md, which earlier versions of this package wrote, may be missing, since no code reads it.
-    """
-    listed = [name for name in read_manifest(root) if re.fullmatch(r"meta/[^/]+", name)]
-    read = {
-        name for name in (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE) if name in listed or (root / name).exists()
-    }
-    check_against_manifest(root, sorted(read | {name for name in listed if (root / name).exists()}))
+    """Check the files of meta/ except chunk tables; see `check_against_manifest`."""
+    names = {name for name in read_manifest(root) if re.fullmatch(r"meta/[^/]+", name)}
+    names |= {name for name in (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE) if (root / name).exists()}
+    check_against_manifest(root, sorted(names))
 
 
 def check_folder(root: Path, folder: str) -> None:

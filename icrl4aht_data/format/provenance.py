@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta
+from msgspec import Meta, Struct
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM
 from icrl4aht_data.benchmark.tasks import Task, check_teammate, teammate_id
@@ -24,8 +24,7 @@ LabelView = Literal["ego", "state"]
 """One of `facts.LABEL_VIEWS`."""
 
 
-@dataclass(frozen=True)
-class StreamReturns:
+class StreamReturns(Struct, frozen=True, omit_defaults=True):
     """Mean returns of a set of environment streams.
 
     Args:
@@ -39,8 +38,7 @@ class StreamReturns:
     return_end: float
 
 
-@dataclass(frozen=True)
-class StreamFilter:
+class StreamFilter(Struct, frozen=True, omit_defaults=True):
     """Mean returns before and after filtering a task's streams.
 
     Args:
@@ -54,8 +52,7 @@ class StreamFilter:
     least_improvement: FiniteNumber | None = None
 
 
-@dataclass(frozen=True)
-class ExpertLabels:
+class ExpertLabels(Struct, frozen=True, omit_defaults=True):
     """Policy that produced the expert actions of all histories of a task.
 
     Args:
@@ -79,8 +76,7 @@ class ExpertLabels:
     view: LabelView | None = None
 
 
-@dataclass(frozen=True)
-class TeammateSwaps:
+class TeammateSwaps(Struct, frozen=True, omit_defaults=True):
     """Changes of the teammate within each history of a task.
 
     Args:
@@ -101,8 +97,7 @@ class TeammateSwaps:
         return tuple((first, teammate_id(self.teammate(first))) for first in range(0, episodes, self.every))
 
 
-@dataclass(frozen=True, kw_only=True)
-class TeammateSuite:
+class TeammateSuite(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Settings of the populations that a learned teammate was selected from.
 
     Args:
@@ -122,8 +117,7 @@ class TeammateSuite:
     xla_threads: Annotated[int, Meta(ge=1)] | None = None
 
 
-@dataclass(frozen=True)
-class ReferenceEgos:
+class ReferenceEgos(Struct, frozen=True, omit_defaults=True):
     """Mean returns of reference egos with the task's teammate, in episodes of `facts.KEPT_STEPS` steps.
 
     Args:
@@ -157,8 +151,7 @@ class ReferenceEgos:
         return ", ".join(f"{name} {value:.1f}" for name, value in self.returns.items())
 
 
-@dataclass(frozen=True)
-class NearestTest:
+class NearestTest(Struct, frozen=True, omit_defaults=True):
     """The test teammate on the same layout that acts most like the task's teammate.
 
     Args:
@@ -173,8 +166,7 @@ class NearestTest:
     behaviour: StoredCount | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Provenance:
+class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How the histories of one task were generated. None means not recorded.
 
     Args:
@@ -223,7 +215,7 @@ class Provenance:
     expert: ExpertLabels | None = None
     suite: TeammateSuite | None = None
     swaps: TeammateSwaps | None = None
-    other: dict[str, Any] = field(default_factory=dict)
+    other: dict[str, Any] = {}
 
     def played(self, task: Task) -> list[Task]:
         """Return the task, and after it a copy with each further teammate that plays in its histories."""
@@ -260,12 +252,8 @@ class Provenance:
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object of a task, without fields that are None."""
-        content = _recorded(asdict(self))
-        for name in {"expert", "filter", "nearest_test", "references", "suite"} & content.keys():
-            content[name] = _recorded(content[name])
-        if self.expert is not None:  # null says that the labels come from a script
-            content["expert"] = {"policy_sha256": self.expert.policy_sha256} | content["expert"]
-        other = content.pop("other")
+        content = msgspec.to_builtins(self)
+        other = content.pop("other", {})
         return content | other
 
     @classmethod
@@ -277,7 +265,7 @@ class Provenance:
         """
         if not isinstance(content, dict):
             raise IndexFormatError("expected an object of objects, one for each task")
-        known = {one.name for one in fields(cls)} - {"other"}
+        known = set(cls.__struct_fields__) - {"other"}
         try:
             found = msgspec.convert({name: value for name, value in content.items() if name in known}, cls)
             msgspec.convert(found.ego, _EgoScale | None)
@@ -292,22 +280,19 @@ class Provenance:
                 check_name(name)
         except (msgspec.ValidationError, Icrl4ahtError) as error:
             raise IndexFormatError(str(error)) from error
-        return replace(found, other={name: value for name, value in content.items() if name not in known})
+        return msgspec.structs.replace(
+            found, other={name: value for name, value in content.items() if name not in known}
+        )
 
 
-def _recorded(content: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in content.items() if value is not None}
-
-
-@dataclass(frozen=True)
-class _EgoScale:
+class _EgoScale(Struct):
     """Hyper-parameters of the ego that this package reads."""
 
     total_steps: int
     environments: int
 
 
-class _NoiseSetting(msgspec.Struct):
+class _NoiseSetting(Struct):
     """Known settings of noise schedules; unknown ones are kept unchanged."""
 
     histories: _Positive | None = None
@@ -319,7 +304,7 @@ class _NoiseSetting(msgspec.Struct):
     power: tuple[_Exponent, _Exponent] | None = None
 
 
-class _TeammateSetting(msgspec.Struct, forbid_unknown_fields=True):
+class _TeammateSetting(Struct, forbid_unknown_fields=True):
     """Agent slot and noise source of a teammate. The task defines the teammate itself, so other fields are refused."""
 
     slot: Literal[1]

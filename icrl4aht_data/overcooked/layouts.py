@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
+from operator import attrgetter
 from pathlib import Path
 from string import digits
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 import msgspec
 import numpy as np
@@ -43,15 +44,6 @@ from icrl4aht_data.utils.plugins import Plugins
 _LETTERS = {"W": WALL, "X": GOAL, "P": POT, "R": INDICATOR, "L": BUTTON, "B": PLATES, " ": EMPTY, "A": EMPTY}
 _TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
 
-_FIELDS = {
-    "name": str,
-    "alias": str,
-    "rows": tuple[str, ...],
-    "recipes": tuple[tuple[int, int, int], ...],
-    "indicates_delivery": bool,
-}
-"""Field of `Layout` -> its type, for the checks."""
-
 
 @dataclass(frozen=True, eq=False)
 class Layout:
@@ -77,7 +69,7 @@ class Layout:
     indicates_delivery: bool = False
 
     def __post_init__(self) -> None:
-        for name, kind in _FIELDS.items():
+        for name, kind in _field_types().items():
             object.__setattr__(self, name, convert_option(f"layout {self.name}: {name}", getattr(self, name), kind))
         if fault := self._map_fault() or self._recipe_fault():
             raise OptionError(f"layout {self.name}: {fault}")
@@ -265,6 +257,11 @@ class Layout:
         return f"Layout({self.name!r}, {self.width}x{self.height}, C={self.channels})"
 
 
+@cache
+def _field_types() -> dict[str, Any]:
+    return get_type_hints(Layout)
+
+
 def tables_of(layout: Layout | Tables) -> Tables:
     """Return the tables of a layout; tables are returned as they are."""
     return layout.tables if isinstance(layout, Layout) else layout
@@ -331,6 +328,7 @@ _BY_ALIAS = {layout.alias: layout for layout in _ALL}
 LAYOUT_PLUGINS = Plugins("icrl4aht.layouts", (*LAYOUTS, *_BY_ALIAS))
 """Layouts registered by other installed packages; no published task uses them."""
 
+_content = attrgetter("rows", "recipes", "indicates_delivery")
 _OF_RELEASES: dict[str, Layout] = {}  # those that the releases opened in this process carry, and generated ones
 
 
@@ -415,11 +413,7 @@ def add_layouts(layouts: Iterable[Layout]) -> list[Layout]:
     for layout in layouts:
         is_known = layout.name in all_layout_names() or layout.name in _of_manifests()
         known = get_layout(layout.name) if is_known else layout
-        if (known.rows, known.recipes, known.indicates_delivery) != (
-            layout.rows,
-            layout.recipes,
-            layout.indicates_delivery,
-        ):
+        if _content(known) != _content(layout):
             raise OptionError(
                 f"layout {layout.name!r}: differs from the layout that this name stands for; expected "
                 f"{'/'.join(known.rows)} with recipes {known.recipes}, found {'/'.join(layout.rows)} with recipes "

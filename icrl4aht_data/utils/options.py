@@ -62,11 +62,11 @@ def option_hints(kind: type) -> dict[str, Any]:
 @cache
 def _checked_hints(kind: type) -> dict[str, Any]:
     hints = get_type_hints(kind, include_extras=True)
-    return {name: hint for name, hint in hints.items() if any(map(_is_checked, annotation_parts(hint)))}
-
-
-def _is_checked(part: Any) -> bool:
-    return isinstance(part, (Option, Meta)) or get_origin(part) is Literal
+    return {
+        name: hint
+        for name, hint in hints.items()
+        if any(isinstance(part, (Option, Meta)) or get_origin(part) is Literal for part in annotation_parts(hint))
+    }
 
 
 def check_options(options: Any) -> None:

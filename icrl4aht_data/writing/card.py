@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from rich.console import Console
 
@@ -36,7 +37,7 @@ from icrl4aht_data.benchmark.tasks import Task, read_tasks
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.layouts_file import layout_title
-from icrl4aht_data.format.provenance import NearestTest, Provenance, read_provenance
+from icrl4aht_data.format.provenance import Provenance, read_provenance
 from icrl4aht_data.format.schema import (
     CARD_TABLES,
     FIELDS,
@@ -185,7 +186,10 @@ def facts(root: Path) -> dict[str, Any]:
         "kinds": dict(sorted({(e.teammate_family, e.teammate_kind) for e in entries if e.teammate_family != "rl"})),
         "algorithms": [name for name in ALGORITHMS if name in {entry.teammate_kind for entry in entries}],
         "labelled": {name: sum(e.has(FIELDS[f"{name}_actions"]) for e in entries) for name in ("expert", "oracle")},
-        "views": _views(entries),
+        "views": {
+            view: Counter(entry.source for entry in entries if entry.label_view == view)
+            for view in dict.fromkeys(entry.label_view for entry in entries if entry.label_view)
+        },
         "swapped": sum(entry.teammate_of_episode is not None for entry in entries),
         "example": {"split": first.split, "layout": first.layout, "length": length},
         "layouts": _layouts(info, titles, matters),
@@ -209,15 +213,6 @@ def facts(root: Path) -> dict[str, Any]:
         "paper": {"ego": PAPER_EGO_STEPS, "teammate": PAPER_TEAMMATE_STEPS, "teammates": PAPER_TEAMMATES * 4},
         "citation": card_file("citation.bib").read_text(encoding="utf-8").strip(),
     }
-
-
-def _views(entries: Iterable[Entry]) -> dict[str, Counter[str]]:
-    """Return label view -> source -> number of histories."""
-    found = defaultdict[str, Counter[str]](Counter)
-    for entry in entries:
-        if entry.label_view:
-            found[entry.label_view][entry.source] += 1
-    return dict(found)
 
 
 def _mean(values: Iterable[float]) -> float:
@@ -275,10 +270,6 @@ def _curves(learning: Iterable[Mapping[str, Any]], sources: Iterable[str]) -> li
     return [[*key, *(of_key.get(source, "") for source in sources)] for key, of_key in found.items()]
 
 
-def _learned_last(family: str) -> tuple[bool, tuple[int, str]]:
-    return family == "rl", family_order(family)
-
-
 def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict[str, Any]]:
     """Return one row per teammate of a release, sorted by layout, split and family."""
     groups = defaultdict[tuple[str, str, str], list[_TaskFacts]](list)
@@ -300,11 +291,16 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
                 "sources": sorted({one.first.source for one in own}),
                 "references": references and references.returns,
                 "matters": references and references.matters,
-                "nearest_test": nearest and asdict(nearest),
+                "nearest_test": nearest and msgspec.structs.asdict(nearest),
             }
         )
     order = {name: number for number, name in enumerate((*layouts, *SPLITS))}
-    return sorted(rows, key=lambda row: (order[row["layout"]], order[row["split"]], _learned_last(row["family"])))
+
+    def place(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        family = row["family"]
+        return order[row["layout"]], order[row["split"]], family == "rl", family_order(family)
+
+    return sorted(rows, key=place)
 
 
 def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
@@ -345,15 +341,6 @@ def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str,
     return rows
 
 
-def _nearest_tests(tasks: Iterable[_TaskFacts]) -> dict[tuple[str, str], NearestTest]:
-    """Return key of a teammate -> its nearest test instance, where one of its tasks has it."""
-    return {
-        one.task.teammate_key: one.made.nearest_test
-        for one in tasks
-        if one.task is not None and one.made.nearest_test is not None
-    }
-
-
 def _known_families(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
     """Return the families of heuristic training and validation teammates, by their similarity to test teammates.
 
@@ -366,7 +353,8 @@ def _known_families(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
         `untested`: whether a teammate plays on a layout that has no test teammates to compare with.
     """
     tested, drawn, alike, distances, untested = set(), set(), set(), [], False
-    nearest = _nearest_tests(tasks)
+    # A teammate may have tasks of several sources, of which only some say which test instance is nearest.
+    nearest = {one.task.teammate_key: one.made.nearest_test for one in tasks if one.task and one.made.nearest_test}
     for task in tasks:
         family, layout = task.first.teammate_family, task.first.layout
         near = task.made.nearest_test or (nearest.get(task.task.teammate_key) if task.task else None)
@@ -429,7 +417,7 @@ def _kinds_table(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[li
 def _distinct(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
     """Return the distinct values of a field of the tasks' provenance."""
     values = (getattr(task.made, name) for task in tasks)
-    found = {json.dumps(value, default=asdict): value for value in values if value is not None}
+    found = {json.dumps(value, default=msgspec.structs.asdict): value for value in values if value is not None}
     return [found[text] for text in sorted(found)]
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from icrl4aht_data.dataset import Dataset, load_icrl4aht
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.format.provenance import Provenance, StreamReturns, read_provenance
-from icrl4aht_data.format.schema import PROVENANCE
+from icrl4aht_data.format.provenance import Provenance, StreamReturns
 from icrl4aht_data.writing.convert import release_tasks, stored_task
 from icrl4aht_data.writing.release import NewTask, write_release
 
@@ -74,22 +74,18 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
     owners: dict[str, Dataset] = {}
     tasks = []
     for dataset in datasets:
-        provenance = read_provenance(dataset.origin.file(PROVENANCE))
-        names, codes = dataset.index.values("task_id"), dataset.column_codes("task_id")
-        code_of = {name: code for code, name in enumerate(names)}
         is_part = len(dataset) < len(dataset.index.entries)
-        for task in release_tasks(dataset):
-            of_task = codes == code_of.get(task.task_id, -1)
-            if not of_task.any():
-                continue
-            histories = dataset.select(of_task)
+        chosen = dataset.column("task_id")
+        present = set(chosen.tolist())
+        for task in (task for name, task in release_tasks(dataset).items() if name in present):
+            histories = dataset.select(chosen == task.task_id)
             owner = owners.setdefault(task.task_id, dataset)
             if owner is not dataset:
                 raise OptionError(
                     f"{dataset.origin}: task {task.task_id} is also in {owner.origin}; leave one of them out, or "
                     f"generate it with another seed"
                 )
-            made = provenance.get(task.task_id, Provenance())
+            made = dataset.provenance.get(task.task_id, Provenance())
             partial = is_part and len(histories) < len(dataset.index.query(task_id=task.task_id))
             if partial and made.streams_kept is not None:
                 made = _of_part(made, histories)

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
-from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks
+from icrl4aht_data.benchmark.tasks import Task, named_task
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files, expert_folder
-from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, PROVENANCE, TASKS, TEAMMATES, Kind
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, TEAMMATES, Kind
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 HistoryProgress = Callable[[int, int], None]
 """Callback that receives the number of histories done and their total."""
 
 
-def release_tasks(dataset: Dataset) -> list[Task]:
-    """Return the tasks of a dataset's release; if it stores none, `NamedTask`s made from the selected entries."""
-    if dataset.knows_tasks:
-        return read_tasks(dataset.origin.file(TASKS))
-    return list({entry.task_id: named_task(entry.to_json()) for entry in dataset.entries}.values())
+def release_tasks(dataset: Dataset) -> Mapping[str, Task]:
+    """Return the tasks of a dataset's release by id; if it stores none, `NamedTask`s made from the selected entries."""
+    return dataset.tasks or {entry.task_id: named_task(entry.to_json()) for entry in dataset.entries}
 
 
 def stored_task(
@@ -84,8 +82,7 @@ def to_release(
             f"{dataset.root}: has observations only, and a {kind} release is made of state records, which observations "
             f"do not determine; convert to {OBSERVATIONS}, published or parquet"
         )
-    tasks = {task.task_id: task for task in release_tasks(dataset)}
-    provenance = read_provenance(dataset.origin.file(PROVENANCE))
+    tasks, provenance = release_tasks(dataset), dataset.provenance
     by_task: dict[str, list[int]] = {}
     for entry in dataset.entries:
         by_task.setdefault(entry.task_id, []).append(entry.history_id)

@@ -25,8 +25,8 @@ import numpy as np
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.environments import environment_spec
 from icrl4aht_data.errors import NotStoredError, OptionError
-from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, PROVENANCE
+from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.fast_observe import fast_observe
@@ -112,14 +112,13 @@ def to_minari(
 
 def _describe(dataset: Dataset) -> dict[str, Any]:
     """Return the content of the metadata key `icrl4aht`."""
-    recorded = read_provenance(dataset.origin.file(PROVENANCE))
     first = {entry.task_id: entry for entry in dataset.entries}
     names = ("task_id", "source", "env_idx", "learner", "episodes")  # who plays follows from `provenance`
     return {
         "data_version": dataset.info.data_version,
         "kept_steps": dataset.info.environment.kept_steps,
         "tasks": [asdict(dataset.history_task(entry.history_id)) for entry in first.values()],
-        "provenance": {name: recorded.get(name, Provenance()).to_json() for name in first},
+        "provenance": {name: dataset.provenance.get(name, Provenance()).to_json() for name in first},
         "histories": [{name: getattr(entry, name) for name in names} for entry in dataset.entries],
     }
 

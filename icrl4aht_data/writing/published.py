@@ -15,11 +15,12 @@ import io
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
+import msgspec
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
@@ -32,8 +33,6 @@ from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
     FIELDS,
     OBSERVATIONS,
-    PROVENANCE,
-    TASKS,
     Kind,
     episode_ends,
     held_fields,
@@ -84,8 +83,7 @@ def to_published(
     target = as_path(target)
     kind: Kind = "full" if states and dataset.has_states else OBSERVATIONS
     names = {entry.task_id for entry in dataset.entries}
-    recorded = read_provenance(dataset.origin.file(PROVENANCE))
-    provenance = {name: of_task for name, of_task in recorded.items() if name in names}
+    provenance = {name: of_task for name, of_task in dataset.provenance.items() if name in names}
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
         with _new_hdf5(folder / HISTORIES_H5) as new, (folder / HISTORIES_INDEX).open("w") as index:
             for number, history in enumerate(dataset):
@@ -96,7 +94,7 @@ def to_published(
                 line["env_idx"] += history.entry.learner * _streams_each(provenance.get(history.entry.task_id))
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
                 advance(number + 1, len(dataset))
-        tasks = [task for task in read_tasks(dataset.origin.file(TASKS)) if task.task_id in names]
+        tasks = [task for name, task in dataset.tasks.items() if name in names]
         if tasks:
             write_tasks(folder / "tasks.jsonl", tasks)
         write_json(folder / "provenance.json", {name: of_task.to_json() for name, of_task in provenance.items()})
@@ -240,7 +238,7 @@ def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenanc
         return provenance
     rows = get_layout(history.line["layout"]).height
     notes = {"obs_shape": history.line["obs_shape"], "padding": PADDING.format(rows=rows)}
-    return replace(provenance, other={**provenance.other, "published": notes})
+    return msgspec.structs.replace(provenance, other={**provenance.other, "published": notes})
 
 
 def _stored_names(file: h5py.File, group: str) -> set[str] | None:

@@ -18,7 +18,7 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
 from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.format.info import LeftOutTask, check_version, describe, layout_statistics
-from icrl4aht_data.format.layouts_file import write_layouts
+from icrl4aht_data.format.layouts_file import write_layouts_file
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import (
@@ -26,6 +26,7 @@ from icrl4aht_data.format.schema import (
     HISTORIES,
     INFO,
     KINDS,
+    LAYOUTS_FILE,
     OBSERVATIONS,
     PROVENANCE,
     RELEASE_CARD,
@@ -167,7 +168,7 @@ def write_release(
         with (root / HISTORIES).open("w", encoding="utf-8") as stream:
             stream.writelines(json.dumps(entry.to_json()) + "\n" for entry in writer.entries)
         named_layouts = [*(one.task.layout_name for one in new), *(one.layout for one in left_out)]
-        write_layouts(root, map(get_layout, named_layouts))  # not with the recipes of a task
+        write_layouts_file(root / LAYOUTS_FILE, map(get_layout, named_layouts))  # not with the recipes of a task
         known = [] if named else [one.task for one in new]
         write_tasks(root / TASKS, known)
         provenance = {one.task.task_id: one.provenance for one in new}

@@ -6,7 +6,6 @@ import itertools
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +117,7 @@ def random_release(
         made = Provenance(seed=task.seed, source=source, expert=expert, learners=None if trained == 1 else trained)
         if swap is not None:
             others = [one.teammate for one in every if one.layout == task.layout and one is not task]
-            made = replace(made, swaps=TeammateSwaps(swap, [task.teammate, *others]))
+            made = msgspec.structs.replace(made, swaps=TeammateSwaps(swap, [task.teammate, *others]))
         tasks.append(NewTask(task, made, len(histories), lambda histories=histories: histories))
     options: dict[str, Any] = {"shard_histories": shard_histories, "overwrite": overwrite}
     write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, **options)

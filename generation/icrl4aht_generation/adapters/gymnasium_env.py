@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from icrl4aht_data.benchmark.tasks import Task, parse_task
-from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
+from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.channels import Channels, observation_shape
@@ -82,8 +82,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         render_mode: str | None = None,
     ) -> None:
         check_choices(channels, render_mode)
-        if noise not in get_args(Noise):
-            raise unknown("noise", noise, get_args(Noise))
+        check_choice("noise", noise, get_args(Noise))
         if not isinstance(task, Mapping):
             raise TaskFormatError(
                 f"task = {task!r:.200}: expected the fields of a task by name, such as dataclasses.asdict(task), found "
@@ -128,8 +127,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         super().reset(seed=seed)
         given = dict(options or {})
         for name in given:
-            if name not in RESET_OPTIONS:
-                raise unknown("option of reset", name, RESET_OPTIONS)
+            check_choice("option of reset", name, RESET_OPTIONS)
         # Drawn in any case, so that an episode with options leaves those after it unchanged.
         drawn = self.np_random.integers(0, 2**32, 2, dtype=np.uint32)
         key = check_integers("key", given.get("key", drawn), np.uint32, 2**32 - 1, (2,))

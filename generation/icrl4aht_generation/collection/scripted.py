@@ -23,7 +23,6 @@ from icrl4aht_data.format.schema import curve_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_generation.collection.curate import stream_returns
-from icrl4aht_generation.collection.record import SCRIPT_ARRAYS, array_shapes, arrays_bytes
 from icrl4aht_generation.collection.scripted_rollout import (
     Piece,
     ScriptedEpisodes,
@@ -31,8 +30,15 @@ from icrl4aht_generation.collection.scripted_rollout import (
     play_scripted_histories,
     scripted_pieces,
 )
-from icrl4aht_generation.collection.task import TEAMMATE_NOISE, UpdateCallback, readable_disk_errors
-from icrl4aht_generation.collection.task_folder import ArrayWriter, check_room, finish_artefact
+from icrl4aht_generation.collection.task import TEAMMATE_NOISE, UpdateCallback
+from icrl4aht_generation.collection.task_folder import (
+    SCRIPT_ARRAYS,
+    ArrayWriter,
+    array_shapes,
+    arrays_bytes,
+    finish_artefact,
+    reserve_disk,
+)
 from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.teammates.registry import build_teammate
@@ -65,8 +71,7 @@ def play_histories(
     needed = scripted_bytes(task.layout, config)
     shutil.rmtree(partial, ignore_errors=True)  # left by a killed run
     partial.mkdir(parents=True)
-    with readable_disk_errors(partial, needed):
-        check_room(partial, needed)
+    with reserve_disk(partial, needed):
         writer = _PieceWriter(partial, task.layout, config, schedules)
         try:
             played = play_scripted_histories(task.layout, teammate, task.seed, work.source, pieces, schedules)
@@ -102,4 +107,4 @@ class _PieceWriter(ArrayWriter):
         for history, (start, end) in enumerate(ends):
             line = {"return_start": round(float(start), 3), "return_end": round(float(end), 3)}
             self._log.write({"update": history} | line)
-        self.sync(lambda: None)
+        self.sync()

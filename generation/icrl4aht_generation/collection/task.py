@@ -7,25 +7,21 @@ and since an update is a pure function of the state, the artefact has the bits o
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from icrl4aht_data.benchmark.tasks import Task
-from icrl4aht_data.errors import DiskFullError
 from icrl4aht_data.overcooked.actions import TEAMMATE
-from icrl4aht_data.utils.files import NO_ROOM
 from icrl4aht_generation.collection.task_folder import (
     LEARNER,
     ArtefactWriter,
     artefact_settings,
-    check_room,
-    disk_full,
     finish_artefact,
     needed_bytes,
+    reserve_disk,
 )
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.ego import Learner, compiled_update
@@ -60,49 +56,24 @@ def learn_histories(
     state = saved.load(jax.eval_shape(init, key)) if first else init(key)
     needed, update = needed_bytes(task, learner.config, state), compiled_update(learner)
 
-    def play(number: int) -> Any:
-        nonlocal state
-        state, rollout, metrics = update(state)
-        writer.write_checkpoint(number + 1, learner.network, state.params)
-        return rollout, metrics
-
-    def save(updates: int) -> None:
-        writer.sync(lambda: saved.save(state, updates))
-
-    with readable_disk_errors(partial, needed):
-        if not first:
-            check_room(partial, needed)
+    with reserve_disk(partial, needed):
         writer = ArtefactWriter(partial, task, learner.config, first)
+        interval = SaveInterval(learner.config.updates, seconds=save_seconds)
+        unwritten: Any = None  # written while the device plays the next update
         try:
-            interval = SaveInterval(learner.config.updates, seconds=save_seconds)
-            for number, played in pipelined(range(first, learner.config.updates), play, interval, save):
-                on_update(number, writer.write(number, *played))
+            for number in range(first, learner.config.updates):
+                state, rollout, metrics = update(state)
+                writer.write_checkpoint(number + 1, learner.network, state.params)
+                if unwritten is not None:
+                    on_update(number - 1, writer.write(number - 1, *unwritten))
+                unwritten = rollout, metrics
+                if interval.due(number + 1):
+                    on_update(number, writer.write(number, *unwritten))
+                    writer.save(saved, state, number + 1)
+                    unwritten = None
         finally:
             writer.close()
         finish_artefact(partial, work, profile)
-
-
-def pipelined(
-    numbers: range, play: Callable[[int], Any], interval: SaveInterval, save: Callable[[int], None]
-) -> Iterator[tuple[int, Any]]:
-    """Yield each number and what was played, to be written while the device plays the next one.
-
-    Args:
-        numbers: numbers of the pieces.
-        play: starts a piece on the device.
-        interval: when to save.
-        save: called with the number of the pieces so far, when all of them were written.
-    """
-    pending: Any = None
-    for number in numbers:
-        played = play(number)
-        if pending is not None:
-            yield pending
-        pending = number, played
-        if interval.due(number + 1):
-            yield pending
-            pending = None
-            save(number + 1)
 
 
 def saved_progress(saved: StateFile) -> int:
@@ -115,26 +86,6 @@ def saved_progress(saved: StateFile) -> int:
         shutil.rmtree(saved.path.parent, ignore_errors=True)
         saved.path.parent.mkdir(parents=True)
     return done or 0
-
-
-@contextmanager
-def readable_disk_errors(partial: Path, needed: int) -> Iterator[None]:
-    """Turn errors of a full disk into a `DiskFullError` that names the folder and the needed space.
-
-    An artefact without a saved state to resume from is removed.
-
-    Raises:
-        DiskFullError: if the disk is full.
-    """
-    try:
-        yield
-    except OSError as error:
-        if not isinstance(error, DiskFullError) and error.errno not in NO_ROOM:
-            raise
-        shown = disk_full(partial, needed)
-        if not (partial / LEARNER).exists():
-            shutil.rmtree(partial, ignore_errors=True)
-        raise shown from error
 
 
 def learner_key(work: Work) -> Any:

@@ -14,34 +14,34 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from icrl4aht_data.benchmark.facts import SCRIPTED_SOURCES
+from icrl4aht_data.benchmark.facts import EPISODE_STEPS, KEPT_STEPS, SCRIPTED_SOURCES
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import DiskFullError, IndexFormatError
 from icrl4aht_data.format.cached_arrays import new_mapped_array
-from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.overcooked.state import record_size
+from icrl4aht_data.utils.files import NO_ROOM, atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
-from icrl4aht_generation.collection.record import (
-    SCRIPT_ARRAYS,
-    HistoryArrays,
-    array_shapes,
-    arrays_bytes,
-    record_rollout,
-)
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic
-from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, last_line, xla_threads
+from icrl4aht_generation.learners.resume import METRICS, TIMING, RunLog, StateFile, last_line, xla_threads
+from icrl4aht_generation.learners.rollout import Rollout
 from icrl4aht_generation.profiles import Profile, Work
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
@@ -49,6 +49,68 @@ LABELLER_RETURNS = "labeller_returns.json"
 """File that packing adds: what the ego's checkpoints earn as labellers."""
 
 _LINE_BYTES = 600  # field of an update's number, in metrics and timing
+
+
+SCRIPT_ARRAYS = ("script_actions", "noise")
+"""Arrays that artefacts of scripted sources have besides those of `HistoryArrays`, see `collection.scripted`."""
+
+
+class HistoryArrays(NamedTuple):
+    """N histories of E episodes and T = 100 E steps; NumPy arrays or memory maps.
+
+    Attributes:
+        state: uint8 (N, T, S), state records before each step.
+        actions: int8 (N, T), the ego's sampled actions.
+        teammate_actions: int8 (N, T).
+        rewards: int8 (N, T), the team's, unshaped.
+        episode_end_state: uint8 (N, E, S), state records after each episode's last kept step.
+    """
+
+    state: np.ndarray
+    actions: np.ndarray
+    teammate_actions: np.ndarray
+    rewards: np.ndarray
+    episode_end_state: np.ndarray
+
+
+def array_shapes(layout: Layout, histories: int, episodes: int) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Return the shape and dtype of every field of `HistoryArrays`."""
+    n, size = histories, record_size(layout)
+    steps = (n, episodes * KEPT_STEPS)
+    return {
+        "state": ((*steps, size), "uint8"),
+        "actions": (steps, "int8"),
+        "teammate_actions": (steps, "int8"),
+        "rewards": (steps, "int8"),
+        "episode_end_state": ((n, episodes, size), "uint8"),
+    }
+
+
+def arrays_bytes(shapes: Mapping[str, tuple[tuple[int, ...], str]]) -> int:
+    """Return the uncompressed size of arrays, given their shapes and dtypes by name."""
+    return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
+
+
+def record_rollout(histories: HistoryArrays, update: int, rollout: Rollout) -> None:
+    """Write the kept steps of one roll-out into the histories.
+
+    All environments start together and never end early, so the number of a step determines its episode and its clock;
+    writing a roll-out twice changes nothing, which a resumed task relies on.
+    """
+    length = rollout.record.shape[0]
+    step = np.arange(update * length, (update + 1) * length)
+    episode, clock = step // EPISODE_STEPS, step % EPISODE_STEPS
+    complete = episode < histories.episode_end_state.shape[1]
+    kept = complete & (clock < KEPT_STEPS)
+    after = complete & (clock == KEPT_STEPS)
+    record = np.asarray(rollout.record).swapaxes(0, 1)
+    actions = np.asarray(rollout.actions).swapaxes(0, 1)
+    to = episode[kept] * KEPT_STEPS + clock[kept]
+    histories.state[:, to] = record[:, kept]
+    histories.actions[:, to] = actions[:, kept, EGO]
+    histories.teammate_actions[:, to] = actions[:, kept, TEAMMATE]
+    histories.rewards[:, to] = np.asarray(rollout.reward).swapaxes(0, 1)[:, kept]
+    histories.episode_end_state[:, episode[after]] = record[:, after]
 
 
 def partial_folder(folder: Path) -> Path:
@@ -113,24 +175,33 @@ def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
     return histories + 2 * saved + len(checkpoint_updates(config)) * params + config.updates * _LINE_BYTES
 
 
-def check_room(partial: Path, needed: int) -> None:
-    """Check that a disk has room for an artefact.
+@contextmanager
+def reserve_disk(partial: Path, needed: int) -> Iterator[None]:
+    """Check that a disk has room for an artefact, and turn errors of a full disk into a `DiskFullError`.
+
+    An artefact without a saved state to resume from is removed.
+
+    Args:
+        partial: the unfinished artefact.
+        needed: its size in bytes.
 
     Raises:
-        DiskFullError: if there is too little space.
+        DiskFullError: if the disk is full; names the folder and the needed space.
     """
-    if needed > shutil.disk_usage(partial).free:
-        raise disk_full(partial, needed)
-
-
-def disk_full(partial: Path, needed: int) -> DiskFullError:
-    """Return the error for a disk without enough space for an unfinished artefact."""
-    free = shutil.disk_usage(partial if partial.exists() else partial.parent).free
-    folder = partial.with_name(partial.name.removesuffix(".partial"))
-    return DiskFullError(
-        f"{folder}: the disk is full: this task needs {needed:,} bytes, {free:,} are free; free some space, or give "
-        f"another --out"
-    )
+    try:
+        if not (partial / LEARNER).exists() and needed > shutil.disk_usage(partial).free:
+            raise OSError(NO_ROOM[0], os.strerror(NO_ROOM[0]))
+        yield
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        free = shutil.disk_usage(partial).free
+        if not (partial / LEARNER).exists():
+            shutil.rmtree(partial, ignore_errors=True)
+        raise DiskFullError(
+            f"{partial.with_name(partial.name.removesuffix('.partial'))}: the disk is full: this task needs "
+            f"{needed:,} bytes, {free:,} are free; free some space, or give another --out"
+        ) from error
 
 
 def finish_artefact(partial: Path, work: Work, profile: Profile) -> None:
@@ -203,14 +274,13 @@ class ArrayWriter:
             self._started, self._steps, self._recording, self._has_written = now, 0, 0.0, True
         return timing
 
-    def sync(self, save: Callable[[], None]) -> None:
-        """Force everything written so far to the disk, and out of memory; then save the state that led to it."""
+    def sync(self) -> None:
+        """Force everything written so far to the disk, and out of memory."""
         began = time.perf_counter()
         for array in self._arrays.values():
             array.flush()
         self._arrays = self._mapped()
         self._log.sync()
-        save()
         self._recording += time.perf_counter() - began
 
     def close(self) -> None:
@@ -248,6 +318,13 @@ class ArtefactWriter(ArrayWriter):
         timing = self._timing(self._config.steps_per_update, began)
         self._log.write(line, timing={"update": number} | timing)
         return line | timing
+
+    def save(self, saved: StateFile, state: Any, updates: int) -> None:
+        """Save the learner's state after everything that led to it is on the disk."""
+        self.sync()
+        began = time.perf_counter()
+        saved.save(state, updates)
+        self._recording += time.perf_counter() - began
 
     def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
         """Write and sync a checkpoint of the ego if this number of updates is among `checkpoint_updates`.

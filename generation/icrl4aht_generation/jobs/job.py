@@ -114,46 +114,31 @@ def run_in_worker(job: Job, wait: bool) -> Literal["done", "busy"]:
     return run_job(job, wait)
 
 
-class FailureLog:
-    """One line per failed job that still has no result. Several processes may share the file.
+def update_failures(path: Path, lines: dict[str, Any]) -> bool:
+    """Write the log of failed jobs that still have no result, one line each. Several processes may share the file.
 
-    On a full disk, changes are kept in memory until a later write succeeds.
+    Args:
+        path: the file; without failures there is none.
+        lines: name of a job -> its new line, or None to remove it. Other jobs keep theirs.
+
+    Returns:
+        False if the disk is full: the file is unchanged.
     """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._waiting: dict[str, dict[str, Any] | None] = {}  # name -> its new line, or None to remove it
-
-    @property
-    def is_written(self) -> bool:
-        """Whether all changes have been written to the disk."""
-        return not self._waiting
-
-    def add(self, outcome: JobOutcome) -> None:
-        """Add a job's line, or replace the one of an earlier attempt."""
-        name, details = outcome.job.name, {"attempts": outcome.attempts, "error": outcome.error}
-        self._change({name: {"task_id": name, **details, "traceback": outcome.trace}})
-
-    def forget(self, names: Iterable[str]) -> None:
-        """Remove the lines of jobs that are finished."""
-        self._change(dict.fromkeys(names))
-
-    def _change(self, changes: dict[str, dict[str, Any] | None]) -> None:
-        self._waiting |= changes
-        try:
-            with process_lock(self.path.with_name(f".{self.path.name}.lock")):
-                found = [json.loads(x) for x in read_text(self.path).splitlines()] if self.path.exists() else []
-                before = {line["task_id"]: line for line in found}
-                after = {name: line for name, line in (before | self._waiting).items() if line}
-                if not after:
-                    self.path.unlink(missing_ok=True)
-                elif after != before:
-                    with atomic_write(self.path) as partial:
-                        partial.write_text("".join(json.dumps(x) + "\n" for x in after.values()), encoding="utf-8")
-            self._waiting.clear()
-        except OSError as error:
-            if error.errno not in NO_ROOM:
-                raise
+    try:
+        with process_lock(path.with_name(f".{path.name}.lock")):
+            found = [json.loads(line) for line in read_text(path).splitlines()] if path.exists() else []
+            before = {line["task_id"]: line for line in found}
+            after = {name: line for name, line in (before | lines).items() if line}
+            if not after:
+                path.unlink(missing_ok=True)
+            elif after != before:
+                with atomic_write(path) as partial:
+                    partial.write_text("".join(json.dumps(line) + "\n" for line in after.values()), encoding="utf-8")
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        return False
+    return True
 
 
 class JobBoard:

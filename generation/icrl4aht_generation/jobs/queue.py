@@ -20,12 +20,12 @@ from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_generation.jobs.job import (
     FAILED,
     FailedJobsError,
-    FailureLog,
     Job,
     JobBoard,
     JobOutcome,
     run_in_worker,
     run_job,
+    update_failures,
 )
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.ray_executor import run_on_ray
@@ -60,7 +60,8 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
             todo.append(job)
     missing = {job.name for job in todo}
     updates = {job.name: job.updates for job in todo}
-    failures, last_error = FailureLog(out / FAILED), ""
+    path, last_error = out / FAILED, ""
+    lines: dict[str, Any] = dict.fromkeys(labels.keys() - missing)
     with (
         progress_bars(unit="updates") as show,
         closing(_run_all(todo, JobBoard(show, updates), options)) as outcomes,
@@ -73,19 +74,22 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
             if outcome.status == "done":
                 console.print(f"{labels[name]}: {outcome.job.finished_text()}")
                 missing.remove(name)
-                failures.forget([name])
+                lines[name] = None
+                update_failures(path, lines)
                 continue
             times = "once" if outcome.attempts == 1 else f"{outcome.attempts} times"
             console.print(f"{labels[name]}: failed {times}: {outcome.error}")
-            failures.add(outcome)
+            details = {"attempts": outcome.attempts, "error": outcome.error, "traceback": outcome.trace}
+            lines[name] = {"task_id": name, **details}
+            update_failures(path, lines)
             last_error = outcome.error
             if options.fail_fast:
-                raise FailedJobsError(f"{failures.path}: the first failure: {outcome.error}")
-    failures.forget(labels.keys() - missing)
+                raise FailedJobsError(f"{path}: the first failure: {outcome.error}")
+    is_written = update_failures(path, lines)
     if missing:
-        reasons = f"{failures.path} has the reasons"
-        if not failures.is_written:
-            reasons = f"{failures.path} cannot be written, the disk is full; the last failure: {last_error}"
+        reasons = f"{path} has the reasons"
+        if not is_written:
+            reasons = f"{path} cannot be written, the disk is full; the last failure: {last_error}"
         raise FailedJobsError(
             f"{len(missing)} of {len(jobs)} jobs are unfinished: {', '.join(sorted(missing))}; {reasons}, and the same "
             f"command tries them again"

@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, check_choice, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_generation.layouts.fixtures import LayoutDraw
@@ -51,8 +51,7 @@ def generate_layouts(family: str, seed: int, count: int, *, split: str | None = 
         UnknownNameError: for an unknown family or split.
         OptionError: if the family does not have so many layouts, or seed or count is not an integer of at least 0.
     """
-    if family not in LAYOUT_FAMILIES:
-        raise unknown("family of layouts", family, LAYOUT_FAMILIES)
+    check_choice("family of layouts", family, LAYOUT_FAMILIES)
     if split not in (None, *LAYOUT_SPLITS):
         raise unknown("split of layouts", split, LAYOUT_SPLITS)
     seed, count = check_int("seed", seed, 0), check_int("count", count, 0)

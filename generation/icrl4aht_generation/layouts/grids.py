@@ -32,17 +32,6 @@ def neighbours(mask: np.ndarray) -> np.ndarray:
     return found
 
 
-def room_around(floor: np.ndarray, start: tuple[int, int]) -> np.ndarray:
-    """Return bool (H, W), the cells of a floor, bool (H, W), that can be reached from a cell (row, column)."""
-    room = np.zeros_like(floor)
-    room[start] = True
-    while True:
-        grown = room | (neighbours(room) & floor)
-        if np.array_equal(grown, room):
-            return room
-        room = grown
-
-
 def agent_rooms(layout: Layout) -> np.ndarray:
     """Return the floor that each agent can reach, bool (2, H, W)."""
     rooms = np.zeros((2, layout.cells), bool)

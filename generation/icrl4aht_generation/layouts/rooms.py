@@ -6,11 +6,13 @@ Shapes: `H` rows, `W` columns, at most 9 and 11.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from scipy.ndimage import binary_erosion, label
 
 from icrl4aht_generation.layouts.fixtures import LayoutDraw, furnished
-from icrl4aht_generation.layouts.grids import canonical_floor, neighbours, room_around
+from icrl4aht_generation.layouts.grids import canonical_floor, neighbours
 from icrl4aht_generation.layouts.templates import published_rooms
 
 MOST_ROWS, MOST_COLUMNS = 9, 11
@@ -49,20 +51,11 @@ def _shared_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
                 break
         floor |= block
     for _ in range(rng.integers(0, 3)):
-        surrounded = np.argwhere(_shrunk(floor))
+        surrounded = np.argwhere(binary_erosion(floor, np.ones((3, 3), bool)))
         if len(surrounded):
             floor[tuple(rng.choice(surrounded))] = False
     floor = _cropped(floor)
     return floor, floor
-
-
-def _shrunk(floor: np.ndarray) -> np.ndarray:
-    """Return bool (H, W), the cells of a floor whose eight neighbours are floor."""
-    rows = floor.copy()
-    rows[1:-1] &= floor[:-2] & floor[2:]
-    found = rows.copy()
-    found[:, 1:-1] &= rows[:, :-2] & rows[:, 2:]
-    return found
 
 
 def _cropped(floor: np.ndarray) -> np.ndarray:
@@ -92,8 +85,8 @@ def _two_rooms(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 def _is_room(floor: np.ndarray) -> bool:
     """Return whether a floor has at least two cells, and all of them are connected."""
-    cells = np.argwhere(floor)
-    return len(cells) > 1 and np.array_equal(room_around(floor, tuple(cells[0])), floor)
+    connected: Any = label(floor)  # the numbers of its parts, and how many there are
+    return floor.sum() > 1 and connected[1] == 1
 
 
 def _ring(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

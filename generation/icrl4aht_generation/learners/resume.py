@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from filelock import Timeout
+from flax.traverse_util import flatten_dict
 from jax._src.xla_bridge import backends_are_initialized  # JAX has no public way to ask without initializing
 from jax.experimental import multihost_utils
 from safetensors import SafetensorError, safe_open
@@ -92,7 +93,7 @@ def last_line(path: Path) -> dict[str, Any] | None:
 
 def differing_settings(found: Mapping[str, Any], expected: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Settings that differ, by dotted name: (found, expected), None for a missing one. Tuples equal lists."""
-    one, other = _flat(json.loads(json.dumps(found))), _flat(json.loads(json.dumps(expected)))
+    one, other = (flatten_dict(json.loads(json.dumps(each)), sep=".") for each in (found, expected))
     names = sorted(one.keys() | other.keys())
     return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
 
@@ -329,13 +330,6 @@ def _cut(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
     if kept != lines:
         with atomic_write(path) as partial:
             partial.write_bytes(b"".join(kept))
-
-
-def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in content.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-    return flat
 
 
 def _named_leaves(tree: Any, part: str = "") -> dict[str, Any]:

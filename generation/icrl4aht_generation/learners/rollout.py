@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.state import swapped
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.learners.encoder import CompactView
@@ -131,8 +130,9 @@ def roll_out(
         outcome = env.step(carry.env, actions)
         state = restart(outcome.state, outcome.done)
         returns = carry.returns + outcome.reward
+        # The memory of a new episode, in the slots whose environment is done.
         memories = tuple(
-            _reset_memory(player, memory, state, outcome.done)
+            select_rows(outcome.done[player.agent_slots % n], player.init(state), memory)
             for player, (_, memory) in zip(players, acted, strict=True)
         )
         played = Rollout(
@@ -148,11 +148,6 @@ def roll_out(
         return RolloutCarry(state, outcome.done, memories, jnp.where(outcome.done, 0.0, returns)), played
 
     return jax.lax.scan(step, carry, jax.random.split(key, steps))
-
-
-def _reset_memory(player: Player, memory: Any, state: EnvState, done: Bool[Array, " N"]) -> Any:
-    """Return the player's memory, with that of a new episode in the slots whose environment is `done`."""
-    return select_rows(done[player.agent_slots % done.shape[0]], player.init(state), memory)
 
 
 def select_rows(which: Bool[Array, " N"], one: Any, other: Any) -> Any:
@@ -245,15 +240,6 @@ def policy_player(
         return Choice(action, jnp.zeros(len(played)), jnp.zeros(len(played))), memory
 
     return Player(agent * envs + played, init, act)
-
-
-def random_player(agent: int, envs: int) -> Player:
-    """Return a player that draws uniformly from the six actions, as one agent of every environment."""
-
-    def act(memory, state: EnvState, key):
-        return Choice(jax.random.randint(key, (envs,), 0, len(ACTIONS)), jnp.zeros(envs), jnp.zeros(envs)), memory
-
-    return Player(agent * envs + np.arange(envs), lambda state: (), act)
 
 
 def slot_records(record: UInt8[Array, "*B N S"], agent_slots: np.ndarray) -> UInt8[Array, "*B M S"]:

@@ -6,10 +6,11 @@ the hyper-parameters. Stored figures suffice for the speed of the environment an
 
 from __future__ import annotations
 
-import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from timeit import repeat
 from typing import Any
 
 import jax
@@ -17,18 +18,19 @@ import jax.numpy as jnp
 import numpy as np
 from rich import filesize
 
-from icrl4aht_data.benchmark.facts import KEPT_STEPS, SCRIPTED_SOURCES
+from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.system import usable_cores
-from icrl4aht_generation.collection.record import array_shapes, arrays_bytes
 from icrl4aht_generation.collection.scripted import scripted_bytes
+from icrl4aht_generation.collection.task_folder import array_shapes, arrays_bytes
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.populations.build import population_runs
 from icrl4aht_generation.profiles import Profile
+from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 BYTES: dict[tuple[Kind, str], float] = {
     ("lite", "ppo"): 1.92,
@@ -121,51 +123,42 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
         profile: the profile.
         devices: number of devices that share the tasks.
     """
-    tasks = {
-        source: {name: profile.tasks_on(name, source) for name in profile.layouts_of(source)}
-        for source in profile.sources
-    }
-    egos = [
-        (get_layout(name), profile.ego_on(name))
-        for name, count in tasks.get("ppo", {}).items()
-        for _ in range(count * profile.learners)
-    ]
-    scripted = [
-        (source, get_layout(name), profile.scripted_on(name, source))
-        for source in SCRIPTED_SOURCES
-        for name, count in tasks.get(source, {}).items()
-        for _ in range(count)
-    ]
+    egos: list[tuple[Layout, PPOConfig]] = []
+    scripted: list[tuple[Layout, NoiseConfig]] = []
+    tasks, kept = 0, Counter[str]()
+    for source in profile.sources:
+        for name in profile.layouts_of(source):
+            layout, count = get_layout(name), profile.tasks_on(name, source)
+            tasks += count
+            if source == "ppo":
+                egos += [(layout, profile.ego_on(name))] * (count * profile.learners)
+                kept[source] += count * profile.keep * profile.ego_on(name).episodes * KEPT_STEPS
+            else:
+                config = profile.scripted_on(name, source)
+                scripted += [(layout, config)] * count
+                kept[source] += count * config.histories * config.episodes * KEPT_STEPS
     runs = population_runs(profile, profile.algorithms, 0)
 
     steps = sum(ego.updates * ego.steps_per_update for _, ego in egos)
     playing = [ego.updates * ego.steps_per_update * step_seconds(ego) for _, ego in egos]
-    transitions = [config.histories * config.episodes * KEPT_STEPS for _, _, config in scripted]
+    transitions = [config.histories * config.episodes * KEPT_STEPS for _, config in scripted]
     scripted_seconds = [count / ENVIRONMENT_STEPS_PER_SECOND + SCRIPTED_SECONDS for count in transitions]
     seconds = [played + COMPILE_SECONDS for played in playing] + scripted_seconds
     teammate_seconds = sum(run.steps * step_seconds(run.config) + COMPILE_SECONDS for run in runs)
-    kept = {
-        "ppo": sum(
-            count * profile.keep * profile.ego_on(name).episodes * KEPT_STEPS
-            for name, count in tasks.get("ppo", {}).items()
-        ),
-    }
-    for (source, _, _), count in zip(scripted, transitions, strict=True):
-        kept[source] = kept.get(source, 0) + count
     sizes = {kind: round(sum(kept[source] * BYTES[kind, source] for source in kept)) for kind in KINDS}
     device = jax.devices()[0]
     return RebuildCost(
         profile=profile.name,
         populations=len(runs),
         teammate_steps=sum(run.steps for run in runs),
-        tasks=sum(sum(counts.values()) for counts in tasks.values()),
+        tasks=tasks,
         learners=len(egos),
         environment_steps=steps,
-        scripted_histories=sum(config.histories for _, _, config in scripted),
+        scripted_histories=sum(config.histories for _, config in scripted),
         scripted_transitions=sum(transitions),
         recorded_transitions=sum(ego.environments * ego.episodes * KEPT_STEPS for _, ego in egos) + sum(transitions),
         kept_transitions=sum(kept.values()),
-        artefact_bytes=artefact_bytes(egos) + sum(scripted_bytes(layout, config) for _, layout, config in scripted),
+        artefact_bytes=artefact_bytes(egos) + sum(scripted_bytes(layout, config) for layout, config in scripted),
         lite_bytes=sizes["lite"],
         full_bytes=sizes["full"],
         device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
@@ -212,11 +205,10 @@ def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
 
 
 def _seconds(function: Any, *arguments: Any) -> float:
-    """Return the time of the fastest of a few calls, after one that compiles."""
-    jax.block_until_ready(function(*arguments))
-    times = []
-    for _ in range(3):  # the fastest of a few, since other programs may slow some down
-        started = time.perf_counter()
+    """Return the time of the fastest of a few calls, after one that compiles; other programs may slow some down."""
+
+    def call() -> None:
         jax.block_until_ready(function(*arguments))
-        times.append(time.perf_counter() - started)
-    return min(times)
+
+    call()
+    return min(repeat(call, number=1, repeat=3))

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 from rich.console import Console
-from rich.table import Table
 
 from icrl4aht_data.benchmark.facts import (
     ALGORITHMS,
@@ -18,12 +21,15 @@ from icrl4aht_data.benchmark.facts import (
     layout_number,
     track_layouts,
 )
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, check_choice
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_generation.env import Environment
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
+from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
+from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR
-from icrl4aht_generation.populations.diversity import actions_on_common_states, family_distances
 from icrl4aht_generation.populations.select import TeammateSelection, select_teammates, write_manifests
 from icrl4aht_generation.populations.train import (
     PopulationJob,
@@ -33,10 +39,13 @@ from icrl4aht_generation.populations.train import (
     suite_checkpoints,
 )
 from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.teammates.distances import hamming_distances
+from icrl4aht_generation.teammates.distances import act_along, hamming_distances
 from icrl4aht_generation.teammates.instances import published_thetas
 from icrl4aht_generation.teammates.learned import build_learned
+from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_families
 from icrl4aht_generation.teammates.registry import build_teammate
+
+_EPISODES = 2  # of each policy, whose states are compared
 
 
 def build_suite(
@@ -67,8 +76,7 @@ def build_suite(
         UnknownNameError: for an unknown algorithm.
     """
     for name in chain(*algorithms.values()):
-        if name not in ALGORITHMS:
-            raise unknown("algorithm", name, ALGORITHMS)
+        check_choice("algorithm", name, ALGORITHMS)
     config = profile.teammates
     runs = population_runs(profile, algorithms, seed)
     jobs = [PopulationJob(run, suite, profile.xla_threads) for run in runs]
@@ -145,8 +153,11 @@ def report_diversity(
 def _report_population(suite: Path, layout: Layout, algorithm: str, greedy: bool, console: Console) -> None:
     returns = play_matrix(suite, layout, algorithm, greedy)
     diagonal = np.eye(len(returns), dtype=bool)
-    title = f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps"
-    _show_matrix(console, title, [f"m{k}" for k in range(len(returns))], ("ego", "teammate"), returns)
+    title = (
+        f"{algorithm} on {layout.name}: mean return of {EPISODES_PER_PAIR} episodes of {EPISODE_STEPS} steps, egos in "
+        f"rows, teammates in columns"
+    )
+    console.print(title, _matrix_text([f"m{k}" for k in range(len(returns))], returns), sep="\n")
     self_play = returns[diagonal].mean()
     cross_play = returns[~diagonal].mean() if len(returns) > 1 else float("nan")
     console.print(f"self-play {self_play:.1f}, cross-play {cross_play:.1f}, gap {self_play - cross_play:.1f}")
@@ -164,15 +175,49 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], co
         policies += [build_teammate(layout, {"family": kind, "theta": theta}) for theta in thetas]
     distances = family_distances(hamming_distances(actions_on_common_states(layout, policies)), families)
     title = f"{layout.name}: mean Hamming distance of families"
-    _show_matrix(console, title, list(families), ("family", "family"), distances)
+    console.print(title, _matrix_text(list(families), distances), sep="\n")
 
 
-def _show_matrix(console: Console, title: str, names: Sequence[str], axes: tuple[str, str], values: np.ndarray) -> None:
-    """Print a square matrix with the same names for rows and columns."""
-    table = Table(title=title)
-    table.add_column(" \\ ".join(axes))
-    for name in names:
-        table.add_column(name, justify="right")
-    for name, row in zip(names, values, strict=True):
-        table.add_row(name, *(f"{value:.2f}" for value in row))
-    console.print(table)
+def _matrix_text(names: list[str], values: np.ndarray) -> str:
+    """Return a square matrix as text, with the same names for rows and columns."""
+    return pd.DataFrame(values, names, names).to_string(float_format="{:.2f}".format)
+
+
+def actions_on_common_states(
+    layout: Layout, policies: Sequence[Policy], seed: int = 0, steps: int = EPISODE_STEPS
+) -> np.ndarray:
+    """Return actions of every policy, as the teammate, on the same states.
+
+    The states are those of roll-outs with a uniformly random ego and each policy in turn as the teammate, two episodes
+    each. Every policy acts on every state; its memory follows the episode that it observes.
+
+    Returns:
+        int8 (policies, states), states = policies x 2 x steps.
+    """
+    env, key = Environment(layout, steps), jax.random.key(seed)
+    played = [_visited_records(env, *family, key) for family in stacked_families(policies)]
+    records = jnp.concatenate(played, axis=1)  # (T, episodes, S)
+    return act_along(layout, policies, records, seed).reshape(len(policies), -1)
+
+
+def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]]) -> np.ndarray:
+    """Return mean distances of families, over all pairs of their policies: (P, P) -> float64 (F, F).
+
+    Within a family, pairs of a policy with itself count too, as in the paper's formula.
+    """
+    return np.array([[distances[np.ix_(a, b)].mean() for b in families.values()] for a in families.values()])
+
+
+def _visited_records(env: Environment, numbers: list[int], family: Policy, key: Any) -> jax.Array:
+    """Return records uint8 (T, policies x 2, S) of a random ego with each policy of the family."""
+    n = len(numbers) * _EPISODES
+
+    @jax.jit
+    def play(params, key):
+        own = jax.tree.map(lambda leaf: jnp.repeat(leaf, _EPISODES, axis=0), params)
+        ego = policy_player(env, REFERENCE_EGOS["random"], (), EGO, n)
+        players = [ego, policy_player(env, family, own, TEAMMATE, n, own_params=True)]
+        carry = init_rollout(env, players, jax.random.split(key, n))
+        return roll_out(env, players, carry, env.max_steps, key)[1].record
+
+    return play(family.params, jax.random.fold_in(key, numbers[0]))

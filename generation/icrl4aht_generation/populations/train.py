@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS
-from icrl4aht_data.errors import IndexFormatError, OptionError, unknown
+from icrl4aht_data.errors import IndexFormatError, OptionError, check_choice
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text, write_json
 from icrl4aht_data.utils.hashes import file_hash, hashes_hold
@@ -95,8 +95,7 @@ class PopulationRun:
     seed: int
 
     def __post_init__(self) -> None:
-        if self.algorithm not in ALGORITHMS:
-            raise unknown("algorithm", self.algorithm, ALGORITHMS)
+        check_choice("algorithm", self.algorithm, ALGORITHMS)
         if self.config.updates < POLICY_CHECKPOINTS:
             raise OptionError(
                 f"teammates.total_steps = {self.config.total_steps}: {self.config.updates} updates, expected at least "

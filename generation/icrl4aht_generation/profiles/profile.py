@@ -287,7 +287,8 @@ class Profile:
     def _heuristic_tasks(self, layout: str, source: str) -> list[Task]:
         if source == "search":
             first = _first_seed(source) + PREFERENCE_LAYOUTS["train"].index(layout) * _LAYOUT_SEEDS
-            own = [task for task in _preference_tasks() if task.layout.name == layout]
+            paths = (manifest_path(PREFERENCE, split) for split in ("train", "validation"))
+            own = [task for path in paths for task in read_tasks(path) if task.layout.name == layout]
             return [
                 make_task(task.track, task.split, layout, task.teammate, first + number, task.recipes)
                 for number, task in enumerate(own)
@@ -314,11 +315,6 @@ class Profile:
     def hash(self) -> str:
         """Hash of the profile."""
         return json_hash(asdict(self))
-
-
-def _preference_tasks() -> list[Task]:
-    """Return the training and validation tasks of the track `preference`."""
-    return [task for split in ("train", "validation") for task in read_tasks(manifest_path(PREFERENCE, split))]
 
 
 def _drawn_for(layout: str, split: str, generated: Mapping[str, int]) -> list[dict[str, Any]]:

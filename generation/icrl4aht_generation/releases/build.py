@@ -23,10 +23,9 @@ from icrl4aht_generation.jobs.job import FAILED, FailedJobsError
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
 from icrl4aht_generation.populations.build import build_suite
-from icrl4aht_generation.populations.headroom import learned_headroom
 from icrl4aht_generation.populations.select import THRESHOLD, make_tasks
 from icrl4aht_generation.profiles import Profile, Work
-from icrl4aht_generation.releases.measures import teammate_facts
+from icrl4aht_generation.releases.measures import learned_headroom, teammate_facts
 from icrl4aht_generation.releases.package import check_release_folder, package_release
 
 SUITE = "suite"

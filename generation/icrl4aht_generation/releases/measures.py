@@ -8,25 +8,33 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import msgspec
+import numpy as np
 
-from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON
+from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, KEPT_STEPS, TESTED_ON
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import IndexFormatError
+from icrl4aht_data.format.checkpoints import checkpoint_folder
 from icrl4aht_data.format.info import LeftOutTask
 from icrl4aht_data.format.provenance import NearestTest, Provenance, ReferenceEgos, read_provenance
 from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
-from icrl4aht_data.overcooked.actions import TEAMMATE
+from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
+from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, read_text
+from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.resume import software_versions
-from icrl4aht_generation.populations.headroom import learned_headroom
+from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
+from icrl4aht_generation.policy import Policy
+from icrl4aht_generation.populations.train import RESPONSES
 from icrl4aht_generation.teammates.distances import nearest_test
 from icrl4aht_generation.teammates.draws import hosted_families, unhosted_reason
+from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_egos, reference_returns
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
 from icrl4aht_generation.teammates.spread import find_measured
@@ -34,6 +42,57 @@ from icrl4aht_generation.teammates.spread import find_measured
 _DIGITS = 4
 
 T = TypeVar("T")
+
+
+_SEED = 12  # of episodes of a learned teammate with its training partner
+
+
+def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceEgos]:
+    """Measure how much an ego matters with learned teammates.
+
+    Args:
+        tasks: tasks with learned teammates.
+        suite: folder of their checkpoints.
+
+    Returns:
+        task id -> returns.
+    """
+    found = {}
+    for layout in dict.fromkeys(task.layout for task in tasks):
+        own = [task for task in tasks if task.layout == layout]
+        folders = [checkpoint_folder(suite, task.teammate) for task in own]
+        mates = [build_learned(layout, folder) for folder in folders]
+        partners = [build_learned(layout, _partner(folder), "sampled") for folder in folders]
+        returns = reference_returns(layout, mates)
+        for k, (task, ego, mate) in enumerate(zip(own, partners, mates, strict=True)):
+            play = _self_play_program(layout, ego._replace(params=()), mate._replace(params=()))
+            self_play = float(np.asarray(play(ego.params, mate.params)).mean())
+            found[task.task_id] = reference_egos(returns, k, self_play)
+    return found
+
+
+def _partner(folder: Path) -> Path:
+    """Return the folder of the policy that a checkpoint, m<k>/c<n>, was trained with."""
+    response = folder.parent.parent / RESPONSES / folder.parent.name
+    return response if response.is_dir() else folder
+
+
+@lru_cache(maxsize=8)
+def _self_play_program(layout: Layout, ego: Policy, mate: Policy) -> Callable[[Any, Any], jax.Array]:
+    """Return a function of both policies' parameters that returns the returns, float32 (REFERENCE_EPISODES,)."""
+    env = Environment(layout, KEPT_STEPS)
+
+    @jax.jit
+    def play(ego_params: Any, mate_params: Any) -> jax.Array:
+        players = [
+            policy_player(env, ego, ego_params, EGO, REFERENCE_EPISODES),
+            policy_player(env, mate, mate_params, TEAMMATE, REFERENCE_EPISODES),
+        ]
+        episodes, actions = jax.random.split(jax.random.key(_SEED))
+        carry = init_rollout(env, players, jax.random.split(episodes, REFERENCE_EPISODES))
+        return roll_out(env, players, carry, KEPT_STEPS, actions)[1].reward.sum(axis=0)
+
+    return play
 
 
 class TeammateFacts(NamedTuple):

@@ -16,14 +16,14 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 from msgspec import Struct
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS, layout_order
 from icrl4aht_data.benchmark.tasks import Task, make_task
-from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, unknown
+from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
@@ -131,8 +131,7 @@ def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
     name = get_layout(layout).name
     if name not in TESTED_ON:
         raise unknown("training layout", layout, TESTED_ON)
-    if family not in HEURISTIC_FAMILIES:
-        raise unknown("teammate family", family, HEURISTIC_FAMILIES)
+    check_choice("teammate family", family, HEURISTIC_FAMILIES)
     if base_seed not in DRAWS_PER_SEED:
         raise unknown("base_seed of draws", base_seed, map(str, DRAWS_PER_SEED))
     return list(_bundled_draws().get((name, family, base_seed), ()))
@@ -300,16 +299,8 @@ def _bundled_draws() -> dict[tuple[str, str, int], tuple[Draw, ...]]:
     return {key: tuple(found) for key, found in draws.items()}
 
 
-class Row(Protocol):
-    """A line of a table of measured teammates."""
-
-    @property
-    def order(self) -> tuple[Any, ...]:
-        """Sort key in the table."""
-        ...
-
-
-AnyRow = TypeVar("AnyRow", bound=Row)
+AnyRow = TypeVar("AnyRow", bound=Struct)
+"""A line of a table of measured teammates."""
 
 
 def read_measured(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
@@ -327,8 +318,8 @@ def read_measured(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
     return found
 
 
-def write_table(path: Path, rows: Iterable[Row]) -> None:
-    """Write one JSON line per row, sorted."""
+def write_table(path: Path, rows: Iterable[Any]) -> None:
+    """Write one JSON line per row, sorted by its `order`."""
     lines = [msgspec.json.encode(row) + b"\n" for row in sorted(rows, key=lambda row: row.order)]
     with atomic_write(path) as partial:
         partial.write_bytes(b"".join(lines))

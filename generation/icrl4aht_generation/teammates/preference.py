@@ -18,7 +18,7 @@ from typing import Any
 
 from icrl4aht_data.benchmark.facts import PLAIN, PREFERENCE, PREFERENCE_LAYOUTS
 from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
-from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
+from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_generation.teammates.heuristics.territory import LAZY, TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_teammate
 from icrl4aht_generation.teammates.registry import sample_teammate
@@ -81,9 +81,7 @@ def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
     for instance in range(INSTANCES):
         for family in TESTED_FAMILIES:
             if split == "test":
-                # All layouts but cramped_down have the same published parameters.
-                published = layout.name.removesuffix(PLAIN)
-                found.append(published_teammate(published if published in LAYOUTS else "demo_wide", family, instance))
+                found.append(published_teammate(layout.name.removesuffix(PLAIN), family, instance))
             else:
                 found.append(sample_teammate(family, instance, "diverse", _DRAWS[split]))
         found += [] if split == "train" else [WATCHER]

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import msgspec
 import numpy as np
 
 from icrl4aht_data.benchmark.facts import TEAMMATE_PLUGINS
 from icrl4aht_data.dataset import Dataset
-from icrl4aht_data.errors import OptionError, TaskFormatError, unknown
+from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unknown
 from icrl4aht_data.format.schema import TEAMMATES
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -40,8 +41,7 @@ def heuristic_teammate(family: str, preset: str, theta_id: int) -> dict[str, Any
         UnknownNameError: for a family or preset that does not exist.
     """
     heuristic = _family(family)
-    if preset not in heuristic.presets:
-        raise unknown(f"preset of {family}", preset, heuristic.presets)
+    check_choice(f"preset of {family}", preset, heuristic.presets)
     theta = heuristic.defaults | heuristic.presets[preset]
     return {"kind": "heuristic", "family": family, "theta_id": theta_id, "base_seed": 0, "theta": theta}
 
@@ -67,8 +67,7 @@ def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) 
     heuristic = _family(family)
     samplings = {"train": heuristic.train, "test": heuristic.test}
     samplings |= {"diverse": heuristic.diverse} if heuristic.diverse else {}
-    if split not in samplings:
-        raise unknown("split", split, samplings)
+    check_choice("split", split, samplings)
     presets, ranges = samplings[split]
     # A hash, because a draw must depend neither on the order of draws nor on Python's own salted hashes.
     digest = hashlib.sha256(f"{family}:{theta_id}:{split}:{base_seed}".encode()).hexdigest()
@@ -163,22 +162,17 @@ def check_theta(teammate: dict[str, Any]) -> None:
 
     Raises:
         UnknownNameError: for a family that does not exist.
-        TaskFormatError: names the parameters, what was found and what was expected.
+        TaskFormatError: names the parameter, what was found and what was expected.
     """
-    heuristic, theta = _family(teammate["family"]), teammate["theta"]
-    names = set(heuristic.defaults)
-    if set(theta) - {RANDOM_ACTIONS} != names:
+    theta, kind = teammate["theta"], _family(teammate["family"]).theta_type
+    try:
+        msgspec.convert(theta, kind)
+    except msgspec.ValidationError as error:
+        problem = str(error).replace("Expected", "expected")
         raise TaskFormatError(
-            f"teammate {teammate['family']}: missing parameters {sorted(names - set(theta))}, "
-            f"unknown parameters {sorted(set(theta) - names - {RANDOM_ACTIONS})}"
-        )
-    wrong = [
-        f"{name} = {value!r} (expected {heuristic.describe(name)})"
-        for name, value in theta.items()
-        if not heuristic.is_valid(name, value)
-    ]
-    if wrong:
-        raise TaskFormatError(f"teammate {teammate['family']}: out of range: {', '.join(wrong)}")
+            f"teammate {teammate['family']}: parameters: {problem}; expected {', '.join(kind.__struct_fields__)}, the "
+            f"last one optional, found {theta!r:.500}"
+        ) from error
 
 
 def _family(name: str) -> Heuristic:

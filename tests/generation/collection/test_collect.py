@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from icrl4aht_generation.collection import job as collection_job
 from icrl4aht_generation.collection import task as collect
-from icrl4aht_generation.collection.record import array_shapes
 from icrl4aht_generation.collection.task_folder import (
     LEARNER,
     METADATA,
     METRICS,
     ArtefactWriter,
     DiskFullError,
+    array_shapes,
     partial_folder,
 )
 from icrl4aht_generation.learners.resume import StateFile

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_generation.collection import curate, record
+from icrl4aht_generation.collection import curate
+from icrl4aht_generation.collection.task_folder import HistoryArrays, array_shapes, record_rollout
 from icrl4aht_generation.learners.config import PPOConfig, Widths
 from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.rollout import Rollout
@@ -32,9 +33,9 @@ def make_config(length: int, updates: int) -> PPOConfig:
     return PPOConfig(total_steps=ENVS * length * updates, environments=ENVS, rollout=length, minibatches=1)
 
 
-def empty_histories(config: PPOConfig) -> record.HistoryArrays:
-    shapes = record.array_shapes(LAYOUT, config.environments, config.episodes)
-    return record.HistoryArrays(**{name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()})
+def empty_histories(config: PPOConfig) -> HistoryArrays:
+    shapes = array_shapes(LAYOUT, config.environments, config.episodes)
+    return HistoryArrays(**{name: np.full(shape, UNTOUCHED, dtype) for name, (shape, dtype) in shapes.items()})
 
 
 def random_rollouts(length: int, updates: int) -> list[Rollout]:
@@ -53,7 +54,7 @@ def random_rollouts(length: int, updates: int) -> list[Rollout]:
     return [one() for _ in range(updates)]
 
 
-def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> record.HistoryArrays:
+def kept_by_loop(rollouts: list[Rollout], config: PPOConfig) -> HistoryArrays:
     """Keep one step of one environment at a time: the first 100 of each 400, and the state after them."""
     kept = empty_histories(config)
     for update, rollout in enumerate(rollouts):
@@ -82,7 +83,7 @@ def test_recording_equals_a_loop_over_steps(length, updates):
     expected = kept_by_loop(rollouts, config)
     found = empty_histories(config)
     for number, rollout in enumerate(rollouts):
-        record.record_rollout(found, number, rollout)
+        record_rollout(found, number, rollout)
     for name, array in expected._asdict().items():
         assert array.size and not (array == UNTOUCHED).any(), name  # every entry is filled
         np.testing.assert_array_equal(getattr(found, name), array, err_msg=name)
@@ -94,9 +95,9 @@ def test_recording_is_idempotent_and_independent_of_order():
     rollouts = random_rollouts(96, 9)
     once, again = empty_histories(config), empty_histories(config)
     for number, rollout in enumerate(rollouts):
-        record.record_rollout(once, number, rollout)
+        record_rollout(once, number, rollout)
     for number in (4, 8, 4, 1, 0, 2, 3, 5, 6, 7, 1):
-        record.record_rollout(again, number, rollouts[number])
+        record_rollout(again, number, rollouts[number])
     for name, array in once._asdict().items():
         np.testing.assert_array_equal(getattr(again, name), array, err_msg=name)
 

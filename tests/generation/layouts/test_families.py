@@ -19,10 +19,9 @@ from icrl4aht_generation.layouts import (
     split_of,
 )
 from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS
-from icrl4aht_generation.layouts.fixtures import FREE_COUNTERS
+from icrl4aht_generation.layouts.fixtures import FREE_COUNTERS, faced_cells
 from icrl4aht_generation.layouts.grids import agent_rooms, grid_of, symmetric_images
 from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
-from icrl4aht_generation.layouts.solvable import faced_cells
 from icrl4aht_generation.layouts.templates import has_tested_rooms, published_rooms
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS

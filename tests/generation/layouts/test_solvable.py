@@ -6,8 +6,8 @@ import re
 
 import pytest
 from icrl4aht_generation.layouts import check_solvable
+from icrl4aht_generation.layouts.fixtures import faced_cells, is_easy, waiting_cells
 from icrl4aht_generation.layouts.grids import agent_rooms, grid_of
-from icrl4aht_generation.layouts.solvable import faced_cells, is_easy, waiting_cells
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout

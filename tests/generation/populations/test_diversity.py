@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.populations import diversity
-from icrl4aht_generation.populations.diversity import actions_on_common_states, family_distances
+from icrl4aht_generation.populations import build
+from icrl4aht_generation.populations.build import actions_on_common_states, family_distances
 from icrl4aht_generation.teammates.distances import hamming_distances
 
 from icrl4aht_data.overcooked.actions import TEAMMATE
@@ -60,10 +60,10 @@ def actions(every_program_is_kept) -> np.ndarray:
 @pytest.fixture(scope="module")
 def records(every_program_is_kept) -> jax.Array:
     """(T, episodes, S) of random agents."""
-    env = diversity.Environment(LAYOUT, STEPS)
-    players = [diversity.random_player(agent, 3) for agent in (0, 1)]
-    carry = diversity.init_rollout(env, players, jax.random.split(jax.random.key(0), 3))
-    play = jax.jit(lambda carry: diversity.roll_out(env, players, carry, STEPS, jax.random.key(1))[1].record)
+    env = build.Environment(LAYOUT, STEPS)
+    players = [build.policy_player(env, build.REFERENCE_EGOS["random"], (), agent, 3) for agent in (0, 1)]
+    carry = build.init_rollout(env, players, jax.random.split(jax.random.key(0), 3))
+    play = jax.jit(lambda carry: build.roll_out(env, players, carry, STEPS, jax.random.key(1))[1].record)
     return play(carry)
 
 
@@ -103,7 +103,7 @@ def test_identical_policies_have_distance_0_and_others_do_not(actions):
 @pytest.mark.slow
 def test_policies_observe_as_the_teammate_with_a_memory(records, monkeypatch):
     """Against a loop over the same states: counted from each episode's start, seen as the teammate sees it."""
-    monkeypatch.setattr(diversity, "_play", lambda env, numbers, family, key: records)
+    monkeypatch.setattr(build, "_visited_records", lambda env, numbers, family, key: records)
     found = actions_on_common_states(LAYOUT, [policy(2), policy(1, by_state)], steps=STEPS)
     repeated = np.concatenate([records, records], axis=1)  # once for either family
     seen = observe(LAYOUT, repeated, TEAMMATE).sum(axis=(2, 3, 4))

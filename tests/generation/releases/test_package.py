@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from icrl4aht_generation.collection.curate import oracle_labels
-from icrl4aht_generation.collection.record import HistoryArrays
-from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA
+from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA, HistoryArrays
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.releases import measures
 from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unhosted_families
@@ -129,7 +128,7 @@ def test_streams_of_both_learners_that_rise_are_kept(two_learners, profile, tmp_
 def test_no_oracle_actions_where_the_oracle_earns_less_than_the_end(two_learners, profile, tmp_path):
     task_id, references = two_learners[0].task.task_id, MATTERS.references
     assert references is not None
-    facts = MATTERS._replace(references=replace(references, oracle=-1000.0))
+    facts = MATTERS._replace(references=replace_fields(references, oracle=-1000.0))
     dataset = load_icrl4aht(pack(tmp_path, replace(profile, oracle_actions=True), two_learners, {task_id: facts}))
     assert dataset.counts("label_view") == {"ego": len(dataset)}
     assert not dataset.has_labels("oracle").any()

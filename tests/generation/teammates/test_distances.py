@@ -13,11 +13,11 @@ from icrl4aht_generation.teammates.distances import (
     common_states,
     distances_to_tests,
     group_behaviours,
+    measure_draws,
     nearest_test,
 )
 from icrl4aht_generation.teammates.draws import read_draws
 from icrl4aht_generation.teammates.instances import published_thetas
-from icrl4aht_generation.teammates.measuring import measure_draws
 from icrl4aht_generation.teammates.references import reference_returns
 from icrl4aht_generation.teammates.registry import build_teammate
 from msgspec.structs import replace

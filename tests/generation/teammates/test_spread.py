@@ -201,5 +201,5 @@ def test_a_mixture_with_fixed_noise_repeats_every_episode():
 
 def test_impossible_chances():
     entry = WATCHER | {"theta": WATCHER["theta"] | {RANDOM_ACTIONS: 1.5}}
-    with pytest.raises(TaskFormatError, match=r"random_actions = 1.5 \(expected a number in 0..1\)"):
+    with pytest.raises(TaskFormatError, match=r"expected `float` <= 1.0 - at `\$.random_actions`"):
         check_theta(entry)

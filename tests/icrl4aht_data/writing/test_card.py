@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from msgspec.structs import replace as replace_fields
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
@@ -140,9 +141,9 @@ def test_teammates_that_act_like_the_test_are_named(write):
 
 def test_teammates_without_a_measured_distance(write):
     tasks = four_tasks()
-    tasks[1] = (tasks[1][0], replace(tasks[1][1], nearest_test=None), tasks[1][2])
+    tasks[1] = (tasks[1][0], replace_fields(tasks[1][1], nearest_test=None), tasks[1][2])
     assert write(tasks)["tested"] == [], "the same teammate was measured in another task"
-    tasks[3] = (tasks[3][0], replace(tasks[3][1], nearest_test=None), tasks[3][2])
+    tasks[3] = (tasks[3][0], replace_fields(tasks[3][1], nearest_test=None), tasks[3][2])
     content = write(tasks)
     assert content["tested"] == ["H1"] and not content["untested"]
 
@@ -164,7 +165,13 @@ def test_the_stream_filter_is_stated_by_layout(write):
     before = StreamReturns(128, 1.0, 2.0)
     least = {"demo_wide": 5.0, "coord_simple": None}
     tasks = [
-        (task, replace(of, streams_recorded=128, streams_kept=1, filter=StreamFilter(before, before, least[name])), own)
+        (
+            task,
+            msgspec.structs.replace(
+                of, streams_recorded=128, streams_kept=1, filter=StreamFilter(before, before, least[name])
+            ),
+            own,
+        )
         for task, of, own in four_tasks()
         for name in [task.layout.name]
     ]

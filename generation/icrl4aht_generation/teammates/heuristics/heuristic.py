@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
-from numbers import Real
-from typing import Any, NamedTuple
+from functools import cached_property, lru_cache
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import msgspec
 from jaxtyping import Array, Bool, Float, Int, Key
+from msgspec import Meta
 
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
+from icrl4aht_data.utils.options import Share
 from icrl4aht_generation.paths import Scene
 from icrl4aht_generation.policy import Noise, Policy, Situation, on_layout, sometimes_random
 
@@ -52,7 +53,7 @@ class Heuristic:
         test: the one for test tasks.
         spans: parameter -> full range; sampling moves these by up to a fifth of their range from the preset.
         choices: parameter -> n, for parameters that are one of 0..n-1.
-        unbounded: parameters without an upper limit; all others are in 0..1, or choices.
+        unbounded: parameters with no other limit than that of 32 bits; all others are in 0..1, or choices.
         diverse: distribution of all parameters that decide how a teammate acts, most of which the published ranges
             leave at their defaults. It is not the paper's; None for a family without diverse
             teammates.
@@ -92,24 +93,15 @@ class Heuristic:
         policy = Policy(params, init, act, "situation")
         return policy if layout is None else on_layout(policy, layout)
 
-    def is_valid(self, name: str, value: Any) -> bool:
-        """Return whether a parameter may have this value."""
-        if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
-            return False
-        # JSON has no integers of its own: 2.0 is a valid value of an integer parameter.
-        integral = isinstance(self.defaults.get(name, 0.0), float) or float(value).is_integer()
-        return integral and 0 <= float(value) <= self._highest(name)
-
-    def describe(self, name: str) -> str:
-        """Return the valid values of a parameter in words, such as "a number in 0..1"."""
-        kind = "an integer" if isinstance(self.defaults.get(name, 0.0), int) else "a number"
-        highest = self._highest(name)
-        return f"{kind} from 0" if math.isinf(highest) else f"{kind} in 0..{highest:g}"
-
-    def _highest(self, name: str) -> float:
-        if name in self.choices:
-            return self.choices[name] - 1
-        return math.inf if name in self.unbounded else 1.0
+    @cached_property
+    def theta_type(self) -> type[msgspec.Struct]:
+        """Type of the parameters, which `msgspec.convert` checks: all of `defaults`, and perhaps `RANDOM_ACTIONS`."""
+        most = {name: number - 1 for name, number in self.choices.items()} | dict.fromkeys(self.unbounded, 2**31 - 1)
+        fields = [
+            (name, Annotated[type(default), Meta(ge=0, le=most.get(name, 1))])
+            for name, default in self.defaults.items()
+        ]
+        return msgspec.defstruct(self.kind, [*fields, (RANDOM_ACTIONS, Share, 0.0)], forbid_unknown_fields=True)
 
 
 def parameters(presets: Sequence[str], rows: Mapping[str, tuple[Any, ...]]) -> dict[str, Any]:
