@@ -181,7 +181,9 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
         seed: the learner's seed.
         source: how the histories were made, see `Entry.source`.
         learners: number of independent learners, each with `ego["environments"]` streams; None for a script.
-        noise: settings of the schedules of noise histories: numbers, or ranges [least, most] to draw from.
+        noise: settings of noise histories: numbers of `histories` and `episodes`, and ranges [least, most] that each
+            history draws from: the chance of a random action at the `start` and the `end`, the shares of the history at
+            which its fall begins and ends (`begin`, `finish`), the exponent of the fall (`power`).
         references: returns of reference egos.
         nearest_test: the test teammate that acts most like this one.
         teammate: the teammate's agent `slot` and the source of its `noise`.
@@ -191,7 +193,9 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
         expert: the policy that produced the expert actions.
         suite: the populations that a learned teammate was selected from.
         swaps: changes of the teammate within each history; None if the task's teammate plays all episodes.
-        other: unknown fields, kept unchanged.
+        other: further fields, kept unchanged. Histories of people have `person`: `pseudonym`; `views`, what was shown
+            in each episode ("ego", the cells that an ego sees, or "whole", the map with the recipe);
+            `steps_per_second`.
     """
 
     profile: str | None = None

@@ -181,17 +181,20 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         seed: the learner's seed; -1 if the task is unknown.
         episodes: number of finished episodes.
         score: end + (end - start), see `curve_ends` (paper, App. F.1).
-        return_start: mean return of the first episodes.
-        return_end: mean return of the last episodes.
+        return_start: mean return of the first max(5, episodes // 10) episodes.
+        return_end: mean return of as many last episodes.
         return_mean: mean return of all episodes.
-        source: how the history was made: a name in `facts.SOURCES`, or another one.
+        source: how the history was made: "ppo" (an ego learned), "noise" (a script played, and its random actions
+            became rarer), "agent" (a trained agent played), "search" (a script found out which dish earns a reward),
+            "human" (a person played), or another name.
         expert_return: mean return of the expert's greedy actions with the task's teammate, over 200 episodes of 100
             steps (a script: `ExpertLabels.episodes`); None if not measured. Equal for all histories of a task.
         expert_return_sampled: mean return of the expert's sampled actions.
         expert_step: environment steps that the expert was trained for; None for a script or if unknown.
-        learner: number of the independent learner that made the history, from 0.
+        learner: number of the independent learner that made the history, from 0; with `env_idx` it names a stream.
         has_oracle_actions: whether the release stores `oracle_actions` of the history; see `stored_field`.
-        label_view: what the policy behind `expert_actions` could see: a name in `facts.LABEL_VIEWS`; None if unknown.
+        label_view: what the policy behind `expert_actions` could see: "ego" (what an ego sees) or "state" (the full
+            state; a searcher: all but the wanted dish); None if unknown.
         teammate_of_episode: pairs (episode, id) in ascending order: from this episode on, the teammate with this
             `tasks.teammate_id` played, until the next pair's. None if the task's teammate played all episodes.
     """

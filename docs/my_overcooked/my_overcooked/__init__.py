@@ -1,0 +1,1 @@
+"""A layout, a teammate and a method of another package, see docs/extending.md."""
