@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines import experiments
 from icrl4aht_baselines.evaluate import protocols
 from icrl4aht_baselines.evaluate.results import read_result
@@ -34,11 +33,11 @@ from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import Checkpoints
 
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import EmptySelectionError, LabelsMissingError, OptionError, UnknownNameError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
+from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
 
 MODEL: dict[str, Any] = {"layers": 1, "width": 8, "heads": 2}
@@ -224,8 +223,8 @@ def test_commands_pass_their_options_on(release, tmp_path, monkeypatch):
         "ablate ta --method ad --layout cramped_up --only ta",
         "tracks --size tiny --layout all --channels own",
     ):
-        result = CliRunner().invoke(cli, f"research {command} {small}", catch_exceptions=False)
-        assert result.exit_code == 0 and "left out: nothing" in result.output, result.output
+        printed = run_cli(f"research {command} {small}")
+        assert "left out: nothing" in printed
     (name, plan, out), (other, tracks, folder) = calls
     assert (name, out, other, folder) == ("ablate ta", Path("runs/ablate-ta"), "tracks", Path("runs/tracks"))
     assert (plan.size, tracks.size) == ("small", "tiny")
@@ -286,8 +285,7 @@ def suite(tmp_path_factory) -> Path:
 def test_held_out_teammates_are_played_and_reported(release, suite, tmp_path):
     command = f"research heldout-rl --suite {suite} --method ad --layout cramped_up --root {release} --out {tmp_path} "
     command += "--steps 1 --context 8 --batch-size 2 --tasks 1 --episodes 2 --layers 1 --width 8 --heads 2"
-    result = CliRunner().invoke(cli, command, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    run_cli(*command)
     assert "AD,0,seeded,,cramped_up,rl,held out," in (tmp_path / "report" / "report.csv").read_text()
     page = (tmp_path / "report" / "report.html").read_text()
     assert "cramped_up, learned (held out)" in page
@@ -337,7 +335,6 @@ def test_invalid_plans(release, tmp_path):
     learned: dict[str, Any] = {"root": None, "histories": {"teammate_family": ("rl",)}, "layouts": ("coord_simple",)}
     absent = "no training histories of teammate_family rl on coord_simple; it has asymm_both, coord_ring, cramped_up"
     fails(EmptySelectionError, absent, **learned)
-    result = CliRunner().invoke(cli, ["research", "sweep", "context", "--context", "9"])
-    assert "context = 9: `sweep context` sets it; choose by --only, such as K250" in str(result.exception)
-    result = CliRunner().invoke(cli, ["research", "sweep", "sizes"])
-    assert "unknown sweep 'sizes'; valid: context, size. Did you mean 'size'" in result.output
+    with pytest.raises(OptionError, match="context = 9: `sweep context` sets it; choose by --only, such as K250"):
+        run_cli("research sweep context --context 9")
+    assert "unknown sweep 'sizes'; valid: context, size. Did you mean 'size'" in run_cli("research sweep sizes", code=2)

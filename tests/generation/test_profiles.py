@@ -61,7 +61,9 @@ def test_names_are_the_shipped_files():
     assert {"mini", "paper", "smoke"} <= set(profile_names())
 
 
-@pytest.mark.parametrize("name", profile_names())
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "teach")) for name in profile_names()]
+)
 def test_shipped_profiles_load(name):
     profile = load_profile(name)
     assert profile.name == name

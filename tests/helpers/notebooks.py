@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -19,8 +19,13 @@ from tests.helpers.paths import ROOT
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 
-def execute(path: Path, folder: Path, timeout: float = 1800) -> Any:
+def execute(path: Path, folder: Path, changes: Mapping[str, str] | None = None) -> Any:
     """Return a notebook with the outputs of a new kernel that runs in a folder.
+
+    Args:
+        path: the notebook.
+        folder: working folder of the kernel.
+        changes: texts of cells -> texts to execute in place of them.
 
     Raises:
         CellExecutionError: if a cell fails.
@@ -29,10 +34,13 @@ def execute(path: Path, folder: Path, timeout: float = 1800) -> Any:
     from nbclient import NotebookClient
 
     notebook = nbformat.read(path, as_version=4)
+    for cell in notebook.cells:
+        for old, new in (changes or {}).items():
+            cell.source = cell.source.replace(old, new)
     variables = {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     with mock.patch.dict(os.environ, variables):
         client = NotebookClient(
-            notebook, timeout=timeout, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+            notebook, timeout=1800, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
         )
         return client.execute()
 

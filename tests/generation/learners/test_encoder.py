@@ -39,7 +39,7 @@ def with_gradient(module: WindowEncoder) -> Any:
     return jax.jit(jax.grad(total, has_aux=True))
 
 
-@pytest.mark.parametrize("kind", ["words", "mlp"])
+@pytest.mark.parametrize("kind", ["words", pytest.param("mlp", marks=pytest.mark.slow)])
 def test_compact_inputs_give_the_results_of_observations(kind):
     obs = jnp.asarray(observe(LAYOUT, RECORDS, 0))
     view = CompactView(kind, (LAYOUT,))
