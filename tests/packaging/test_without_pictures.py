@@ -7,7 +7,6 @@ import sys
 
 import pytest
 from icrl4aht_baselines.demo import run_demo
-from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.build import build_releases
 from rich.console import Console
@@ -33,10 +32,9 @@ def missing(request, monkeypatch) -> str:
     "work",
     [
         lambda out: run_demo(out, CONSOLE),
-        lambda out: run_experiment("tracks", ExperimentPlan(), out),
         lambda out: build_releases(SMOKE, out, ("lite",), CONSOLE),
     ],
-    ids=["demo", "experiment", "releases"],
+    ids=["demo", "releases"],
 )
 def test_work_with_pictures_is_refused_at_once(missing, work, tmp_path):
     with pytest.raises(OptionError, match=f"drawing needs matplotlib and Pillow: {HINT}"):
