@@ -15,7 +15,7 @@ LogCurves = dict[str, dict[str, dict[int, list[float]]]]
 """Panel -> curve -> training step -> values."""
 
 _RETURN = "return"
-"""First word of the names of returns in a log, "return <layout> [<variant>] <kind of teammate>"."""
+"""First word of the names of returns in a log, "return <layout> [rearranged] <kind of teammate>"."""
 
 
 def plot_training_log(metrics: Path, path: Path, title: str) -> None:

@@ -68,8 +68,6 @@ EGO_NAME = Names("agent", lambda: import_module("icrl4aht_baselines.agents.egos"
 """Name of a reference ego, or folder of a run; checked by `find_ego`."""
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], checked_later)
 METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())
-_HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
-_playing = lazy_attribute("icrl4aht_baselines.methods.registry", "PLAYING")
 REFERENCE_NAME = Names("reference model", lazy_attribute("icrl4aht_baselines.reference", "RECIPES"))
 HISTORIES_NAME = Names("kind of histories", lazy_attribute("icrl4aht_baselines.reference", "RL2_HISTORIES"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "PROTOCOLS"))
@@ -125,12 +123,6 @@ tasks_options = (
 )
 """Options that choose tasks; `chosen_tasks` takes their values."""
 
-evaluation_split_option = click.option(
-    "--split",
-    type=EVALUATION_SPLIT,
-    help="Which tasks: test, or validation and diverse, by which models are chosen.",
-    show_default="test",
-)
 tasks_option = click.option(
     "--tasks", type=COUNT, help="Most tasks of each cell, a layout with a teammate family: 2 are two a cell."
 )
@@ -280,7 +272,7 @@ def prepare_training(
         played = job.about["histories"]
         text = (
             f"{method}: layers {sized.recurrent_layers}, width {sized.width}, encoder {sized.encoder}, steps "
-            f"{options.steps}, in each {job.trainer.tasks} tasks of {job.trainer.play.episodes} episodes\nplaying on "
+            f"{options.steps}, each an episode of {job.trainer.tasks} tasks\nplaying on "
             f"{', '.join(played['layouts'])}, canonical channels, with the teammates of {len(played['groups'])} "
             f"families and layouts"
         )
@@ -343,81 +335,3 @@ def join_processes(coordinator: str | None, processes: int, process: int) -> Non
         raise click.UsageError(f"--process {process}: expected a number below {processes}")
     if coordinator:
         jax.distributed.initialize(coordinator, processes, process)
-
-
-def variant_names(command: str) -> Names:
-    """Return the type of an experiment's second word, such as `size` in `sweep size`."""
-    experiments = lazy_attribute("icrl4aht_baselines.experiments", "EXPERIMENTS")
-    prefix = f"{command} "
-    return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
-
-
-_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "first", "mirror", "hide_recipe")
-
-
-def experiment_options(out: str) -> Callable[[Any], Any]:
-    """Return a decorator with the options of all experiments; `out` is shown as the default folder."""
-    options = [
-        click.option(
-            "--method",
-            "methods",
-            type=_HISTORY_METHOD,
-            multiple=True,
-            help="ad, dpt, hybrid_ad or amago_offline; repeat for several.",
-            show_default="ad and dpt",
-        ),
-        click.option(
-            "--layout",
-            "layouts",
-            type=TRAINING_LAYOUT,
-            multiple=True,
-            help="Training layout, such as demo_wide; repeat for several models, or all: one model of all layouts.",
-            show_default="the paper's that the release has",
-        ),
-        root_option,
-        click.option(
-            "--only",
-            "values",
-            metavar="SETTING",
-            multiple=True,
-            help="Only this setting, such as K250, medium or ta; repeat for several.",
-        ),
-        click.option(
-            "--family",
-            "families",
-            type=FAMILY,
-            multiple=True,
-            help="Evaluate only with teammates of this family, such as H4; repeat for several.",
-        ),
-        click.option(
-            "--size",
-            type=_SIZE_NAME,
-            help="tiny, for a CPU, or the paper's small, medium or large; not with `sweep size`, which varies it.",
-            show_default="small, as in the paper",
-        ),
-        dataclass_options(HistoryOptions, "histories", exclude=_NOT_IN_EXPERIMENTS),
-        evaluation_split_option,
-        tasks_option,
-        episodes_option,
-        seeds_option,
-        protocol_option,
-        click.option("--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"),
-        gifs_option,
-        click.option("--out", type=Folder(), metavar="FOLDER", help="Write runs and report here.", show_default=out),
-        dataclass_options(
-            TrainOptions,
-            "train",
-            default_text={
-                "steps": "the paper's",
-                "batch_size": _PAPER_OR_CPU,
-                "context": "500; varied by `sweep context`",
-            },
-        ),
-        dataclass_options(
-            ModelOptions,
-            "model",
-            default_text={"layers": "4; varied by `sweep size`", "width": "256; varied by `sweep size`"},
-        ),
-    ]
-
-    return lambda command: add_options(command, options)

@@ -88,8 +88,7 @@ def prepare_play(
     method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
     hidden = [get_layout(one).name for one in histories.hide_recipe]
     groups, played = _groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
-    teachers: dict[str, Labels] = {"oracle": "oracle", "search": "expert"}  # as histories have labels of these scripts
-    labels = teachers[play.teacher] if play.imitation else None
+    labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
         "play": asdict(play),

@@ -1,16 +1,14 @@
 """Training of RL^2 (Duan et al. 2016): PPO on episodes that the model plays with the teammates of a release.
 
-A step plays one or more episodes of every task, then learns from all of them. After these a task continues with the
-model's recurrent state, or ends by chance; a new task with the same teammate then begins. Returns include the rewards
-of later episodes, so the model is rewarded for exploration that helps later. Gradients pass through all episodes of a
-step: with several, the model learns to keep what a later episode needs.
+A step plays one episode of every task, then learns from all of them. After an episode a task continues with the model's
+recurrent state, or ends by chance; a new task with the same teammate then begins. Returns include the rewards of later
+episodes, so the model is rewarded for exploration that helps later.
 
-Learning starts from imitation: the loss contains the cross-entropy of a script's actions in the states that the model
-visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The scripted oracle
-knows what the model has to find out, so imitation alone is not the goal. The searcher does not know which dish is
-wanted: it judges by what the model delivered in the task so far, and shows how to find out.
+Learning starts from imitation: the loss contains the cross-entropy of the scripted oracle's actions in the states that
+the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The
+oracle knows what the model has to find out, so imitation alone is not the goal.
 
-Shapes: `B` tasks, `E` episodes of a step, `T` steps of all of these, `S` size of the recurrent state.
+Shapes: `B` tasks, `T` steps of an episode, `S` size of the recurrent state.
 """
 
 from __future__ import annotations
@@ -26,9 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from icrl4aht_generation.collection.curate import follow_script
-from icrl4aht_generation.experts.oracle import oracle
-from icrl4aht_generation.experts.search import searcher
+from icrl4aht_generation.collection.curate import follow_oracle
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.ppo import PPO, Sequences, ppo_optimizer
 from icrl4aht_generation.learners.rollout import select_rows
@@ -60,14 +56,12 @@ class PlayerMemory(NamedTuple):
         state: float32 (S,), its recurrent state.
         started: bool (), whether a step of the task was played; before it the outcome of the previous step is zero.
         partner: int32 (), number of the teammate, for a model that is told; None for others.
-        teacher: memory of the script that is imitated, if it remembers the task; None otherwise.
     """
 
     change: ViewChange
     state: Float[Array, " S"]
     started: Bool[Array, ""]
     partner: Int[Array, ""] | None = None
-    teacher: Any = None
 
 
 class PlayState(NamedTuple):
@@ -186,23 +180,13 @@ class _Player:
             np.array([number[layout] for layout in played]) if several else None,
         )
         self.mates = self.rollout.teammate_params
-        self._remembers = play.teacher == "search"
-        self._teacher = (searcher if self._remembers else oracle)(self.rollout.layout)
-        self.compiled: Any = jax.jit(self.episodes)
+        self.compiled: Any = jax.jit(self.episode)
 
     def start(self, key: Key[Array, ""]) -> RolloutState:
         """Return the state before the first episode of all tasks."""
         env_key, change_key = jax.random.split(key)
         state = self.rollout.start(jax.random.split(env_key, self.tasks))
-        drawn, teacher = self._draw_change(change_key), self._new_teacher(key)
-        return state._replace(ego=state.ego._replace(change=drawn, partner=self._partners, teacher=teacher))
-
-    def _new_teacher(self, key: Key[Array, ""]) -> Any:
-        """Return the script's memories before a task, leaves (B, ...); None for a script that remembers no task."""
-        if not self._remembers:
-            return None
-        keys = jax.random.split(jax.random.fold_in(key, 1), self.tasks)
-        return jax.vmap(self._teacher.init, in_axes=(None, 0))(self._teacher.params, keys)
+        return state._replace(ego=state.ego._replace(change=self._draw_change(change_key), partner=self._partners))
 
     def _draw_change(self, key: Key[Array, ""]) -> ViewChange:
         change = no_change(self.tasks)._replace(hidden=jnp.asarray(self._hidden))
@@ -211,48 +195,22 @@ class _Player:
         upside_down, sideways = jax.random.bernoulli(key, 0.5, (2, self.tasks))
         return change._replace(upside_down=upside_down, sideways=sideways)
 
-    def episodes(
+    def episode(
         self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
-    ) -> tuple[RolloutState, Sequences, Float[Array, "B E"]]:
-        """Return the state after the next episodes of every task, these episodes for learning, and their returns."""
+    ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
+        """Return the state after one episode of every task, the episode for learning, and its returns."""
         change_key, end_key = jax.random.split(key)
-
-        def episode(state: RolloutState, _: None) -> tuple[RolloutState, tuple[EpisodeBatch, Array]]:
-            after, played = self.rollout.episode(params, mates, state)
-            # The script acts in the environment's view; its actions are learned in the model's.
-            expert, teacher = follow_script(
-                self._teacher,
-                self.rollout.layout,
-                jnp.swapaxes(played.record, 0, 1),
-                jnp.swapaxes(played.actions[..., EGO], 0, 1),
-                state.env.layout,
-                state.ego.teacher,
-            )
-            ego = after.ego._replace(teacher=teacher if self._remembers else None)
-            return after._replace(ego=ego), (played, expert)
-
-        after, (played, expert) = jax.lax.scan(episode, state, length=self._play.episodes)
-        returns = jnp.swapaxes(played.reward.sum(axis=-1), 0, 1)
-        # The episodes of a task follow one another: (E, B, 100, ..) to (B, E * 100, ..).
-        joined = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:]), played)
+        after, played = self.rollout.episode(params, mates, state)
         ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
-        learned = self._sequences(params, state, after, joined, expert.reshape(-1, self.tasks), ended)
+        sequences = self._sequences(params, state, after, played, ended)
         # Where a task ends, a new one begins with the same teammate: another view, an empty state, no previous step.
         begun = select_rows(ended, self._draw_change(change_key), after.ego.change)
-        teacher = select_rows(ended, self._new_teacher(key), after.ego.teacher) if self._remembers else None
-        own = jnp.where(ended[:, None], 0.0, after.ego.state)
-        memory = PlayerMemory(begun, own, ~ended, state.ego.partner, teacher)
+        memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended, state.ego.partner)
         before = select_rows(ended, no_outcome(self.tasks), after.before)
-        return RolloutState(after.env, memory, before), learned, returns
+        return RolloutState(after.env, memory, before), sequences, played.reward.sum(axis=-1)
 
     def _sequences(
-        self,
-        params: Any,
-        state: RolloutState,
-        after: RolloutState,
-        played: EpisodeBatch,
-        expert: Int[Array, "T B"],
-        ended: Bool[Array, " B"],
+        self, params: Any, state: RolloutState, after: RolloutState, played: EpisodeBatch, ended: Bool[Array, " B"]
     ) -> Sequences:
         env, change = self.rollout.env, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
@@ -268,20 +226,20 @@ class _Player:
             partner=None if state.ego.partner is None else jnp.tile(state.ego.partner, (len(record) + 1, 1)),
         )
         if self._changes:
-            # Only the first of these steps can be a task's first one.
+            # Only the first step of an episode can be a task's first one.
             started = jnp.ones((len(record) + 1, self.tasks), bool).at[0].set(state.ego.started)
             seen = seen_steps(change.at_each_step(len(record) + 1, 0), steps, started)
         else:
             seen = steps
-        # A second pass over the episodes gives log-probabilities and values by the operations of the loss, and the
-        # value of the step after the last.
+        # A second pass over the episode gives log-probabilities and values by the operations of the loss, and the value
+        # of the step after the last.
         _, logits, value = _Network(self._method.model).apply(params, state.ego.state, seen)
         own = change.at_each_step(len(record), 0)
         action = own.actions(taken)
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits[:-1]), action[..., None], axis=-1)[..., 0]
         return Sequences(
             seen=jax.tree.map(lambda leaf: leaf[:-1], seen),
-            reset=jnp.zeros(reward.shape, bool),  # the recurrent state is never reset within a task
+            reset=jnp.zeros(reward.shape, bool),  # the recurrent state is never reset within an episode
             action=action,
             log_prob=log_prob,
             value=value[:-1],
@@ -292,7 +250,8 @@ class _Player:
             partner=jnp.zeros((1, self.tasks), jnp.int32),  # one value function for all teammates
             weight=jnp.ones((1, self.tasks)),
             last_value=value[-1][None],
-            expert=own.actions(expert),
+            # The oracle acts in the environment's view; its actions are learned in the model's.
+            expert=own.actions(follow_oracle(self.rollout.layout, record, taken, state.env.layout)),
         )
 
 
@@ -376,9 +335,9 @@ class PlayTrainer:
         # Minibatches have equal sizes: a pass leaves out up to minibatches - 1 tasks, others in each pass.
         learned = self.tasks - self.tasks % play.minibatches
         config = PPOConfig(
-            total_steps=options.steps * learned * play.episodes * KEPT_STEPS,
+            total_steps=options.steps * learned * KEPT_STEPS,
             environments=learned,
-            rollout=play.episodes * KEPT_STEPS,
+            rollout=KEPT_STEPS,
             epochs=play.epochs,
             minibatches=play.minibatches,
             learning_rate=options.learning_rate,
@@ -416,15 +375,15 @@ class PlayTrainer:
         return []
 
     def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:
-        """Play the next episodes of every task and learn from them; return the state after it and what to log."""
+        """Play one episode of every task and learn from them; return the state after it and the numbers to log."""
         # Keys are functions of the seed and the step's number, so that a resumed run plays the same episodes.
         play_key, learn_key = jax.random.split(jax.random.fold_in(jax.random.key(self.options.seed + 1), number))
         keys = jax.random.split(play_key, len(self.players))
         if self._compiled is None:
             self._compiled = self._compile(state, keys[0])
         played = [
-            play(state.params, mates, tasks, key)
-            for play, mates, tasks, key in zip(self._compiled, self._mates, state.tasks, keys, strict=True)
+            episode(state.params, mates, tasks, key)
+            for episode, mates, tasks, key in zip(self._compiled, self._mates, state.tasks, keys, strict=True)
         ]
         tasks, sequences, returns = zip(*played, strict=True)
         # All groups are one batch, from which minibatches are drawn: none learns from one layout alone.
@@ -449,14 +408,14 @@ class PlayTrainer:
         for number, player in enumerate(self.players):
             key = jax.random.fold_in(jax.random.key(seed), number)
             state, returns = player.start(key), []
-            for step in range(-(-episodes // self.play.episodes)):
+            for step in range(episodes):
                 state, _, own = player.compiled(params, player.mates, state, jax.random.fold_in(key, step + 1))
                 returns.append(np.asarray(own, np.float64))
-            found += np.split(np.concatenate(returns, axis=-1)[:, :episodes], player.ends)
+            found += np.split(np.stack(returns, axis=-1), player.ends)
         return found
 
     def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:
-        """Compile the play of all groups at the same time, since each takes seconds and one core."""
+        """Compile the episodes of all groups at the same time, since each takes seconds and one core."""
         with ThreadPoolExecutor() as pool:
             lowered = [
                 player.compiled.lower(state.params, mates, tasks, key)

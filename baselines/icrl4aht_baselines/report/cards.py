@@ -93,11 +93,8 @@ def training_sentence(config: Mapping[str, Any]) -> str:
         sentence, play = "It was trained by playing with teammates, not on learning histories.", config.get("play", {})
         if not play.get("imitation"):
             return sentence
-        script = "oracle, which sees the full state"
-        if play.get("teacher") == "search":
-            script = "searcher, which sees the full state except the dish that its teammate wants"
-        share = f"{play['imitation_end']:.0%}"
-        return f"{sentence} In the first {share} of its steps it also imitated the scripted {script}."
+        part = f"In the first {play['imitation_end']:.0%} of its steps it also imitated the scripted oracle"
+        return f"{sentence} {part}, which sees the full state."
     cells = config.get(TRAINED_ON, ())
     sources = sorted({cell["source"] for cell in cells if cell.get("source")})
     labels = sorted({cell["labels"] for cell in cells if cell.get("labels")})

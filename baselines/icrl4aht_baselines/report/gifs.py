@@ -156,7 +156,6 @@ def restore_ego(source: ResultSource) -> JaxEgoMaker:
         raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor of a run folder")
     if "model" not in details and not Path(folder).is_dir():
         raise OptionError(f"its run folder {folder} is missing")
-    details.pop("variant", None)
     agent = find_agent(folder, **PlayMode.from_details(details)._asdict())
     if agent.details != details:
         raise OptionError(f"{folder} holds another model than these results are of: {agent.details}, not {details}")

@@ -91,7 +91,7 @@ def summary_lines(runs: Sequence[EvaluationRun]) -> list[str]:
 def csv_text(runs: Sequence[EvaluationRun]) -> str:
     """Return the results of all runs as CSV, with the columns of docs/results.csv, see `results`.
 
-    The column `agent` has the runs' labels, which distinguish the entries of a sweep.
+    The column `agent` has the runs' labels, which distinguish several runs of an agent.
     """
     table = pd.concat([run.table.assign(agent=run.label) for run in runs], ignore_index=True)
     return add_scales(table).round(3).to_csv(index=False, lineterminator="\n")
@@ -103,10 +103,10 @@ def write_page(
     """Write the page. Return its path.
 
     Args:
-        runs: merged, see `results.merge`; of any protocols, sweeps among them.
+        runs: merged, see `results.merge`; of any protocols.
         path: ends in .html; replaced atomically.
         episodes: see `gifs.family_gifs`.
-        notes: facts about these runs for the reader, such as layouts that were left out.
+        notes: facts about these runs for the reader, such as those without episodes.
 
     Raises:
         OptionError: if the path does not end in .html, or there is no run.
@@ -127,7 +127,6 @@ def write_page_with_episodes(
     path: Path,
     *,
     episodes: bool = True,
-    notes: Sequence[str] = (),
     suite: Path | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
@@ -136,15 +135,16 @@ def write_page_with_episodes(
     Reference egos come after the other runs.
 
     Args:
-        runs, path, notes: see `write_page`.
+        runs, path: see `write_page`.
         episodes: False for a page without episodes.
         suite: folder of learned teammates' checkpoints.
         progress: called with (description, tasks drawn, tasks).
     """
     shown = sorted(runs, key=lambda run: run.agent in AGENTS)[:_RUNS_WITH_EPISODES] if episodes else []
     left = [run.label for run in runs if run not in shown]
+    notes = []
     if shown and left:
-        notes = [*notes, f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}"]
+        notes.append(f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}")
     with TemporaryDirectory() as folder:
         return write_page(runs, path, family_gifs(shown, Path(folder), suite, progress), notes)
 

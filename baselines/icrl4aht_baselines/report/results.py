@@ -210,7 +210,6 @@ class EvaluationRun:
         table: the results, see the module's docstring.
         cells: cell -> returns of the team in each episode, float64 (instances, episodes), means over the seeds; in the
             paper's order.
-        variant: name and value of the varied quantity in a sweep, such as ("K", 250); None otherwise.
         note: text that distinguishes results of one agent on the same cells; usually empty.
         sources: origins of the results; each cell has one.
     """
@@ -219,7 +218,6 @@ class EvaluationRun:
     protocol: str
     table: pd.DataFrame
     cells: dict[ResultCell, np.ndarray]
-    variant: tuple[str, Any] | None = None
     note: str = ""
     sources: tuple[ResultSource, ...] = ()
 
@@ -253,11 +251,10 @@ class EvaluationRun:
         """Return whether a cell has published test tasks, and its episodes have the benchmark's length."""
         return cell.kind == "test" and self.has_full_length(cell)
 
-    @cached_property
+    @property
     def label(self) -> str:
-        """The agent with variant and note, which distinguishes this run from others of the agent."""
-        varied = "" if self.variant is None else ", {} = {}".format(*self.variant)
-        return self.agent + varied + (f" [{self.note}]" if self.note else "")
+        """The agent, with the note if there is one."""
+        return f"{self.agent} [{self.note}]" if self.note else self.agent
 
 
 def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
@@ -399,8 +396,7 @@ def as_run(
             for seed, value in zip(seeds, of_task, strict=True)
         ]
     sources = tuple(ResultSource(where, settings, trained, own, seen[track]) for track, own in tracks.items())
-    variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
-    return EvaluationRun(*agent, pd.DataFrame(rows, columns=TABLE_COLUMNS), cells, variant, sources=sources)
+    return EvaluationRun(*agent, pd.DataFrame(rows, columns=TABLE_COLUMNS), cells, sources=sources)
 
 
 def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: str) -> dict[str, SeenInTraining | None]:

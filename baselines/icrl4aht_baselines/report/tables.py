@@ -261,11 +261,11 @@ def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> 
         agent: name of a published method, or a run of it.
         cells: the group.
     """
-    name, variant = (agent, None) if isinstance(agent, str) else (agent.agent, agent.variant)
+    name, context = (agent, None) if isinstance(agent, str) else (agent.agent, agent.sources[0].detail("context"))
     layouts, families = (tuple(dict.fromkeys(cell[part] for cell in cells)) for part in (0, 1))
-    if variant and variant[1] not in (500, "small"):
-        stated = read_published()["contexts"]["methods"].get(name, {}).get(layouts[0], {}).get(str(variant[1]))
-        return (stated, None) if stated is not None and (len(layouts), families) == (1, HEURISTICS) else None
+    stated = read_published()["contexts"]["methods"].get(name, {}).get(layouts[0], {})
+    if context != 500 and str(context) in stated:
+        return (stated[str(context)], None) if (len(layouts), families) == (1, HEURISTICS) else None
     if len(layouts) == 1:
         label = AVERAGE if families == HEURISTICS else families[0]
         found = published_cells(name).get(layouts[0], {}).get(label) if label == AVERAGE or len(cells) == 1 else None

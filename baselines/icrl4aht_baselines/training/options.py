@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 from msgspec import Meta
 
@@ -47,7 +47,7 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """Settings of a method that is trained by playing; one step plays `episodes` of each of `batch_size` tasks.
+    """Settings of a method that is trained by playing; one step plays an episode of each of `batch_size` tasks.
 
     Raises:
         OptionError: if a value is out of bounds.
@@ -58,15 +58,8 @@ class PlayOptions:
     discount: Annotated[Share, Option("Discount of rewards, which continue over a task's episodes.")] = 0.99
     gae_lambda: Annotated[Share, Option("Decay of the advantage estimate's trace.")] = 0.95
     entropy: Annotated[NotNegative, Option("Weight of the entropy bonus.")] = 0.01
-    episodes: Annotated[
-        Count, Option("Episodes of each task that a step plays and learns from; memory is learned across these.")
-    ] = 1
-    task_end: Annotated[float, Meta(gt=0, le=1), Option("Chance that a task ends after a step's episodes.")] = 1 / 16
-    imitation: Annotated[NotNegative, Option("Weight of imitating a script at the start.")] = 1.0
-    teacher: Annotated[
-        Literal["oracle", "search"],
-        Option("That script: oracle knows what its teammate wants, search finds it out over the episodes of a task."),
-    ] = "oracle"
+    task_end: Annotated[float, Meta(gt=0, le=1), Option("Chance that a task ends after an episode.")] = 1 / 16
+    imitation: Annotated[NotNegative, Option("Weight of imitating the oracle at the start.")] = 1.0
     imitation_end: Annotated[Positive, Option("Share of the steps at which that weight has fallen to 0.")] = 0.5
     rearranged: Annotated[
         int,

@@ -18,10 +18,8 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.oracle import oracle
-from icrl4aht_generation.experts.search import with_taken
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.network import ActorCritic
-from icrl4aht_generation.policy import Policy
 
 
 def stream_returns(rewards: np.ndarray) -> np.ndarray:
@@ -145,41 +143,32 @@ def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array
 @lru_cache(maxsize=8)
 def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """Return a compiled map from records (100, E, S) and ego actions (100, E) to oracle actions, int8 (100, E)."""
-    return jax.jit(lambda records, taken: follow_script(oracle(layout), layout, records, taken)[0].astype(jnp.int8))
+    return jax.jit(lambda records, taken: follow_oracle(layout, records, taken).astype(jnp.int8))
 
 
-def follow_script(
-    script: Policy,
-    layout: Layout | Sequence[Layout],
-    records: jax.Array,
-    taken: jax.Array,
-    numbers: jax.Array | None = None,
-    memory: Any = None,
-) -> tuple[jax.Array, Any]:
-    """Return what a script would do in each state of episodes in which another ego acted, and its memory after them.
+def follow_oracle(
+    layout: Layout | Sequence[Layout], records: jax.Array, taken: jax.Array, numbers: jax.Array | None = None
+) -> jax.Array:
+    """Return what the scripted oracle would do in each state of episodes in which another ego acted.
 
     Args:
-        script: the oracle or the searcher of these layouts.
         layout: the layout, or several.
         records: uint8 (T, E, S), state records of E episodes.
         taken: int (T, E), the ego's actions.
         numbers: int (E,), number of each episode's layout; None for one layout.
-        memory: the script's memory before the episodes, leaves (E, ...); by default as before its first episode.
 
     Returns:
-        int32 (T, E), and leaves (E, ...).
+        int32 (T, E).
     """
-    env = Environment(layout)
-    keys = jax.random.split(jax.random.key(0), records.shape[1])  # without effect: only the memory's start is drawn
+    env, script = Environment(layout), oracle(layout)
+    keys = jax.random.split(jax.random.key(0), records.shape[1])  # without effect: the oracle draws nothing
     zero = jnp.zeros(len(keys), jnp.int32)
 
     def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
         record, action = now
         state = EnvState(keys, zero, zero, record, numbers)
         wanted, memory = env.act(script, script.params, memory, state, EGO, keys, own=False)
-        return with_taken(memory, action.astype(jnp.int32)), wanted
+        return memory._replace(action=action.astype(jnp.int32)), wanted
 
-    if memory is None:
-        memory = jax.vmap(script.init, in_axes=(None, 0))(script.params, keys)
-    memory, wanted = jax.lax.scan(step, memory, (records, taken))
-    return wanted, memory
+    memory = jax.vmap(script.init, in_axes=(None, 0))(script.params, keys)
+    return jax.lax.scan(step, memory, (records, taken))[1]

@@ -51,7 +51,7 @@ from tests.helpers.commands import run_cli
 LAYOUT = get_layout("cramped_up")
 MODEL = ModelOptions(width=16, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05)
 OPTIONS = TrainOptions(steps=6, batch_size=8, learning_rate=6e-3, warmup=0.0, log_every=1, save_every=3)
-PLAY = PlayOptions(epochs=1, minibatches=2, episodes=2, task_end=0.5, teacher="search", imitation_end=1.0)
+PLAY = PlayOptions(epochs=1, minibatches=2, task_end=0.5, imitation_end=1.0)
 METHOD = get_method("rl2")(MODEL, overcooked_world([LAYOUT], "mlp", canonical=True))
 
 
@@ -69,7 +69,7 @@ def trainer() -> PlayTrainer:
 
 @pytest.fixture(scope="module")
 def episode(trainer) -> Any:
-    """The compiled episodes of the trainer's only player, which its steps play as well."""
+    """The compiled episode of the trainer's only player, which its steps play as well."""
     trainer._compiled = trainer._compile(trainer.init(), jax.random.key(0))
     return trainer._compiled[0]
 
@@ -110,20 +110,16 @@ def test_episodes_for_learning(trainer, episode):
     """Learning sequences contain the observations, actions and rewards of the played episode."""
     player, state = trainer.players[0], trainer.init()
     tasks, key = state.tasks[0], jax.random.key(3)
-    for number in range(3):  # unfinished tasks continue in the next step
+    for number in range(3):  # unfinished tasks continue in the next episode
         after, played, returns = episode(state.params, player.mates, tasks, jax.random.fold_in(key, number))
-        assert played.action.shape == (200, 8)  # two episodes, of which the second continues the first
+        assert played.action.shape == (100, 8)
         np.testing.assert_array_equal(played.seen.prev_action[1:], played.action[:-1])
-        by_episode = played.reward.reshape(2, 100, 8).sum(axis=1)
-        np.testing.assert_allclose(by_episode.T / PLAY_REWARD_SCALE, returns, rtol=1e-5)
+        np.testing.assert_allclose(played.reward.sum(axis=0) / PLAY_REWARD_SCALE, returns, rtol=1e-5)
         ended = np.asarray(played.done[-1])
         assert not played.done[:-1].any()
         memory = np.asarray(after.ego.state)
         assert not memory[ended].any() and np.abs(memory[~ended]).sum() > 0
         np.testing.assert_array_equal(played.hidden[0], tasks.ego.state)
-        belief, before = after.ego.teacher, tasks.ego.teacher  # of the script, over the episodes of a task
-        assert not np.asarray(belief.refused | belief.paid)[ended].any()
-        assert (belief.refused | ~before.refused)[~ended].all()
         for before in (after.before.prev_action, after.before.prev_reward, after.before.prev_teammate_action):
             assert ended.any() and not np.asarray(before)[ended].any()  # a new task starts with empty memory
         tasks = after
@@ -138,8 +134,8 @@ def test_the_log(through):
     assert {"return cramped_up assembly_line", "policy_loss", "value_loss", "entropy", "loss"} <= lines[0].keys()
 
 
-def test_imitation_makes_the_scripts_actions_likelier(trainer, episode):
-    """On fixed episodes, the script's actions become likelier only with a positive imitation weight."""
+def test_imitation_makes_oracle_actions_likelier(trainer, episode):
+    """On a fixed episode, the oracle's actions become likelier only with a positive imitation weight."""
     state = trainer.init()
     _, played, _ = episode(state.params, trainer._mates[0], state.tasks[0], jax.random.key(0))
     fallen = {}
@@ -151,7 +147,7 @@ def test_imitation_makes_the_scripts_actions_likelier(trainer, episode):
             params, optimizer, log = learned
             losses.append(float(log["imitation_loss"]))
         fallen[weight] = losses[0] - losses[-1]
-    assert fallen[5.0] > 0.05
+    assert fallen[5.0] > 0.1
     assert fallen[0.0] < fallen[5.0] / 4
 
 

@@ -117,7 +117,6 @@ def test_results_of_other_conditions_are_not_merged():
     for other, label in (
         (evaluated_run("AD", value=3.0), "AD [runs/AD]"),
         (evaluated_run("AD", ("coord_simple",), acting="exact"), "AD [runs/AD]"),
-        (evaluated_run("AD", ("coord_simple",), variant=("K", 250)), "AD, K = 250"),
         (evaluated_run("AD", ("coord_simple",), acting="cached", details={"sampled": True}), "AD [runs/AD]"),
         (evaluated_run("AD", ("coord_simple",), acting="cached", details={"forget": True}), "AD [runs/AD]"),
     ):
