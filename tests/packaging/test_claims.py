@@ -163,7 +163,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ),
     ("docs/protocol", "Dropout {} is on the outputs", lambda: ModelOptions().dropout),
     ("docs/protocol", "{} GRU layers of {}", lambda: (ModelOptions().recurrent_layers, ModelOptions().width)),
-    ("docs/protocol", "for all {} training layouts", lambda: len(TESTED_ON)),
     ("docs/protocol", "A {} of the histories is held out", lambda: HistoryOptions(("demo_wide",)).held_out),
     (
         "docs/generating",
