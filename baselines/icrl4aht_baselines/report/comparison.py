@@ -22,6 +22,7 @@ from icrl4aht_baselines.report.results import (
     AgentReturns,
     ResultCell,
     in_order,
+    mean_of,
     returns_by_cell,
 )
 from icrl4aht_baselines.report.scores import (
@@ -37,7 +38,6 @@ from icrl4aht_baselines.report.scores import (
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, holm
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission, submitted_runs
-from icrl4aht_baselines.report.tables import mean_of
 from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
 from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS

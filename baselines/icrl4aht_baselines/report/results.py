@@ -130,6 +130,11 @@ class CellReturns(NamedTuple):
         return self.blocks["all"].mean(axis=0)
 
 
+def mean_of(cells: Iterable[np.ndarray]) -> float:
+    """Return the mean of the cells' means."""
+    return float(np.mean([values.mean() for values in cells]))
+
+
 AgentReturns = Mapping[ResultCell, CellReturns]
 """Returns of an agent under one protocol."""
 
