@@ -264,13 +264,11 @@ def block_difference(
 
     Args:
         one, other: the agents.
-        cells: the cells; None is returned unless both played all of them.
-        block: block of episodes, see `results.BLOCKS`.
+        cells: the cells, of which those count that both played; if there is none, None is returned.
+        block: block of episodes, see `results.BLOCKS`; None is returned unless both played it.
     """
     groups, alike = [], behaviour_names()
-    for cell in cells:
-        if cell not in one or cell not in other:
-            return None
+    for cell in (cell for cell in cells if cell in one and cell in other):
         first, second = paired(one[cell], other[cell])
         if block not in first.blocks or block not in second.blocks:
             return None
