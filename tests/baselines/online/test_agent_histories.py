@@ -20,7 +20,6 @@ from icrl4aht_baselines.online.agent_histories import (
     release_teammates,
     with_noise,
 )
-from icrl4aht_baselines.reference import RL2_HISTORIES
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
@@ -211,14 +210,3 @@ def test_the_command(tmp_path):
     assert result.exit_code == 0 and "describes it" in result.output
     again = CliRunner().invoke(cli, arguments)
     assert isinstance(again.exception, OptionError) and "--overwrite" in str(again.exception)
-
-
-def test_histories_like_those_of_reference_models(monkeypatch, tmp_path):
-    made = []
-    monkeypatch.setattr(agent_histories, "collect_release", lambda *given, **options: made.append(given[2]))
-    arguments = ["collect", "--agent", "random", "--layout", "cramped_up", "--like", "rising", "--out", str(tmp_path)]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0 and made == [RL2_HISTORIES["rising"]]
-    result = CliRunner().invoke(cli, [*arguments, "--noise", "1", "0", "--episodes", "60"])
-    assert result.exit_code == 2 and len(made) == 1
-    assert "--like: not with --episodes, --noise, which it sets" in " ".join(result.output.split())
