@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 
 from icrl4aht_baselines.agents.egos import OTHER_WAYS
-from icrl4aht_baselines.online.adaptation import adaptation_table
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.results import (
     EPISODE_BLOCKS,
@@ -39,7 +38,7 @@ from icrl4aht_baselines.report.scores import (
 from icrl4aht_baselines.report.statistics import MeanInterval, holm
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission, submitted_runs
 from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
-from icrl4aht_data.benchmark.best_responses import BestResponse, read_best_responses
+from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
 from icrl4aht_data.benchmark.reference_returns import REFERENCES, read_headroom
 from icrl4aht_data.errors import OptionError
@@ -205,13 +204,12 @@ def render_comparison(stored: StoredResults) -> str:
         one_way=", ".join(one_way) or "none",
         difference=describe_lead(results, scales),
         controls=controls_table(stored, shown, scales),
-        layouts=layouts_table(shown, scales),
-        best_responses=best_responses_table(scales),
-        adaptation=adaptation_table(results_file().parent, layouts=False),
+        layouts=layouts_table(results, scales),
+        trainings=describe_trainings(),
         about="\n".join(_describe_agent(agent, stored.agents[agent]) for agent in results),
         earlier=", ".join(f"`{agent}`" for agent in every if agent not in results) or "none",
         marks="\n".join(f"* {text}" for text in overlap_legend(overlaps)),
-        measured=f"{measured.about.rstrip('.')} (best responses of version {measured.version}).",
+        measured=f"{measured.about.rstrip('.')} (version {measured.version}).",
         cells=f"{len(scored)} of {len(scales)} cells",
         scored=", ".join(dict.fromkeys(cell.layout for cell in scored)) or "none",
         least=f"{LEAST_HEADROOM:g}",
@@ -238,17 +236,17 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
     body = []
     for agent, cells in results.items():
         facts, marks = stored.agents.get(agent), {name for of in cells.values() for name in of.overlaps}
-        texts = [""] * 4
+        texts = [""] * 3
         if facts:
-            hours = "–" if facts.core_hours is None else f"{facts.core_hours:g}"
-            texts = [facts.data, facts.labels, facts.steps or "–", hours]
+            hours = "" if facts.core_hours is None else f"{facts.core_hours:g} core-hours"
+            texts = [facts.data, facts.labels, ", ".join(filter(None, (facts.steps, hours))) or "–"]
         row = [f"`{agent}`{overlap_marks(marks)}", *texts]
         for track in TRACKS:
             score = find_score(cells, track_cells(open_cells(scales), track), scales)
             row += [_shown(score and score.total), _shown(score and score.middle)]
         body.append(row)
     scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")]
-    return markdown_table(["model", "data", "labels", "budget", "core-hours", *scored], body)
+    return markdown_table(["model", "data", "labels", "budget", *scored], body)
 
 
 def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
@@ -349,38 +347,21 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
     return markdown_table(["model", *TEST_LAYOUTS, "worst teammate", "regret"], body, right=len(TEST_LAYOUTS) + 2)
 
 
-def best_responses_table(scales: CellScales) -> str:
-    """Return table 5: a row for each test cell with best responses.
-
-    S and B are means over the tasks of a cell; the spread is the difference of the highest and the lowest return of the
-    trainings with one teammate, mean over the behaviours with several trainings.
-    """
-    by_cell: dict[ResultCell, list[BestResponse]] = defaultdict(list)
-    for one in read_best_responses().behaviours:
-        by_cell[ResultCell(one.layout, one.family, one.split)].append(one)
-    body = []
-    for cell in (cell for cell in scales if cell in by_cell and cell.kind == "test"):
-        own, scale = by_cell[cell], scales[cell]
-        trained = [training for one in own for training in one.seeds]
-        spreads = [np.ptp([training.mean_return for training in one.seeds]) for one in own if len(one.seeds) > 1]
-        body.append([
-            cell.layout,
-            cell.family,
-            str(len(own)),
-            f"{scale.stay:z.1f}",
-            f"{scale.best:z.1f}",
-            _span([one.best for one in own], "z.1f"),
-            str(sum(not one.agent.startswith("best response") for one in own)),
-            _span([len(one.seeds) for one in own], "d"),
-            _span([training.steps for training in trained], ",d"),
-            _span([training.width for training in trained], "d"),
-            f"{np.mean(spreads):.1f}" if spreads else "–",
-        ])  # fmt: skip
-    numbers = ["behaviours", "S", "B", "B by behaviour", "of a model", "trainings", "steps", "width", "spread"]
-    return markdown_table(["layout", "family", *numbers], body, right=len(numbers))
+def describe_trainings() -> str:
+    """Return sentences on the trainings behind the best responses; empty if none was measured."""
+    behaviours = read_best_responses().behaviours
+    trained = [training for one in behaviours for training in one.seeds]
+    if not trained:
+        return ""
+    steps, width = _span([one.steps for one in trained], ",d"), _span([one.width for one in trained], "d")
+    better = sum(not one.agent.startswith("best response") for one in behaviours)
+    return (
+        f"Behaviours: {len(behaviours)}. Trainings with each: {_span([len(one.seeds) for one in behaviours], 'd')}, of "
+        f"{steps} steps and width {width}. Behaviours whose B is the higher return of a stored model: {better}."
+    )
 
 
-def _span(values: Sequence[float], form: str) -> str:
+def _span(values: Sequence[int], form: str) -> str:
     low, high = (format(limit, form) for limit in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
 

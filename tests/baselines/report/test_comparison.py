@@ -16,9 +16,9 @@ from icrl4aht_baselines.report.comparison import (
     add_scales,
     add_submission,
     agents_table,
-    best_responses_table,
     controls_table,
     describe_lead,
+    describe_trainings,
     figure_layouts,
     layouts_table,
     mean_best,
@@ -28,8 +28,7 @@ from icrl4aht_baselines.report.comparison import (
     write_comparison,
     write_stored,
 )
-from icrl4aht_baselines.report.results import ResultCell
-from icrl4aht_baselines.report.scores import CellScale, TaskScale, cell_scales
+from icrl4aht_baselines.report.scores import cell_scales
 from icrl4aht_baselines.report.submission import AgentFacts, make_submission
 
 from icrl4aht_data.benchmark import best_responses
@@ -94,12 +93,12 @@ def test_table_1_has_scores_of_complete_tracks(stored, measured):
     scales = cell_scales("seeded")
     table = agents_table(stored, stored.returns(), scales)
     high, low = row(table, "high"), row(table, "low")
-    assert high[1:7] == ["noise", "oracle", "10 updates", "2", "–", "–"], "no track teammate"
+    assert high[1:6] == ["noise", "oracle", "10 updates, 2 core-hours", "–", "–"], "no track teammate"
     # R - S over B - S = 20, with S = 12.0 on asymm_right in the mean and 0.0 on cramped_down
     stays = np.mean([np.mean([scale.stay for cell, scale in scales.items() if cell.layout == name])
                      for name in ("asymm_right", "cramped_down")])  # fmt: skip
     for found, mean in ((high, 21.5), (low, 9.5)):
-        assert found[7].startswith(f"{(mean - stays) / 20:z.2f} (")
+        assert found[6].startswith(f"{(mean - stays) / 20:z.2f} (")
     assert describe_lead(stored.returns(), scales) == "No two models have a score on the track `teammate`."
 
 
@@ -138,27 +137,26 @@ def test_best_responses_of_a_layout_count_as_stay_in_cells_without_one(measured)
     assert mean_best("coord_ring", {cell: scales[cell] for cell in scales if cell not in ring}) is None
 
 
-def test_table_5_has_the_range_and_the_spread_of_best_responses(cards, monkeypatch):
+def test_the_page_describes_the_trainings_of_best_responses(cards, monkeypatch):
     by_agent = [("best response, seed 1", [1.0, 3.0]), ("some model", [4.0])]
-    h1 = [f"task_{number}" for number in range(5)]
     behaviours = [
         BestResponse(
             layout="asymm_right",
             family="H1",
             split="test",
-            tasks=tuple(tasks),
+            tasks=(f"task_{agent}",),
             seeds=tuple(TrainedResponse(seed, 100, value) for seed, value in enumerate(returns)),
             best=max(returns),
             agent=agent,
         )
-        for tasks, (agent, returns) in zip((h1[:2], h1[2:]), by_agent, strict=True)
+        for agent, returns in by_agent
     ]
     write_best_responses(cards / "two.json", BestResponseCard("0", "seeded", "Two.", tuple(behaviours)))
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "two.json")
-    scale = CellScale({task: TaskScale(0.0, 3.5, task) for task in h1})
-    table = best_responses_table({ResultCell("asymm_right", "H1", "test"): scale})
-    texts = ["2", "0.0", "3.5", "3.0 to 4.0", "1", "1 to 2", "100", "128", "2.0"]
-    assert table.splitlines()[-1] == f"| asymm_right | H1 | {' | '.join(texts)} |"
+    assert describe_trainings() == (
+        "Behaviours: 2. Trainings with each: 1 to 2, of 100 steps and width 128. Behaviours whose B is the higher "
+        "return of a stored model: 1."
+    )
 
 
 def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monkeypatch):
@@ -167,8 +165,8 @@ def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monke
     paths = write_comparison(some, tmp_path / "page")
     assert [path.name for path in paths] == [*RESULTS_FILES]
     text = paths[0].read_text(encoding="utf-8")
-    assert "| `high` | noise | oracle | 10 updates | 2 | – |" in text and "| `low`" not in text
-    assert "Models of earlier code are there as well: `low`." in text and "None measured (best responses of" in text
+    assert "| `high` | noise | oracle | 10 updates, 2 core-hours | – |" in text and "| `low`" not in text
+    assert "Models of earlier code are there as well: `low`." in text and "None measured (version" in text
     assert paths[1].stat().st_size > 10_000 and len(figure_layouts()) == 6
     assert len(pd.read_parquet(paths[3])) == len(stored.table)
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")

@@ -121,7 +121,7 @@ def test_the_commands(submitted, tmp_path, monkeypatch):
     result = runner.invoke(cli, page, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     text = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
-    assert "| `my rule` | none | none | – | 1.5 |" in text and "| `rule` † |" in text
+    assert "| `my rule` | none | none | 1.5 core-hours |" in text and "| `rule` † |" in text
     result = runner.invoke(cli, [*page, "--overwrite", "--store"], catch_exceptions=False)
     assert list(comparison.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
     result = runner.invoke(cli, [*page, "--overwrite"])
@@ -149,7 +149,7 @@ def test_another_way_of_playing_is_added(tmp_path):
     shown = later.with_other_ways(later.returns())
     assert list(shown) == ["mine", "mine (sampled)"]
     table = comparison.agents_table(later, shown, {})
-    assert "| `mine` | none | none | – | – | – |" in table and "| `mine (sampled)` |  |  |  |  | – |" in table
+    assert "| `mine` | none | none | – | – | – |" in table and "| `mine (sampled)` |  |  |  | – |" in table
     page = comparison.render_comparison(later)
     assert "Not measured for: none." in page and "Not measured for: `mine`." in comparison.render_comparison(stored)
     replaced = comparison.add_submission(later, make_submission([own], FACTS, update=True))
