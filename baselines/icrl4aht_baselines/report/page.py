@@ -31,11 +31,11 @@ from icrl4aht_baselines.report.results import (
     ResultCell,
     family_title,
     in_order,
-    published_instances,
 )
 from icrl4aht_baselines.report.scores import (
     add_scales,
     blocks_text,
+    bundled_cells,
     cell_scales,
     find_headlines,
     find_score,
@@ -106,14 +106,15 @@ def table_score(
     means = [of.mean.mean(axis=1) for of in returns]
     values = means[0] if len(cells) == 1 else np.array([of_cell.mean() for of_cell in means])
     std = f" ± {values.std():z.1f}" if len(values) > 1 else ""
-    complete = all(cell.kind != "test" or run.is_complete(cell) for cell in played)
-    counts = f"{len(means[0])} of {counted_noun(published_instances(cells[0]), 'instance')}"
+    instances = {cell: len(bundled_cells()[cell]) for cell in played if cell.kind == "test"}
+    complete = all(len(run.tasks(cell)) == count for cell, count in instances.items())
+    counts = f"{len(means[0])} of {counted_noun(instances.get(cells[0], 0), 'instance')}"
     score, overlaps = find_score(run.returns, scored_cells(run, played, scales), scales), run.overlaps(played)
     blocks = blocks_text(returns)
     notes = [
         f"{len(played)} of {len(cells)} cells" if len(played) < len(cells) else "",
         "" if complete else counts if len(cells) == 1 else "incomplete cells",
-        *(paper if len(played) == len(cells) and all(map(run.is_comparable, played)) else []),
+        *(paper if len(played) == len(cells) and all(map(run.has_full_length, played)) else []),
         f"score {score.total.mean:z.2f}" if score else "",
         f"episodes {blocks}" if blocks else "",
         "no headroom" if is_flat else "",
