@@ -16,12 +16,11 @@ import jax
 import numpy as np
 import psutil
 import pytest
-from click.testing import CliRunner
 from filelock import FileLock
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.writing.published import from_published, to_published
+from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
 from tests.helpers.published_files import KEPT, publish
 from tests.helpers.random_releases import random_release
@@ -31,6 +30,9 @@ from tests.helpers.xla_flags import add_xla_flag, is_xla_flag
 
 COMPILATIONS: list[float] = []
 """Seconds of each compilation of this process."""
+
+MEMORY_TO_FREE = 1200 * 2**20
+"""Bytes of a worker from which on it drops compiled programs."""
 
 SharedFolder = Callable[[str, Callable[[Path], object]], Path]
 COMPILATION_CACHE: dict[str, Any] = {
@@ -108,11 +110,12 @@ def pytest_testnodedown(node) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def free_compiled_programs() -> Iterator[None]:
-    """Drop the compiled programs of a module, which would take gigabytes by the end of a session."""
+    """Drop the compiled programs once they take much memory; until then other modules use them too."""
     yield
-    jax.clear_caches()
-    gc.collect()
-    getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)  # glibc keeps freed memory otherwise
+    if psutil.Process().memory_info().rss > MEMORY_TO_FREE:
+        jax.clear_caches()
+        gc.collect()
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)  # glibc keeps freed memory otherwise
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -176,9 +179,7 @@ def damaged(lite, tmp_path) -> Path:
 
 
 def _generate(profile: Path, out: Path, *options: str) -> None:
-    arguments = ["generate", "--profile", str(profile), "--out", str(out), *options]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    run_cli("generate", "--profile", profile, "--out", out, *options)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ from icrl4aht_baselines.training.options import TrainOptions
 from icrl4aht_generation.teammates.registry import sample_teammate
 from rich.console import Console
 
-from icrl4aht_data.benchmark.tasks import make_task
+from icrl4aht_data.benchmark.tasks import make_task, write_tasks
 from tests.helpers.random_releases import random_release
 
 TASKS = tuple(
@@ -67,16 +67,28 @@ def evaluation_of(last: float, last_cleared: float):
     ("last", "last_cleared", "verdict"),
     [(20.0, 0.0, "rises by"), (20.0, 20.0, "does not rise by"), (-10.0, -30.0, "does not rise by")],
 )
-def test_the_demo_runs_every_step(last, last_cleared, verdict, release, tmp_path, monkeypatch):
+def test_verdicts(last, last_cleared, verdict, tmp_path):
+    evaluate = evaluation_of(last, last_cleared)
+    for control in (None, "cleared"):
+        out = tmp_path / str(control)
+        evaluate(
+            "AD", None, TASKS, SETTINGS.protocol, seeds=range(4), out=out, details={}, played=None, control=control
+        )
+        write_tasks(out / "tasks.jsonl", TASKS)
+    said = demo.conclusion(results.read_run(tmp_path / "None"), results.read_run(tmp_path / "cleared"))
+    assert said.startswith(f"Its return {verdict} what it remembers: {last + 1.5:+.1f}")
+
+
+def test_the_demo_runs_every_step(release, tmp_path, monkeypatch):
     """The model is trained; its evaluation is replaced by invented results."""
-    monkeypatch.setattr(results, "evaluate", evaluation_of(last, last_cleared))
+    monkeypatch.setattr(results, "evaluate", evaluation_of(20.0, 0.0))
     monkeypatch.setattr(demo, "DEMO_LAYOUT", "demo_wide")
     text = StringIO()
     page = demo.run_demo(tmp_path, Console(file=text, width=300), replace(SETTINGS, root=release))
     said = text.getvalue()
     for expected in ("1/6", "target_actions", "transitions replayed", "6/6", "done in", str(page)):
         assert expected in said, expected
-    assert f"Its return {verdict} what it remembers: {last + 1.5:+.1f}" in said
+    assert "Its return rises by what it remembers: +21.5" in said
     assert re.search(r"search +-20\.0 +41\.5 +41\.5\n", said)
     for name in ("learning_curves.png", "adaptation.png"):
         assert (tmp_path / name).read_bytes()[1:4] == b"PNG"

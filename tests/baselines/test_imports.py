@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
 from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
+from tests.helpers.commands import run_python
 
 USE = """
 import dataclasses
@@ -31,8 +29,7 @@ except ValueError as error:
 
 def test_one_line_imports_what_a_user_needs():
     """Nothing is played, because compiling takes seconds."""
-    found = subprocess.run([sys.executable, "-c", USE], check=True, capture_output=True, text=True, timeout=120)
-    assert found.stdout.startswith("unknown protocol 'publishd'; valid: published, ")
+    assert run_python("-c", USE).startswith("unknown protocol 'publishd'; valid: published, ")
 
 
 def test_other_names():

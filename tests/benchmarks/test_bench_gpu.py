@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import re
 from functools import partial
 from typing import Any
 
 import jax
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import learned
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout
@@ -30,13 +28,12 @@ from benchmarks.bench_gpu import (
     context_length,
     ego_learner,
     h4_tasks,
-    main,
     measure_training,
 )
 from benchmarks.harness import product_flops
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.overcooked.actions import TEAMMATE
-from tests.helpers.paths import ROOT
+from tests.helpers.commands import run_cli, run_python
 
 MEASURED = {
     "device": {"device", "jax", "commit", "date", "xla_threads"},
@@ -51,7 +48,7 @@ MEASURED = {
 
 
 def lines_of(output: str) -> dict[str, dict[str, Any]]:
-    return {line["case"]: line for line in map(json.loads, output.splitlines())}
+    return {line["case"]: line for line in map(json.loads, re.findall("^{.*", output, re.MULTILINE))}
 
 
 @pytest.mark.slow
@@ -60,10 +57,7 @@ def test_the_command():
     cases = ["device", "product", "learner/mlp", "act/tiny", "loader/tiny", "train/tiny/mlp/bfloat16", "attention"]
     assert {case.split("/")[0] for case in cases} == set(PARTS)
     options = [word for case in cases for word in ("--case", case)]
-    command = [sys.executable, "-m", "benchmarks.bench_gpu", *options, "--seconds", "0.01"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    found = lines_of(done.stdout)
+    found = lines_of(run_python("-m", "benchmarks.bench_gpu", *options, "--seconds", "0.01"))
     assert list(found) == cases
     for case, line in found.items():
         assert MEASURED[case.split("/")[0]] <= line.keys(), case
@@ -73,18 +67,15 @@ def test_the_command():
 
 
 def test_cases_without_time_are_reported_as_skipped():
-    result = CliRunner().invoke(main, ["--minutes", "0"], catch_exceptions=False)
-    assert result.exit_code == 0
-    found = lines_of(result.output)
+    found = lines_of(run_cli("--minutes 0", program=bench_gpu.main))
     assert found.keys() == CASES.keys()
     assert all(line["skipped"] for line in found.values())
 
 
 def test_an_error_is_reported_and_ends_the_process(monkeypatch):
     monkeypatch.setitem(CASES, "product", lambda sizes: 1 / 0)
-    result = CliRunner().invoke(main, ["--here", "--part", "product", "--part", "loader"], catch_exceptions=False)
-    assert result.exit_code == 1
-    assert lines_of(result.output) == {
+    printed = run_cli("--here --part product --part loader", code=1, program=bench_gpu.main)
+    assert lines_of(printed) == {
         "product": {"benchmark": "gpu", "case": "product", "error": "ZeroDivisionError: division by zero"}
     }
 

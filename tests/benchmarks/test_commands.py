@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.methods.options import SIZES, ModelSize
 from icrl4aht_generation.teammates.instances import published_tasks
 
@@ -17,13 +16,13 @@ from benchmarks.bench_learn import published_batches
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import to_published
+from tests.helpers.commands import run_cli
 
 
 def run(module: Any, options: str) -> list[dict[str, Any]]:
     """Run a benchmark and return its JSON lines."""
-    result = CliRunner().invoke(module.main, options.split(), catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return [json.loads(line) for line in result.stdout.splitlines() if line.startswith("{")]
+    printed = run_cli(options, program=module.main)
+    return [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
 
 
 def check_ratio(line: dict[str, Any], peer: str) -> None:
@@ -81,8 +80,8 @@ def test_the_jaxmarl_script_gets_both_environments(tmp_path, monkeypatch):
     script = tmp_path / "ippo.py"
     script.write_text(SCRIPT)
     options = ["--layout", "cramped_up", "--environments", "2", "--rollout", "4", "--rounds", "1", "--peer", script]
-    result = CliRunner().invoke(bench_env.main, list(map(str, options)), catch_exceptions=False)
-    *said, last = result.stdout.splitlines()
+    printed = run_cli(*options, program=bench_env.main).splitlines()
+    *said, last = [line for line in printed if line.startswith(("training", "{"))]
     assert said == ["training icrl4aht_cramped_up 80 2", "training Overcooked V2 80 2"]
     check_ratio(json.loads(last), "jaxmarl")
 
@@ -153,6 +152,4 @@ def test_sequence_models(monkeypatch):
 
 
 def test_the_peer_needs_its_file():
-    result = CliRunner().invoke(bench_learn.main, ["--part", "jaxmarl"])
-    assert result.exit_code == 2
-    assert "--peer FILE" in result.output
+    assert "--peer FILE" in run_cli("--part jaxmarl", code=2, program=bench_learn.main)

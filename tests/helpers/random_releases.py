@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -123,6 +123,22 @@ def random_release(
     options: dict[str, Any] = {"shard_histories": shard_histories, "overwrite": overwrite}
     write_release(root, kind, tasks, data_version="0.0.1", card="# test\n", kept_steps=length, **options)
     return written
+
+
+def one_history_release(
+    root: Path,
+    change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]] = dict,
+    kind: Kind = "lite",
+    provenance: Provenance | None = None,
+    learner: int = 0,
+    copies: int = 1,
+) -> Path:
+    """Write a release of one task on demo_simple, with valid hashes, whose history `change` has changed."""
+    (task,) = make_tasks(["demo_simple"])
+    arrays = change(random_history(task.layout, 6, 20, np.random.default_rng(5)))
+    histories = [NewHistory(number, arrays, learner) for number in range(copies)]
+    new = NewTask(task, provenance or Provenance(), copies, lambda: histories)
+    return write_release(root, kind, [new], data_version="0.0.1", card="", kept_steps=20)
 
 
 def long_index(root: Path, lines: int = 3000) -> list[Entry]:

@@ -20,13 +20,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from huggingface_hub import file_download, get_session
+from huggingface_hub import file_download
 from huggingface_hub.utils import _http
 
 from icrl4aht_data import clients, load_icrl4aht, verify_release
 from icrl4aht_data.clients import check_credentials, without_credentials
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import (
     Icrl4ahtError,
     IndexFormatError,
@@ -40,6 +38,7 @@ from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from tests.helpers.batches import assert_equal
+from tests.helpers.commands import run_cli
 from tests.helpers.damages import contents, flip_bit
 from tests.helpers.random_releases import SHARD
 from tests.servers.faults import Cut, Fault, Flip, Long, Redirect, Short, Slow, Status
@@ -147,7 +146,7 @@ def test_the_revision_is_pinned_and_shown(lite, full, tmp_path):
         tagged, newest = load_icrl4aht(f"{HUB}@v0.0.1"), load_icrl4aht(HUB)
         assert (tagged.info.kind, newest.info.kind) == ("lite", "full")
         assert str(tagged.origin) == f"{HUB}@{first}"
-        shown = json.loads(CliRunner().invoke(cli, ["show", f"{HUB}@v0.0.1", "--json"]).output)
+        shown = json.loads(run_cli("show", f"{HUB}@v0.0.1", "--json"))
         assert (shown["revision"], shown["data_version"]) == (first, tagged.info.data_version)
 
 
@@ -178,23 +177,21 @@ def test_a_download_of_a_part_and_then_of_the_rest(kind, lite, tmp_path):
 
 
 def test_the_command(lite, tmp_path, monkeypatch):
-    run, target = CliRunner(), tmp_path / "mine"
+    target = tmp_path / "mine"
     with http_server(lite[0]) as server:
-        plan = json.loads(
-            run.invoke(cli, ["download", server.url, "--layout", "demo_wide", "--dry-run", "--json"]).output
-        )
+        plan = json.loads(run_cli("download", server.url, "--layout", "demo_wide", "--dry-run", "--json"))
         assert plan["bytes"] == sum(plan["files"][name] for name in plan["absent"]) > 0
         monkeypatch.setenv("ICRL4AHT_REMOTE", server.url)
-        result = run.invoke(cli, ["download", "--to", str(target)], catch_exceptions=False)
-        assert result.exit_code == 0 and "bytes downloaded" in result.output
+        printed = run_cli("download", "--to", target)
+        assert "bytes downloaded" in printed
         files = len(contents(target)) - 1
         for name in (SHARD, "README.md"):
             flip_bit(target / name)
-        again = run.invoke(cli, ["download", "--to", str(target)], catch_exceptions=False).output
+        again = run_cli("download", "--to", target)
         assert f"{SHARD}: had changed, was fetched again" in again
         assert "2 files," in again and f"{files - 2} files present already, with the right hashes" in again
-        result = run.invoke(cli, ["convert", server.url, "--out", str(tmp_path / "full"), "--to", "full"])
-        assert result.exit_code == 0 and verify_release(tmp_path / "full", level="deep").ok
+        run_cli("convert", server.url, "--out", tmp_path / "full", "--to", "full")
+        assert verify_release(tmp_path / "full", level="deep").ok
     assert contents(target) == contents(lite[0])
 
 
@@ -346,22 +343,6 @@ def test_a_silent_server_times_out(what, tmp_path, monkeypatch):
     assert time.monotonic() - began < 5, "by default 15 s instead of 0.5 s"
 
 
-def test_a_time_out_without_text_says_what_happened():
-    with pytest.raises(RemoteError, match="https://a/b: TimeoutError: no answer for 15 s"):
-        clients.with_retries("https://a/b", lambda: (_ for _ in ()).throw(TimeoutError))
-
-
-def test_the_time_limit_of_the_hub_includes_other_requests_of_its_client(monkeypatch):
-    monkeypatch.setattr(clients, "_TIMEOUT", 1.0)
-    with silent_server() as server, clients.HubClient("org/name", "main").connect():
-        endpoint = f"http://127.0.0.1:{server.getsockname()[1]}"
-        began = time.monotonic()
-        for path, limit in (("/other", 0.3), ("/file", 60)):
-            with pytest.raises(Exception, match="timed out"):
-                get_session().get(endpoint + path, timeout=limit)
-    assert time.monotonic() - began < 1.5
-
-
 @pytest.mark.parametrize("kind", ["http", "hub"])
 @pytest.mark.parametrize("path", ["*.h5", "*/api/*", f"*{INFO}"])
 def test_a_server_that_stops_answering(kind, path, lite, tmp_path, monkeypatch):
@@ -487,7 +468,7 @@ def test_credentials_in_an_address_are_used_and_never_kept_or_shown(lite, tmp_pa
         assert_equal(batch(url), batch(lite[0]))
         said.append(repr(load_icrl4aht(url)))
         for command in (["download", url, "--to", str(tmp_path / "mine")], ["show", url], ["verify", url]):
-            said.append(CliRunner().invoke(cli, command, catch_exceptions=False).output)
+            said.append(run_cli(*command))
         for wrong in (url.replace("?", "/nowhere?"), url.replace("hunter2", "hunter2x")):
             with pytest.raises(Icrl4ahtError) as caught:
                 load_icrl4aht(wrong)

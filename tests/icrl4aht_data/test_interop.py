@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import re
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,10 +14,8 @@ from torch.utils.data import DataLoader
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.interop import IGNORED, hf_episodes, hf_index, hf_windows, torch_loader
-from icrl4aht_data.utils.install_hints import install_command
-from icrl4aht_data.writing.parquet import to_parquet
 from tests.helpers.batches import assert_equal
-from tests.helpers.paths import ROOT
+from tests.helpers.commands import run_python
 
 
 @pytest.fixture
@@ -55,18 +48,6 @@ class TestPasses:
         found = [next(iter(loader)).obs for _ in range(3)]
         for i, obs in zip((2, 5, 8), found, strict=True):
             np.testing.assert_array_equal(obs, sampler[i].obs)
-
-    def test_grain_continues_and_resumes_over_passes(self, sampler):
-        import grain
-
-        numbers = grain.MapDataset.range(3 * len(sampler)).map(sampler.batch)
-        iterator, n = iter(numbers.to_iter_dataset()), len(sampler)
-        for _ in range(n + 1):
-            next(iterator)
-        state = iterator.get_state()
-        again = iter(numbers.to_iter_dataset())
-        again.set_state(state)
-        assert_equal(next(again), sampler[n + 1])
 
 
 class TestGrain:
@@ -130,15 +111,8 @@ def test_pytorch_workers(lite, tmp_path, combinations):
     """Runs in a separate process, since a process that has run JAX must not fork."""
     script = tmp_path / "loader.py"
     script.write_text(TORCH)
-    run = subprocess.run(
-        [sys.executable, "-W", "error", "-W", ONE_CORE, str(script), str(lite[0]), json.dumps(combinations)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert run.returncode == 0, run.stderr
-    assert len(run.stdout.splitlines()) == len(combinations)
+    printed = run_python("-W", "error", "-W", ONE_CORE, script, lite[0], json.dumps(combinations))
+    assert len(printed.splitlines()) == len(combinations)
 
 
 class TestHuggingFace:
@@ -213,18 +187,3 @@ def test_losses_take_the_targets_of_a_plain_data_loader(lite):
     assert (batch.target_actions.dtype, batch.prev_actions.dtype) == (torch.int64, torch.int32)
     assert functional.cross_entropy(torch.zeros(3, 6, 9), batch.target_actions) > 0
     assert functional.cross_entropy(torch.zeros(3, 6), queries.query_target) > 0
-
-
-@pytest.mark.parametrize(
-    ("module", "call", "extra"),
-    [
-        ("datasets", lambda sampler: hf_index(sampler.dataset), "hf"),
-        ("torch.utils.data", torch_loader, "torch"),
-        ("pandas", lambda sampler: sampler.dataset.to_pandas(), "pandas"),
-        ("pyarrow", lambda sampler: to_parquet(sampler.dataset, Path("never.parquet")), "hf"),
-    ],
-)
-def test_a_missing_library_names_its_extra(sampler, monkeypatch, module, call, extra):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(Exception, match=re.escape(install_command(extra))):
-        call(sampler)

@@ -6,26 +6,23 @@ Numbers that take long name the command that prints them in the text.
 
 from __future__ import annotations
 
-import json
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable
 from functools import cache
 from typing import Literal
 
 import pytest
 from icrl4aht_baselines import reference
-from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.methods.ad import dropped_steps
 from icrl4aht_baselines.methods.options import SIZES, ModelOptions
-from icrl4aht_baselines.online.responses import find_behaviours
 from icrl4aht_baselines.training.options import SAVE_MINUTES, HistoryOptions
 from icrl4aht_generation.layouts.families import LAYOUT_SPLITS
 from icrl4aht_generation.layouts.rooms import MOST_COLUMNS, MOST_ROWS
 from icrl4aht_generation.learners.checkpoint import POLICY_CHECKPOINTS
 from icrl4aht_generation.profiles import load_profile
-from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED, Draw, find_draw, read_draws
+from icrl4aht_generation.teammates.draws import DRAWS_PER_SEED
 from icrl4aht_generation.teammates.heuristics.territory import TERRITORY
 from icrl4aht_generation.teammates.instances import INSTANCES
 
@@ -42,8 +39,7 @@ from icrl4aht_data.benchmark.reference_returns import HEURISTICS, alike_tasks, h
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
-from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import PROVENANCE, READABLE_VERSIONS, Entry
+from icrl4aht_data.format.schema import READABLE_VERSIONS, Entry
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
@@ -63,52 +59,9 @@ def histories() -> tuple[Entry, ...]:
     return tuple(read_index(MINI).entries)
 
 
-@cache
-def provenance() -> dict[str, Provenance]:
-    return dict(read_provenance(MINI / PROVENANCE))
-
-
-def histories_by_task(source: str) -> dict[str, list[Entry]]:
-    """Return task id -> histories of the bundled release."""
-    found = defaultdict[str, list[Entry]](list)
-    for entry in histories():
-        if entry.source == source:
-            found[entry.task_id].append(entry)
-    return found
-
-
-def rise(entries: list[Entry]) -> float:
-    """Return the mean difference between the end and the start of some histories."""
-    return sum(entry.return_end - entry.return_start for entry in entries) / len(entries)
-
-
 def rising_histories() -> tuple[float, ...]:
     rising = [entry for entry in histories() if entry.return_end - entry.return_start >= LEAST_HEADROOM]
     return len(histories()), len(rising), LEAST_HEADROOM
-
-
-def noise_histories_of_a_task() -> float:
-    """Noise histories of a task; a task of learners has one, of two learners."""
-    learned = histories_by_task("ppo").values()
-    assert {len(own) for own in learned} == {1}
-    assert {provenance()[own[0].task_id].learners for own in learned} == {2}
-    (noise,) = {len(own) for own in histories_by_task("noise").values()}
-    return noise
-
-
-def least_rise_of_the_bundle() -> float:
-    least = load_profile("small").least_rise
-    assert least is not None
-    flat = {own[0].layout for own in histories_by_task("ppo").values() if rise(own) < least}
-    assert flat <= {"coord_simple", "test_simple"}
-    return least
-
-
-def heuristics_on_coord_ring() -> int:
-    own = [entry for entry in histories() if entry.layout == "coord_ring" and entry.teammate_family != "rl"]
-    references = [provenance()[entry.task_id].references for entry in own]
-    assert {entry.split for entry in own} == {"train"} and all(found and found.matters for found in references)
-    return len({entry.task_id for entry in own})
 
 
 def best_responses_by_split() -> tuple[int, int]:
@@ -118,65 +71,14 @@ def best_responses_by_split() -> tuple[int, int]:
     return len(found), len({one.layout for one in found})
 
 
-def teammate_steps_of_the_bundle() -> float:
-    (steps,) = {made.suite.total_steps for made in provenance().values() if made.suite}
-    return steps / 1e6
-
-
 def cells_without_headroom() -> tuple[int, int]:
     cells = read_headroom("published").values()
     return sum(not has_headroom(cell) for cell in cells), len(cells)
 
 
-def oracle_on_test_wide() -> tuple[float, float]:
-    returns = [cell["oracle"] for (layout, _), cell in read_headroom("published").items() if layout == "test_wide"]
-    return min(returns), max(returns)
-
-
 def tasks(split: str, kind: Literal["", "diverse"] = "") -> list[Task]:
     """Return the bundled tasks of a split of both tracks."""
     return [task for track in TRACKS for task in read_tasks(manifest_path(track, split, kind))]
-
-
-def most_by_family(split: str, kind: Literal["", "diverse"] = "") -> int:
-    return max(Counter((task.layout.name, task.teammate_family) for task in tasks(split, kind)).values())
-
-
-def draws_of(found: list[Task]) -> list[Draw]:
-    draws = [find_draw(task.layout.name, task.teammate) for task in found]
-    assert None not in draws
-    return [draw for draw in draws if draw]
-
-
-def validation_without_headroom() -> tuple[int, int]:
-    draws = draws_of(tasks("validation"))
-    flat = [draw for draw in draws if not draw.headroom]
-    assert {draw.layout for draw in flat} == {"coord_simple", "coord_ring", "test_simple", "demo_simple"}
-    return len(flat), len(draws)
-
-
-def diverse_distance() -> float:
-    draws = draws_of([*tasks("train", "diverse"), *tasks("validation", "diverse")])
-    least = min(min(draw.distance, draw.other_distance) for draw in draws)
-    assert least < 0.11
-    return round(least - 0.005, 1)
-
-
-def draws_like_h1() -> tuple[int, int]:
-    draws = read_draws("test_wide", "assembly_line")
-    return sum(draw.other == "H1/t0" and draw.like_another_family for draw in draws), len(draws)
-
-
-def settings_of_rl2(name: str) -> float:
-    config = json.loads((MODELS / "rl2-reference" / "layout" / "config.json").read_text(encoding="utf-8"))
-    return config["play"][name]
-
-
-def streams_of_profiles() -> tuple[float, ...]:
-    paper, small = load_profile("paper"), load_profile("small")
-    streams = small.ego.environments * small.learners
-    improvement, least = small.least_improvement or 0.0, small.least_rise or 0.0
-    return paper.keep, paper.ego.environments, small.keep, streams, small.learners, improvement, least
 
 
 def plan_of_the_paper() -> tuple[float, ...]:
@@ -200,10 +102,6 @@ def channels_of_layouts() -> tuple[int, int]:
 
 def validation_by_layout() -> int:
     return max(Counter(task.layout.name for task in tasks("validation")).values())
-
-
-def most_diverse() -> tuple[int, int]:
-    return most_by_family("train", "diverse"), most_by_family("validation", "diverse")
 
 
 def tiny_size() -> tuple[int, int, int]:
@@ -240,10 +138,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("README", "a delivery is worth {}.", lambda: DELIVERY_REWARD),
     ("README", "more than `stay` in {} of the {} cells", cells_without_headroom),
     ("docs/index", "the benchmark's {} test tasks", lambda: len(tasks("test"))),
-    ("docs/index", "and {} history in a task of source `noise`", noise_histories_of_a_task),
-    ("docs/index", "On coord_ring, {} heuristics give the ego headroom", heuristics_on_coord_ring),
-    ("docs/index", "rise by less than {} on average are left out", least_rise_of_the_bundle),
-    ("docs/index", "with {} million steps a member", teammate_steps_of_the_bundle),
     ("docs/evaluating", "There are {} published test tasks", lambda: len(tasks("test"))),
     ("docs/evaluating", "of {} episodes with {} steps each", lambda: (SEEDED.episodes, SEEDED.steps)),
     ("docs/evaluating", "canonical channels, the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
@@ -260,7 +154,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/protocol", "canonical channels takes (5, 5, {})", lambda: len(CANONICAL_CHANNELS)),
     ("docs/protocol", "its oldest {} is dropped", lambda: dropped_steps(500) / 500),
     ("docs/protocol", "*No headroom*: {} of the {} cells", cells_without_headroom),
-    ("docs/protocol", "The oracle earns {} to {} with each", oracle_on_test_wide),
     ("docs/protocol", "{} steps in profile `paper`", lambda: load_profile("paper").ego.shaping_horizon),
     ("docs/protocol", "`tiny`: {} layers of width {}, a dense encoder, K = {}", tiny_size),
     (
@@ -269,12 +162,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         lambda: (SIZES["small"].cpu_batch, TINY_SIZE.cpu_batch),
     ),
     ("docs/protocol", "{} on attention weights (App. E.5)", lambda: ModelOptions().dropout),
-    (
-        "docs/protocol",
-        "the best {} of {} streams | in `small` the best {} of the {} of {} learners, if its end exceeds its start "
-        "by {}; tasks that rise by less than {}",
-        streams_of_profiles,
-    ),
     ("docs/protocol", "{} GRU layers of {}", lambda: (ModelOptions().recurrent_layers, ModelOptions().width)),
     ("docs/protocol", "for all {} training layouts", lambda: len(TESTED_ON)),
     ("docs/protocol", "a {} of the histories is held out", lambda: HistoryOptions(("demo_wide",)).held_out),
@@ -282,9 +169,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/generating", "A draw closer than {} to a test instance", lambda: SAME_BEHAVIOUR),
     ("docs/generating", "Draws of one family that are closer than {} to", lambda: SAME_BEHAVIOUR),
     ("docs/generating", "`oracle` differ by {} or more", lambda: LEAST_HEADROOM),
-    ("docs/generating", "test_wide, {} of the {} training draws of H3 act like H1/t0", draws_like_h1),
-    ("docs/generating", "None is closer than {} to any test instance", diverse_distance),
-    ("docs/generating", "at most {} and {} of each layout and family", most_diverse),
     ("docs/generating", "Each artefact keeps {} checkpoints", lambda: POLICY_CHECKPOINTS),
     ("docs/generating", "each plays {} episodes of {} steps", lambda: (LABEL_EPISODES, KEPT_STEPS)),
     ("docs/generating", "grids of up to {} rows and {} columns", lambda: (MOST_ROWS, MOST_COLUMNS)),
@@ -308,8 +192,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         plan_of_the_paper,
     ),
     ("docs/choices", "{} behaviours on {} layouts have one so far", best_responses_by_split),
-    ("docs/choices", "the teammates of {} of the {} validation tasks", validation_without_headroom),
-    ("docs/choices", "also plays with {} recipes", lambda: 4 * settings_of_rl2("four_recipes")),
     ("docs/choices", "plays on {} rearranged versions", lambda: reference.TRACK_PLAY["layout"]["rearranged"]),
 ]
 """Page, text with {} for each number, and what computes these numbers."""
@@ -332,11 +214,3 @@ def test_stated_numbers_are_those_of_code_and_data(page, claim, compute):
         decimals = len(text.partition(".")[2]) if text not in WORDS else 3
         number = WORDS[text] if text in WORDS else float(text.replace(",", ""))
         assert number == pytest.approx(round(value, decimals)), f"{page}.md: {claim!r}: {text}, computed {value}"
-
-
-@pytest.mark.slow
-def test_alike_tasks_of_a_layout():
-    own = [task for task in tasks("test") if task.layout.name == "test_wide"]
-    ids = {task.task_id for task in own}
-    found = [[task.task_id for task in alike] for alike in find_behaviours(own) if len(alike) > 1]
-    assert found == [group for group in alike_tasks() if group[0] in ids]

@@ -6,13 +6,11 @@ import contextlib
 import dataclasses
 import io
 import json
-import os
 import pydoc
 import re
 import runpy
 import shutil
 import subprocess
-import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +19,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from fsspec.implementations.memory import MemoryFileSystem
 from icrl4aht_baselines.methods.registry import METHODS
 
@@ -35,6 +32,7 @@ from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_posi
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.writing.convert import to_release
+from tests.helpers.commands import run_cli, run_python
 from tests.helpers.damages import flip_bit
 from tests.helpers.paths import ROOT
 from tests.helpers.plugins import installed, write_package
@@ -116,11 +114,6 @@ def test_commands_are_accepted(page, request, tmp_path, monkeypatch):
         assert words in all_verbs(), words
 
 
-def run(arguments: list[str]) -> None:
-    result = CliRunner().invoke(cli, arguments)
-    assert result.exit_code == 0, result.output
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -130,7 +123,7 @@ def run(arguments: list[str]) -> None:
 )
 def test_first_commands(arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run(arguments)
+    run_cli(*arguments)
 
 
 @pytest.mark.slow
@@ -141,17 +134,8 @@ def test_hub_commands(tmp_path, monkeypatch):
     with hub_server(tmp_path / "hub") as hub:
         for page in ("publishing", "remote"):
             for arguments in commands(PAGES[page]):
-                run(arguments)
+                run_cli(*arguments)
         assert "README.md" in hub.files("you/icrl4aht")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arguments", commands(PAGES["scale"], "ray"), ids=" ".join)
-def test_ray_has_the_commands(arguments):
-    """The commands run in a process of their own, because importing Ray reads the environment."""
-    ray = Path(sys.executable).with_name("ray")
-    process = subprocess.run([ray, *arguments, "--help"], capture_output=True, text=True, check=False)
-    assert process.returncode == 0, process.stderr
 
 
 @EVERY_PAGE
@@ -290,12 +274,9 @@ def test_extending(tmp_path, monkeypatch):
     assert names["task"].teammate_family == "waiter"
     shutil.copy(tmp_path / "page/mine.jsonl", tmp_path)
     (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (package, ROOT)))}
     for line in blocks("sh", PAGES["extending"])[0].splitlines():
         line = line.replace("--profile smoke", "--profile tiny.toml").replace("--steps 2000", SMALL)
-        command = [sys.executable, "-m", "icrl4aht_data", *line.split()[1:]]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, f"{line}: {done.stderr}"
+        run_python("-m", "icrl4aht_data", *line.split()[1:], cwd=tmp_path, PYTHONPATH=str(package))
     report = (tmp_path / "runs/oracle/report/report.md").read_text(encoding="utf-8")
     assert "## Training tasks" in report and "| waiter | oracle |" in report
     assert json.loads((tmp_path / "runs/mean_open/config.json").read_text(encoding="utf-8"))["method"] == "mean_ad"

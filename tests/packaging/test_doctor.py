@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import h5py
 import pytest
-from click.testing import CliRunner
 from packaging.requirements import Requirement
 
+from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands import doctor
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.utils.install_hints import EXTRAS, RESTORE, install_command
+from tests.helpers.commands import run_cli, run_python
 from tests.helpers.random_releases import SHARD
+
+QUERY_JAX = doctor._query_jax
+verified_once = functools.cache(verify_release)
 
 
 @pytest.fixture
@@ -29,22 +31,22 @@ def elsewhere(tmp_path, monkeypatch) -> Path:
     for name in ("ICRL4AHT_OFFLINE", "HF_HUB_OFFLINE", "ICRL4AHT_REMOTE", "ICRL4AHT_CACHE_BYTES"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(doctor, "_query_jax", lambda: '["cpu", ["cpu"]]')
+    monkeypatch.setattr(doctor, "verify_release", verified_once)
     return tmp_path
 
 
-def run_doctor() -> tuple[dict[str, Any], str]:
-    """Run the command; returns its JSON and its text."""
-    text, as_json = (CliRunner().invoke(cli, ["doctor", *options]) for options in ((), ("--json",)))
-    facts = json.loads(as_json.output)
-    assert text.exit_code == as_json.exit_code == bool(facts["problems"]) == (not facts["ok"])
+def run_doctor(code: int = 0) -> tuple[dict[str, Any], str]:
+    """Run the command, which exits with `code`; returns its JSON and its text."""
+    text, facts = run_cli("doctor", code=code), json.loads(run_cli("doctor", "--json", code=code))
+    assert code == bool(facts["problems"]) == (not facts["ok"])
     for each in facts["problems"]:
-        assert f"problem: {each['problem']}\n   next: {each['next_step']}" in text.output
-    return facts, text.output
+        assert f"problem: {each['problem']}\n   next: {each['next_step']}" in text
+    return facts, text
 
 
 def problems() -> dict[str, str]:
     """Run the command; returns problem -> next step."""
-    return {each["problem"]: each["next_step"] for each in run_doctor()[0]["problems"]}
+    return {each["problem"]: each["next_step"] for each in run_doctor(1)[0]["problems"]}
 
 
 def test_no_problems(elsewhere):
@@ -66,13 +68,12 @@ def test_no_problems(elsewhere):
 
 
 def test_jax_is_imported_in_another_process(elsewhere):
-    code = (
-        "import sys; from icrl4aht_data.commands.doctor import diagnose;"
-        "print(diagnose()['devices'], 'jax' in sys.modules)"
+    done = run_python(
+        "-c",
+        "import sys; from icrl4aht_data.commands.doctor import diagnose; "
+        "print(diagnose()['devices'], 'jax' in sys.modules)",
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "'jax': {'backend': " in done.stdout
-    assert done.stdout.endswith("False\n")
+    assert "'jax': {'backend': " in done and done.endswith("False\n")
 
 
 def test_folders_that_cannot_be_written(elsewhere, monkeypatch):
@@ -102,6 +103,7 @@ def test_damaged_bundled_release(elsewhere, monkeypatch, damaged):
     shard = damaged / SHARD
     shard.write_bytes(shard.read_bytes()[:-1])
     monkeypatch.setattr(doctor, "MINI", damaged)
+    monkeypatch.setattr(doctor, "verify_release", verify_release)
     ((problem, step),) = problems().items()
     assert problem.startswith(f"the bundled release, {SHARD}: ")
     assert step == RESTORE
@@ -121,14 +123,12 @@ def test_versions_that_are_not_accepted(elsewhere, monkeypatch):
     monkeypatch.setattr(doctor, "version", version)
     found = problems()
     assert found.pop("numpy 1.26.4: expected >=2.1") == "pip install -U 'numpy>=2.1'"
-    assert set(found) == {"matplotlib 3.0: expected >=3.9", "rich is not installed: expected >=13"}, (
-        "extras are optional"
-    )
-    assert f"pillow: not installed: {install_command('plot')}" in run_doctor()[1]
+    assert set(found) == {"matplotlib 3.0: expected >=3.9", "rich is not installed: expected >=13"}
+    assert f"pillow: not installed: {install_command('plot')}" in run_doctor(1)[1], "extras are optional"
 
 
 def test_broken_jax(elsewhere, monkeypatch):
-    monkeypatch.undo()
+    monkeypatch.setattr(doctor, "_query_jax", QUERY_JAX)
     monkeypatch.setattr(doctor, "_JAX_CODE", "raise ImportError('libcuda.so is another version')")
     assert any("JAX cannot be used: ImportError: libcuda.so" in problem for problem in problems())
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import click
 import pytest
-from click.testing import CliRunner
 
 from icrl4aht_data.commands.cli import VerbGroup, all_verbs, cli
 from icrl4aht_data.commands.verbs import Verb
+from tests.helpers.commands import run_cli, run_python
 from tests.packaging.test_readme import understand
 
 PUBLIC = (
@@ -43,8 +43,7 @@ def test_every_command_exists():
 @pytest.mark.parametrize("words", all_verbs())
 def test_help(words):
     command = find(all_verbs()[words])
-    result = CliRunner().invoke(cli, [*words.split(), "--help"])
-    assert result.exit_code == 0, result.output
+    run_cli(*words.split(), "--help")
     assert (command.help or "").splitlines()[0] == all_verbs()[words].help, "the table and the command's own text"
     assert command.get_short_help_str(62) == all_verbs()[words].help, "a list of commands shows it completely"
     for option in command.params:
@@ -55,17 +54,15 @@ def test_the_programs_help_imports_no_command():
     """No JAX either; it takes less than half a second of CPU time on one core, mostly for NumPy."""
     code = "import sys; from icrl4aht_data.commands.cli import cli; cli(['--help'], standalone_mode=False); "
     code += "print('loaded:', *sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    text, _, loaded = done.stdout.partition("loaded: ")
-    assert all(f"\n  {name} " in text for name in PUBLIC.split()), done
+    text, _, loaded = run_python("-c", code).partition("loaded: ")
+    assert all(f"\n  {name} " in text for name in PUBLIC.split()), text
     targets = {verb.target.partition(":")[0] for verb in all_verbs().values()}
     assert not {*targets, "jax", "h5py", "rich", "icrl4aht_data.dataset"} & {*loaded.split()}
 
 
 def test_a_research_command_without_its_group_is_named():
-    result = CliRunner().invoke(cli, ["draws", "--overwrite"])
-    assert result.exit_code == 2
-    assert "icrl4aht-data research draws --overwrite" in result.output
+    printed = run_cli("draws", "--overwrite", code=2)
+    assert "icrl4aht-data research draws --overwrite" in printed
 
 
 def examples() -> list[str]:

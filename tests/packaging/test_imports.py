@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
 from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from typing import NamedTuple
 
-from tests.helpers.paths import PACKAGES, ROOT
+from tests.helpers.commands import run_python
+from tests.helpers.paths import PACKAGES
 
 ORDER = {
     "": "icrl4aht_data icrl4aht_generation icrl4aht_baselines benchmarks tests",
@@ -128,7 +127,6 @@ def test_baselines_use_only_what_playing_needs():
 
 def test_importing_the_reader_loads_nothing_heavy():
     code = "import sys, icrl4aht_data; print(sorted({name.split('.')[0] for name in sys.modules}))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    loaded = ast.literal_eval(done.stdout)
+    loaded = ast.literal_eval(run_python("-c", code))
     assert "numpy" in loaded
     assert not HEAVY & set(loaded)

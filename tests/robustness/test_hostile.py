@@ -15,20 +15,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
 from safetensors.numpy import save_file
 
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import Icrl4ahtError, IndexFormatError, OptionError, UnsafePathError
 from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.utils.files import atomic_write, parse_json, resolve_inside
-from tests.robustness.hostile.cases import CASES
+from tests.helpers.commands import run_cli
+from tests.robustness.hostile.cases import CASES, TERABYTE
 from tests.robustness.hostile.run import bound_process, make_bases, run_case
-from tests.robustness.hostile.spoil import TERABYTE
 
 SECONDS = 400
 """Time for one case."""
@@ -115,8 +113,7 @@ def test_names_are_not_read_as_markup(damaged):
     path = damaged / "meta" / "histories.jsonl"
     path.write_text(path.read_text().replace("_coord_", "[/b][link=file:///]_coord_"))
     write_manifest(damaged)
-    result = CliRunner().invoke(cli, ["list", str(damaged)], catch_exceptions=False)
-    assert "[/b][link=file:///]" in result.output
+    assert "[/b][link=file:///]" in run_cli("list", damaged)
 
 
 def test_the_depth_of_json_is_limited():

@@ -10,23 +10,19 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.agents import bundled
 from icrl4aht_baselines.agents.bundled import MODEL_CARD, MODELS, bundle_run, bundled_models
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.commands.options import find_ego
-from icrl4aht_baselines.evaluate.evaluator import evaluate
-from icrl4aht_baselines.evaluate.protocols import get_protocol
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
-from icrl4aht_generation.teammates.instances import published_task
 from PIL import Image
 
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
+from tests.helpers.commands import run_cli
 
 MODEL = ModelOptions(layers=1, width=8, heads=2, encoder="mlp")
 OPTIONS = TrainOptions(steps=1, batch_size=2, context=6)
@@ -59,12 +55,10 @@ def test_bundling_copies_the_parameters_of_the_run(run, models):
         assert copied.size == drawn.size and copied.mode == "P"
 
 
-def test_a_bundled_model_is_evaluated_under_its_name(run, models, tmp_path):
-    task, protocol = published_task("demo_wide", "H4/t0"), get_protocol("seeded", 2)
+def test_a_bundled_model_has_a_name_and_its_training_record(run, models):
     agent = find_agent("ad-tiny")
-    (found,) = evaluate(agent.name, agent.make, [task], protocol, out=tmp_path / "results", details=agent.details)
-    assert found.settings["agent"] == found.settings["details"]["model"] == "ad-tiny"
-    assert found.settings["details"]["trained_on"] == {"teammate": read_trained(run).trained_on}
+    assert agent.details and agent.name == agent.details["model"] == "ad-tiny"
+    assert agent.details["trained_on"] == {"teammate": read_trained(run).trained_on}
 
 
 def test_a_bundled_model_keeps_its_play_mode(run, tmp_path, monkeypatch):
@@ -76,8 +70,9 @@ def test_a_bundled_model_keeps_its_play_mode(run, tmp_path, monkeypatch):
     assert find_ego("--agent", "ad-drawn", acting="exact", greedy=None).name == "ad-drawn"
     assert find_ego("--agent", "ad-drawn", greedy=True).name == "ad-drawn (greedy)"
     assert find_ego("--agent", str(run), greedy=False).name == "AD+mlp (sampled)"
-    result = CliRunner().invoke(cli, ["models"], catch_exceptions=False)
-    assert result.output.endswith("(source noise), draws its actions\n")
+    assert run_cli("models").endswith("(source noise), draws its actions\n")
+    with pytest.raises(UnknownNameError, match=r"unknown acting 'exat'.*Did you mean 'exact'"):
+        find_agent(run, acting="exat")  # type: ignore[arg-type]
 
 
 def test_layouts_outside_the_track_are_refused(models):
@@ -126,24 +121,13 @@ def test_parameters_of_another_model_are_refused(run, tmp_path):
     out = str(tmp_path / "out")
     arguments = ["train", "ad", "--layout", "demo_wide", "--channels", "canonical", "--out", out, "--init", str(run)]
     small = ["--steps", "1", "--batch-size", "2", "--context", "6", "--heads", "2", "--dropout", "0.1"]
-    result = CliRunner().invoke(cli, [*arguments, *small, "--layers", "1", "--width", "12", "--positions", "none"])
-    message = f"{run}: its parameters are of another model (width = 8, not 12): give its options, or another run"
-    assert isinstance(result.exception, OptionError) and str(result.exception) == message
+    with pytest.raises(OptionError, match=r"run: its parameters are of another model \(width = 8, not 12\): give its"):
+        run_cli(*arguments, *small, "--layers", "1", "--width", "12", "--positions", "none")
     assert not Path(out).exists()
 
 
 def test_models_command(models):
-    result = CliRunner().invoke(cli, ["models"], catch_exceptions=False)
-    assert result.exit_code == 0
-    assert re.search(
-        r"^ad-tiny: ; N – on track teammate, N – on track layout, M –; of 20\d\d-\d\d-\d\d\n", result.output
-    )
-    assert "\n  track teammate: AD+mlp, " in result.output
-    assert "parameters, K = 6, 1 steps on demo_wide (source noise)" in result.output
-
-
-class TestPlayMode:
-    def test_play_modes_change_the_agents_name(self, run):
-        assert find_agent(run, greedy=False).name == "AD+mlp (sampled)"
-        with pytest.raises(UnknownNameError, match=r"unknown acting 'exat'.*Did you mean 'exact'"):
-            find_agent(run, acting="exat")  # type: ignore[arg-type]
+    printed = run_cli("models")
+    assert re.search(r"^ad-tiny: ; N – on track teammate, N – on track layout, M –; of 20\d\d-\d\d-\d\d\n", printed)
+    assert "\n  track teammate: AD+mlp, " in printed
+    assert "parameters, K = 6, 1 steps on demo_wide (source noise)" in printed

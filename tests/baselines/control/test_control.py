@@ -5,11 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.control import control, worlds
 from icrl4aht_generation.policy import Policy
 
-from icrl4aht_data.commands.cli import cli
+from tests.helpers.commands import run_cli
 
 TINY = control.ControlSize(bandit_steps=4, room_episodes=2, rows=64, tasks=4, updates=(2, 2, 2), batch_size=4)
 
@@ -52,18 +51,16 @@ def test_sources_learn():
 def test_the_command_fails_if_a_check_fails(tmp_path, monkeypatch, quantity, code):
     check = control.ControlCheck("bandits", "AD", quantity, 1.0, 2.0, "")
     monkeypatch.setattr(control, "run_control", lambda folder, done: [check])
-    result = CliRunner().invoke(cli, ["control", "--out", str(tmp_path)])
-    assert result.exit_code == code, result.output
-    assert ("FAIL" in result.output) == bool(code)
+    printed = run_cli("control", "--out", tmp_path, code=code)
+    assert ("FAIL" in printed) == bool(code)
 
 
 @pytest.mark.slow
 def test_a_tiny_control_runs_and_fails(tmp_path, monkeypatch):
     monkeypatch.setattr(control.run_control, "__defaults__", (TINY, lambda name, total, step, loss: None))
-    result = CliRunner().invoke(cli, ["control", "--out", str(tmp_path)])
-    assert result.exit_code == 1, result.output
-    assert result.output.count("FAIL") >= 2
+    printed = run_cli("control", "--out", tmp_path, code=1)
+    assert printed.count("FAIL") >= 2
     # A model without its context cannot have twice the regret of the algorithm within four steps.
-    assert "FAIL  bandits    AD, context cut off" in result.output
+    assert "FAIL  bandits    AD, context cut off" in printed
     parts = {path.name for path in tmp_path.iterdir() if path.is_dir()}
     assert parts == {"dpt_on_bandits", "ad_on_bandits", "ad_in_dark_room"}

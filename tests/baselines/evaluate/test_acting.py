@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import find_agent
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
@@ -20,9 +19,9 @@ from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions,
 from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_generation.teammates.instances import published_tasks
 
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.utils.hashes import file_hash
+from tests.helpers.commands import run_cli
 from tests.helpers.small_models import random_parameters
 from tests.servers.http import http_server
 
@@ -60,10 +59,8 @@ def test_the_evaluator_plays_trained_models(runs, tmp_path):
 class TestBadRuns:
     def test_a_layout_that_does_not_fit(self, runs, tmp_path):
         arguments = ["evaluate", "--agent", str(runs / "ad"), "--layout", "coord_simple", "--out", str(tmp_path)]
-        result = CliRunner().invoke(cli, arguments)
-        assert isinstance(result.exception, OptionError)
-        message = "trained on demo_wide with observations (5, 5, 45); coord_simple has (5, 5, 40)"
-        assert message in str(result.exception)
+        with pytest.raises(OptionError, match=r"trained on demo_wide with observations \(5, 5, 45\); coord_simple has"):
+            run_cli(*arguments)
 
     def test_folders_without_a_run(self, runs, tmp_path):
         with pytest.raises(UnknownNameError, match="unknown agent 'no/where'; valid: stay, random, oracle, search"):
@@ -100,15 +97,15 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
     small = ["--steps", "1", "--batch-size", "2", "--context", "4"]
     with http_server(lite[0]) as server:
         arguments = ["train", "ad", "--layout", "demo_wide", "--root", server.url, "--out", str(tmp_path / "run")]
-        result = CliRunner().invoke(cli, [*arguments, *small], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-        assert "1 step in" in result.output
-        again = CliRunner().invoke(cli, [*arguments, *small, "--ta"])
+        printed = run_cli(*arguments, *small)
+        assert "1 step in" in printed
+        with pytest.raises(OptionError, match=r"model\.teammate_actions: it has False, expected True"):
+            run_cli(*arguments, *small, "--ta")
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["model"].items() >= {"layers": 1, "width": 16, "heads": 2, "encoder": "words"}.items()
     assert (config["train"]["steps"], config["train"]["batch_size"]) == (1, 2)
-    assert "size tiny, the default on a CPU: layers 1, width 16, encoder words" in result.output
-    assert "K = 4, steps 1, batch size 2" in result.output
+    assert "size tiny, the default on a CPU: layers 1, width 16, encoder words" in printed
+    assert "K = 4, steps 1, batch size 2" in printed
     assert config["histories"]["sizes"] == {"train": 2, "histories": 1, "teammates": 3}
     (cell,) = config["trained_on"]
     named = {"layout": "demo_wide", "split": "train", "family": "H4", "algorithm": "utility_greedy", "source": "ppo"}
@@ -116,4 +113,3 @@ def test_the_train_command(lite, tmp_path, monkeypatch):
     assert config["histories"]["data_version"] == "0.0.1"
     assert config["histories"]["root"] == server.url
     assert config["histories"]["manifest_sha256"] == file_hash(lite[0] / "MANIFEST.sha256")
-    assert "model.teammate_actions: it has False, expected True" in str(again.exception)

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import find_agent, with_view
 from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate.evaluator import evaluate
@@ -27,10 +26,10 @@ from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task
 
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
+from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
 from tests.helpers.states import random_records
 
@@ -47,9 +46,8 @@ def trained(lite, tmp_path_factory) -> tuple[Path, str]:
     out = tmp_path_factory.mktemp("canonical") / "run"
     sizes = ["--steps", "1", "--batch-size", "4", "--context", "6", "--layers", "1", "--width", "8", "--heads", "2"]
     arguments = ["train", "ad", "--layout", "all", "--root", str(lite[0]), "--out", str(out)]
-    result = CliRunner().invoke(cli, [*arguments, *sizes, "--validation-batches", "0"], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return out, result.output
+    printed = run_cli(*arguments, *sizes, "--validation-batches", "0")
+    return out, printed
 
 
 def test_the_run(trained):

@@ -311,7 +311,14 @@ def test_acting_computes_what_training_computes(name):
     np.testing.assert_allclose(player(name, 4, False)(seen)[-1], last, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize(("context", "first", "positions"), [(12, 0, "none"), (4, 2, "none"), (4, 2, "rope")])
+@pytest.mark.parametrize(
+    ("context", "first", "positions"),
+    [
+        pytest.param(12, 0, "none", marks=pytest.mark.slow),
+        pytest.param(4, 2, "none", marks=pytest.mark.slow),
+        (4, 2, "rope"),
+    ],
+)
 def test_dpt_answers_from_the_transitions_of_finished_episodes(context, first, positions):
     method, params = tiny("dpt", positions=positions)
     seen = ego_inputs(11, episode=4)  # two finished episodes, and three steps of the third

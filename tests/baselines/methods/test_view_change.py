@@ -72,14 +72,6 @@ def test_mirrored_views_equal_views_on_the_mirrored_layout(rows, columns):
     assert seen > 0  # an agent held an item at some step
 
 
-@pytest.mark.parametrize(("rows", "columns"), MIRRORINGS)
-def test_mirroring_twice_changes_nothing(rows, columns):
-    view, actions = change(rows, columns), jnp.arange(6)
-    np.testing.assert_array_equal(view.actions(view.actions(actions)), actions)
-    obs = jnp.asarray(np.random.default_rng(0).integers(0, 20, (3, 5, 5, 46), dtype=np.uint8))
-    np.testing.assert_array_equal(view.observations(view.observations(obs)), obs)
-
-
 def test_a_hidden_recipe_indicator_looks_like_a_counter():
     """asymm_right differs from asymm_both only by the missing recipe indicator in the ego's room."""
     both, right = get_layout("asymm_both"), get_layout("asymm_right")

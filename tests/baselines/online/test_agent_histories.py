@@ -9,7 +9,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, stay
 from icrl4aht_baselines.online import agent_histories
 from icrl4aht_baselines.online.agent_histories import (
@@ -27,10 +26,10 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, teammate_id
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import LabelsMissingError, OptionError
 from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.overcooked.actions import STAY
+from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS
 
 CONFIG = NoiseConfig(2, 10, start=(1.0, 1.0), end=(0.0, 0.0))
@@ -197,16 +196,11 @@ def test_whom_teammates_take_turns_with(teammates):
         plan_swaps(tasks[:1], 10, 3)
 
 
-def test_what_labels_are_made_from():
-    layout = TEST_TASKS[0].layout
-    assert (AGENTS["oracle"](layout).label_view, cook(layout).label_view) == ("state", "ego")
-
-
 @pytest.mark.slow
 def test_the_command(tmp_path):
     choice = ["--layout", "cramped_up", "--teammate-family", "H3", "--histories", "1", "--episodes", "10"]
     arguments = ["collect", "--agent", "random", *choice, "--out", str(tmp_path / "release")]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0 and "describes it" in result.output
-    again = CliRunner().invoke(cli, arguments)
-    assert isinstance(again.exception, OptionError) and "--overwrite" in str(again.exception)
+    printed = run_cli(*arguments)
+    assert "describes it" in printed
+    with pytest.raises(OptionError, match="--overwrite"):
+        run_cli(*arguments)

@@ -13,7 +13,6 @@ from icrl4aht_baselines.online.adaptation import (
     HeadroomJob,
     adaptation_table,
     headroom_jobs,
-    read_adaptation,
     write_adaptation,
 )
 from icrl4aht_baselines.online.responses import (
@@ -113,11 +112,6 @@ def test_table_of_the_adaptation_headroom(tmp_path):
 def test_the_documented_headroom_is_the_bundled_one():
     page = (ROOT / "docs" / "preference.md").read_text(encoding="utf-8")
     assert adaptation_table(card_file("adaptation.json").parent, layouts=False) in page
-    (entry,) = read_adaptation(card_file("adaptation.json").parent)
-    differences = {name: round(of["informed"] - of["episodic"], 1) for name, of in entry["layouts"].items()}
-    for name in ("templates-0-46", "rooms-0-67", "templates-0-38"):
-        assert f"{differences.pop(name)} on {name}" in page
-    assert f"{min(differences.values())} to {max(differences.values())}" in page
 
 
 def test_every_task_must_be_played(tmp_path):
@@ -138,7 +132,7 @@ def test_tiny_trainings(tmp_path):
     before = (tmp_path / job.name / "result.json").read_bytes()
     job.run(lambda updates, speed: pytest.fail("trained again"))
     assert (tmp_path / job.name / "result.json").read_bytes() == before
-    tasks = {"all": [DEMO[0], DEMO[5], *tasks_of("teammate", "test_wide", "H1")[:1]]}
+    tasks = {"all": [DEMO[5], *tasks_of("teammate", "test_wide", "H1")[:1]]}
     for other in headroom_jobs(tasks, 1, TINY, tmp_path):
         other.run()
         assert set(other.returns()) == {task.task_id for task in tasks["all"]}

@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,23 +17,14 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.cells import FACING_OF
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import columns
-from tests.helpers.chromium import CHROMIUM, NEEDS_CHROMIUM
+from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, chromium, wait_until
 
-playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra browser")
 pytest.importorskip("starlette", reason="needs the extra play")
 
 pytestmark = [pytest.mark.slow, NEEDS_CHROMIUM]
 
 KEYS = {"up": "ArrowUp", "down": "ArrowDown", "left": "ArrowLeft", "right": "ArrowRight", "stay": ".", "interact": " "}
-STEPS, PHONE = 12, 390
-
-
-def wait_until(page: Any, condition: str, seconds: float = 30) -> None:
-    """Wait until a JavaScript expression is true."""
-    end = time.monotonic() + seconds
-    while not page.evaluate(condition):
-        assert time.monotonic() < end, condition
-        page.wait_for_timeout(20)
+STEPS = 12
 
 
 @pytest.fixture
@@ -54,19 +44,11 @@ def served(tmp_path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
 
 @pytest.fixture
 def page(served) -> Iterator[Any]:
-    """Open the page on a phone; check that it has no errors."""
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": PHONE, "height": 844}, has_touch=True)
-        page.set_default_timeout(60_000)
-        problems: list[str] = []
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("console", lambda message: problems.append(message.text))
-        page.goto(served[0])
+    """The page on a phone."""
+    with chromium() as open_page:
+        page = open_page(served[0], PHONE, has_touch=True)
         wait_until(page, "setup !== undefined")
         yield page
-        browser.close()
-        assert not problems
 
 
 def test_a_game_in_the_browser(page, served, tmp_path):

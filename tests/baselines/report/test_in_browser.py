@@ -11,14 +11,11 @@ from icrl4aht_baselines.report.page import write_page
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, ResultCell
 from PIL import Image
 
-from tests.helpers.chromium import CHROMIUM, NEEDS_CHROMIUM
+from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_phone, chromium
 from tests.helpers.evaluated import evaluated_run
-
-playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra browser")
 
 pytestmark = [pytest.mark.slow, NEEDS_CHROMIUM]
 
-PHONE = 390
 TOO_WIDE = """(width) => [...document.body.querySelectorAll("*")]
     .filter((element) => !element.closest(".wide, svg") && element.getBoundingClientRect().right > width + 0.5)
     .map((element) => element.outerHTML.slice(0, 100))"""
@@ -42,16 +39,9 @@ def file(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("dark", [False, True])
 def test_a_phone_does_not_scroll_sideways(file, dark):
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        scheme = "dark" if dark else "light"
-        page = browser.new_page(viewport={"width": PHONE, "height": 844}, color_scheme=scheme)
-        page.set_default_timeout(60_000)
-        page.goto(file.as_uri())
+    with chromium() as open_page:
+        page = open_page(file.as_uri(), PHONE, dark)
         page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true })")
         assert page.locator("section").count() == 6
         assert page.evaluate(TOO_WIDE, PHONE) == []
-        assert page.evaluate("document.documentElement.scrollWidth") == PHONE
-        shade = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
-        assert (max(shade) < 60) is dark
-        browser.close()
+        check_phone(page, dark)

@@ -9,7 +9,6 @@ from html import unescape
 from html.parser import HTMLParser
 
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines import report
 from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
@@ -23,8 +22,8 @@ from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, Resul
 
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import make_task, read_tasks, write_tasks
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
+from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS, evaluated_run
 
 GIF = b"GIF89a"  # the page does not decode the image
@@ -214,15 +213,13 @@ def test_commands_with_a_custom_manifest(tmp_path, monkeypatch):
     write_tasks(tmp_path / "own.jsonl", [make_task("teammate", "train", "demo_wide", theta | {"theta_id": 77}, 5)])
     monkeypatch.setitem(PROTOCOLS, "seeded", get_protocol("seeded").__class__("seeded", "seeded", False, 3, 5))
     played = ["evaluate", "--agent", "stay", "--manifest", str(tmp_path / "own.jsonl"), "--out", str(tmp_path / "run")]
-    result = CliRunner().invoke(cli, played, catch_exceptions=False)
     summary = (
         "stay (seeded), 1 training cell: return 0.0; by episode 1: 0.0, 2-5: 0.0. No score: no best response measured."
     )
-    assert summary in result.output
+    assert summary in run_cli(*played)
     arguments = ["report", str(tmp_path / "run"), "--html", str(tmp_path / "report.html")]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert f"* {summary}" in result.stdout
+    printed = run_cli(*arguments)
+    assert f"* {summary}" in printed
     text = (tmp_path / "report.html").read_text()
     assert Elements(text).images.count("data:image/gif") == 2
     (task,) = read_tasks(tmp_path / "own.jsonl")
@@ -231,7 +228,7 @@ def test_commands_with_a_custom_manifest(tmp_path, monkeypatch):
     assert re.findall(r"<figcaption>(Episode [^<]+)<", text) == ["Episode 1: return 0", "Episode 3: return 0"]
     (tmp_path / "run" / "tasks.jsonl").unlink()
     with pytest.raises(OptionError, match=r"is neither a published test task, .* nor in the results' tasks\.jsonl"):
-        CliRunner().invoke(cli, ["report", str(tmp_path / "run")], catch_exceptions=False)
+        run_cli("report", tmp_path / "run")
 
 
 def test_a_report_without_a_page(tmp_path):

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.evaluate.results import read_result
 from icrl4aht_baselines.report import comparison
 from icrl4aht_baselines.report.submission import (
@@ -18,8 +17,8 @@ from icrl4aht_baselines.report.submission import (
     write_submission,
 )
 
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
+from tests.helpers.commands import run_cli
 from tests.helpers.evaluated import TEST_TASKS, write_results
 
 CURVE = [0.0, *[10.0] * 4, *[20.5] * 95]
@@ -112,25 +111,24 @@ def test_the_commands(submitted, tmp_path, monkeypatch):
     monkeypatch.setattr(comparison, "results_file", lambda: tmp_path / "stored.json")
     folder = str(write_results(tmp_path / "mine", "mine", CURVE))
     said = ["--about", "a rule", "--data", "none", "--labels", "none", "--core-hours", "1.5", "--name", "my rule"]
-    runner = CliRunner()
-    result = runner.invoke(cli, ["submit", folder, *said, "--out", str(tmp_path / "mine.json")], catch_exceptions=False)
-    assert result.exit_code == 0 and "mine.json: my rule, layout;" in result.output
+    printed = run_cli("submit", folder, *said, "--out", tmp_path / "mine.json")
+    assert "mine.json: my rule, layout;" in printed
     assert read_submission(tmp_path / "mine.json").facts.core_hours == 1.5
-    assert json.loads(runner.invoke(cli, ["submit", "--schema"]).output)["$defs"]["AgentFacts"]
+    assert json.loads(run_cli("submit", "--schema"))["$defs"]["AgentFacts"]
     page = ["results", str(submitted), str(tmp_path / "mine.json"), "--out", str(tmp_path / "page")]
-    result = runner.invoke(cli, page, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    run_cli(*page)
     text = (tmp_path / "page" / "results.md").read_text(encoding="utf-8")
     assert "| `my rule` | none | none | 1.5 core-hours |" in text and "| `rule` † |" in text
-    result = runner.invoke(cli, [*page, "--overwrite", "--store"], catch_exceptions=False)
+    run_cli(*page, "--overwrite", "--store")
     assert list(comparison.read_stored(tmp_path / "stored.json").agents) == ["rule", "my rule"]
-    result = runner.invoke(cli, [*page, "--overwrite"])
-    assert result.exit_code == 1 and "the page has results of an agent rule already" in str(result.exception)
-    said = [*said[:-1], "Rule", "--out", str(tmp_path / "again.json")]
-    result = runner.invoke(cli, ["submit", folder, *said])
-    assert result.exit_code == 1 and f"{folder}: the page has results of an agent rule already" in str(result.exception)
-    result = runner.invoke(cli, ["submit", folder, *said, "--update"])
-    assert result.exit_code == 1 and "updates the agent Rule, which the page does not have" in str(result.exception)
+    said = ["submit", folder, *said[:-1], "Rule", "--out", str(tmp_path / "again.json")]
+    for words, message in (
+        ([*page, "--overwrite"], "the page has results of an agent rule already"),
+        (said, "mine: the page has results of an agent rule already"),
+        ([*said, "--update"], "updates the agent Rule, which the page does not have"),
+    ):
+        with pytest.raises(OptionError, match=message):
+            run_cli(*words)
 
 
 def test_another_way_of_playing_is_added(tmp_path):

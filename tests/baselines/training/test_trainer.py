@@ -383,8 +383,11 @@ class TestHeldOut:
 DEVICES = """
 import json, os, sys
 import jax
+import jax.experimental.multihost_utils
 if len(sys.argv) > 2:
     jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(os.environ["PROCESS"]))
+    # The processes connect now: later, one may still compile when the other has waited for 30 seconds, and fail.
+    jax.experimental.multihost_utils.sync_global_devices("start")
 from pathlib import Path
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.methods.options import ModelOptions

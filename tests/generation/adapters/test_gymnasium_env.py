@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
 from dataclasses import asdict
 from typing import Any
 
@@ -17,11 +14,10 @@ from icrl4aht_generation.adapters.gymnasium_env import TaskEnv, published_enviro
 from icrl4aht_generation.teammates.instances import published_task, published_tasks
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.environments import TASK_ENVIRONMENT, make_environment
+from icrl4aht_data.environments import TASK_ENVIRONMENT
 from icrl4aht_data.errors import NotStoredError, OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.utils.install_hints import install_command
-from tests.helpers.paths import ROOT
+from tests.helpers.commands import run_python
 
 NAME = "icrl4aht/demo_wide-H4-t0-v0"
 
@@ -48,8 +44,7 @@ def test_every_published_test_task_has_an_id():
 def test_the_prefix_of_an_id_imports_the_package():
     """Importing the package registers the ids, on which the other tests rely."""
     code = f"import gymnasium; print(gymnasium.make('icrl4aht_data:{NAME}').spec.id)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == NAME
+    assert run_python("-c", code).strip() == NAME
 
 
 def test_episodes_are_functions_of_the_seed(env):
@@ -111,7 +106,7 @@ def test_recorded_actions_lead_to_the_recorded_history(filters):
     assert returns.max() > 0
 
 
-@pytest.mark.parametrize("source", ["ppo", "noise"])
+@pytest.mark.parametrize("source", ["ppo", pytest.param("noise", marks=pytest.mark.slow)])
 def test_recovered_keys_reproduce_heuristics(source):
     """With the keys of a recorded episode, the teammate's policy plays as recorded without a script."""
     dataset, history = bundled(layout="demo_wide", source=source, teammate_family=["H1", "H2", "H3", "H4"])
@@ -168,11 +163,7 @@ def test_episodes_that_do_not_exist_are_errors():
     ("options", "error", "message"),
     [
         ({"stat": 0}, UnknownNameError, "Did you mean 'state'"),
-        (
-            {"state": np.zeros(3, np.uint8)},
-            OptionError,
-            r"state: expected integers in 0\.\.255 of shape \(\d+,\)",
-        ),
+        ({"state": np.zeros(3, np.uint8)}, OptionError, r"state: expected integers in 0\.\.255 of shape \(\d+,\)"),
         ({"state": "zeros"}, OptionError, "state: expected a state record of demo_wide, found a position that is not"),
         ({"teammate_actions": [0, 6]}, OptionError, r"teammate_actions: expected integers in 0\.\.5 .* values 0\.\.6"),
         ({"recipes": [1]}, OptionError, "recipes: expected items of demo_wide's recipes"),
@@ -206,9 +197,3 @@ def test_wrong_use_is_an_error():
             TaskEnv(task, **wrong)
     with pytest.raises(UnknownNameError, match="unknown teammate 'H9/t0'"):
         published_environment("demo_wide", "H9/t0")
-
-
-def test_without_gymnasium_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(OptionError, match=re.escape("needs gymnasium: " + install_command("gym"))):
-        make_environment(task={})

@@ -8,7 +8,6 @@ from itertools import cycle
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_generation.layouts import (
     canonical_map,
     check_solvable,
@@ -26,9 +25,9 @@ from icrl4aht_generation.layouts.solvable import faced_cells
 from icrl4aht_generation.layouts.templates import has_tested_rooms, published_rooms
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TRACKS
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from tests.helpers.commands import run_cli
 
 GOLDEN = {
     "rearranged": "40f6dac5bd75f870cf4813c9d5a9248dfaa7bb1315b5a03b4c6cfc9fd616d4ab",
@@ -180,18 +179,17 @@ def test_the_command_lists_and_draws(tmp_path):
 
     sheet = tmp_path / "sheet.png"
     arguments = ["layouts", "--family", "rooms", "--count", "8", "--split", "train", "--out", str(sheet)]
-    result = CliRunner().invoke(cli, arguments)
-    assert result.exit_code == 0, result.output
+    printed = run_cli(*arguments)
     wanted = generate_layouts("rooms", 0, 8, split="train")
-    lines = result.output.splitlines()
+    lines = printed.splitlines()
     assert [line.split()[:2] for line in lines[:-1]] == [[one.name, "train"] for one in wanted]
     assert lines[-1].startswith("wrote ")
     with Image.open(sheet) as picture:
         assert picture.width > 6 * 4 * 22 and picture.height > 2 * 4 * 22
-    refused = CliRunner().invoke(cli, arguments)
-    assert refused.exit_code == 1 and "--overwrite" in str(refused.exception)
-    result = CliRunner().invoke(cli, [*arguments, "--overwrite", "--json"])
-    found = json.loads(result.stdout)
+    with pytest.raises(OptionError, match="--overwrite"):
+        run_cli(*arguments)
+    printed = run_cli(*arguments, "--overwrite", "--json")
+    found = json.loads(printed[: printed.rindex("]") + 1])
     assert [(one["name"], tuple(one["rows"]), one["split"]) for one in found] == [
         (one.name, one.rows, "train") for one in wanted
     ]

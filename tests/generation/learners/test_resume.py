@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -31,6 +29,7 @@ from icrl4aht_generation.learners.resume import (
 from jax.sharding import SingleDeviceSharding
 
 from icrl4aht_data.errors import OptionError
+from tests.helpers.commands import run_python
 
 
 class State(NamedTuple):
@@ -100,10 +99,7 @@ def test_threads_are_limited_before_jax_is_used():
         "print(xla_threads(), sum('XLAEigen' in name for name in names))"
     )
     for threads in (1, 3):
-        process = subprocess.run(
-            [sys.executable, "-c", script.format(threads)], capture_output=True, text=True, check=True
-        )
-        assert process.stdout.split() == [str(threads)] * 2
+        assert run_python("-c", script.format(threads)).split() == [str(threads)] * 2
 
 
 class TestStateFile:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 
 import pytest
-from click.testing import CliRunner
 from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.planning import plan
 from icrl4aht_generation.profiles import load_profile
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.overcooked.layouts import get_layout
+from tests.helpers.commands import run_cli
 from tests.helpers.tiny import NOISE, artefact
 
 
@@ -71,10 +70,9 @@ def test_disk_of_artefacts(built):
 
 
 def test_the_command_measures_the_network(built):
-    found = json.loads(CliRunner().invoke(cli, ["plan", "--profile", str(built / "tiny.toml"), "--json"]).output)
+    found = json.loads(run_cli("plan", "--profile", built / "tiny.toml", "--json"))
     assert (found["tasks"], found["devices"]) == (1, 8)
     assert 0 < found["steps_per_second"] < plan.ENVIRONMENT_STEPS_PER_SECOND
-    result = CliRunner().invoke(cli, ["plan", "--profile", str(built / "tiny.toml"), "--devices", "2"])
-    assert result.exit_code == 0, result.output
+    printed = run_cli("plan", "--profile", built / "tiny.toml", "--devices", "2")
     for expected in ("environment steps", "disk, lite", "CPU cores", "hours on 2 devices"):
-        assert expected in result.output
+        assert expected in printed

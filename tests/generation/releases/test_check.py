@@ -7,20 +7,18 @@ import shutil
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_generation.learners.resume import xla_threads
 from icrl4aht_generation.releases.check import compare_rebuilds
 
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
+from tests.helpers.commands import run_cli
 from tests.helpers.tiny import artefact
 
 
 def test_equal_folders(built):
-    result = CliRunner().invoke(cli, ["check", str(built / "a"), str(built / "a")])
-    assert result.exit_code == 0
-    assert "bit-equal" in result.output
-    assert f"{built / 'a'}: made with {xla_threads()} XLA thread" in result.output
+    printed = run_cli("check", built / "a", built / "a")
+    assert "bit-equal" in printed
+    assert f"{built / 'a'}: made with {xla_threads()} XLA thread" in printed
 
 
 def test_different_thread_counts_are_reported(tmp_path):
@@ -28,7 +26,7 @@ def test_different_thread_counts_are_reported(tmp_path):
         (tmp_path / name / "meta").mkdir(parents=True)
         (tmp_path / name / "meta/provenance.json").write_text(json.dumps(records))
     assert compare_rebuilds(tmp_path / "a", tmp_path / "b").xla_threads == ([1, 2], [])
-    output = CliRunner().invoke(cli, ["check", str(tmp_path / "a"), str(tmp_path / "b")]).output
+    output = run_cli("check", tmp_path / "a", tmp_path / "b", code=1)
     assert f"{tmp_path / 'a'}: made with 1 and 2 XLA threads" in output
     assert f"{tmp_path / 'b'}: made with an unknown number of XLA threads" in output
 
@@ -47,9 +45,8 @@ def test_differences_are_reported(built, tmp_path):
     (theirs / "notes.txt").touch()
     for name in ("timing.jsonl", "labeller_returns.json"):
         (theirs / name).write_bytes(b"another clock")
-    result = CliRunner().invoke(cli, ["check", "--json", str(ours), str(theirs)])
-    assert result.exit_code == 1
-    compared = json.loads(result.output)
+    printed = run_cli("check", "--json", ours, theirs, code=1)
+    compared = json.loads(printed)
     found = compared["differences"]
     assert not compared["equal"]
     assert set(found) == {"actions.npy", "rewards.npy", "metrics.jsonl", "checkpoints/c2/policy.json", "notes.txt"}
@@ -59,9 +56,8 @@ def test_differences_are_reported(built, tmp_path):
     assert found["metrics.jsonl"].endswith(", line 3")
     assert found["checkpoints/c2/policy.json"] == f"only in {ours}"
     assert found["notes.txt"] == f"only in {theirs}"
-    text = CliRunner().invoke(cli, ["check", str(ours), str(theirs)])
-    assert text.exit_code == 1
-    assert "5 differ" in text.output
+    printed = run_cli("check", ours, theirs, code=1)
+    assert "5 differ" in printed
 
 
 def test_nothing_to_compare(tmp_path):

@@ -12,7 +12,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_generation.collection import job
 from icrl4aht_generation.collection import task_folder as artefacts
 from icrl4aht_generation.collection.task_folder import METADATA
@@ -27,7 +26,6 @@ from icrl4aht_generation.teammates.registry import recover_teammate
 from rich.console import Console
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import NearestTest
@@ -35,6 +33,7 @@ from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.writing.convert import to_release
+from tests.helpers.commands import run_cli
 from tests.helpers.tiny import LEARNED, TINY, artefact
 
 
@@ -170,8 +169,7 @@ def test_a_release_is_rebuilt_from_its_own_tasks_and_teammates(learned, tmp_path
     profile.write_text(LEARNED)
     given = ("--tasks", learned / "lite/meta/tasks.jsonl", "--suite", learned / "lite/teammates")
     arguments = ["generate", "--profile", profile, "--out", tmp_path / "again", *given]
-    result = CliRunner().invoke(cli, [str(part) for part in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    run_cli(*[str(part) for part in arguments])
     assert not (tmp_path / "again/suite").exists()
     compared = compare_rebuilds(learned / "lite", tmp_path / "again/lite")
     assert not compared.differences

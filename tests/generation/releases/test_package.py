@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.record import HistoryArrays
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA
@@ -26,12 +25,12 @@ from msgspec.structs import replace as replace_fields
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LABEL_EPISODES
 from icrl4aht_data.benchmark.tasks import Task, make_task
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import NearestTest, ReferenceEgos, read_provenance
 from icrl4aht_data.overcooked.layouts import LAYOUTS
+from tests.helpers.commands import run_cli
 from tests.helpers.tiny import artefact
 
 MATTERS = TeammateFacts(ReferenceEgos(0.0, 1.0, 40.0, 20), NearestTest("H4/t0", 0.25, 3))
@@ -207,8 +206,8 @@ def test_noise_histories_are_labelled_by_their_script(built, profile, tmp_path):
     assert recorded_sources(root) == {task.task_id: "noise"}
     assert recorded_sources(tmp_path) == {}
     arguments = ["--profile", built / "tiny.toml", "--tasks", root / "meta/tasks.jsonl", "--out", tmp_path / "out"]
-    result = CliRunner().invoke(cli, ["generate", *map(str, arguments)])
-    assert f"task {task.task_id}: its source is noise, those of profile tiny are ppo" in str(result.exception)
+    with pytest.raises(OptionError, match=f"task {task.task_id}: its source is noise, those of profile tiny are ppo"):
+        run_cli("generate", *arguments)
     without = pack(tmp_path, replace(both, oracle_actions=False), [work], {task.task_id: MATTERS})
     assert not any(entry.has_oracle_actions for entry in load_icrl4aht(without).entries)
 

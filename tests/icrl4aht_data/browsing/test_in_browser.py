@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,8 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.render import draw_frame
-from tests.helpers.chromium import CHROMIUM, NEEDS_CHROMIUM
+from tests.helpers.chromium import NEEDS_CHROMIUM, PHONE, check_phone, chromium, wait_until
 from tests.helpers.random_releases import random_release
-
-playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra browser")
 
 pytestmark = NEEDS_CHROMIUM
 
@@ -45,36 +42,15 @@ def file(dataset, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def open_page(file) -> Iterator[OpenPage]:
-    """Open the page in a new tab; check that it has no errors and requests no other file."""
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        problems: list[str] = []
+    """Open the page at an address in it, and wait for its data."""
+    with chromium() as open_address:
 
-        def opened(address: str = "", path: Path = file, width: int = 1280, dark: bool = False) -> Any:
-            scheme = "dark" if dark else "light"
-            page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
-            page.set_default_timeout(60_000)
-            page.on("pageerror", lambda error: problems.append(str(error)))
-            page.on("console", lambda message: problems.append(message.text))
-            page.on("request", lambda request: problems.append(request.url) if request.url[:5] == "http:" else None)
-            page.goto(f"{path.as_uri()}{address}")
+        def opened(address: str = "", path: Path = file, **options: Any) -> Any:
+            page = open_address(f"{path.as_uri()}{address}", **options)
             page.evaluate("opened")
             return page
 
         yield opened
-        browser.close()
-        assert not problems
-
-
-def wait_until(page: Any, condition: str) -> None:
-    """Wait until a JavaScript expression is true, for ten seconds at most.
-
-    Playwright's own function of this kind calls `eval` in the page, which the page's security policy forbids.
-    """
-    end = time.monotonic() + 10
-    while not page.evaluate(condition):
-        assert time.monotonic() < end, condition
-        page.wait_for_timeout(20)
 
 
 def table_of(page) -> dict[str, str]:
@@ -195,11 +171,9 @@ def test_playing_ends_with_the_episode_and_can_pause(open_page):
 
 @pytest.mark.parametrize("dark", [False, True])
 def test_a_phone_does_not_scroll_sideways(open_page, dark):
-    page = open_page("#history=0&episode=1&step=3&ends=1", width=390, dark=dark)
+    page = open_page("#history=0&episode=1&step=3&ends=1", width=PHONE, dark=dark)
     assert page.locator(".pane").count() == 2
-    assert page.evaluate("document.documentElement.scrollWidth") == 390
-    shade = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
-    assert (max(shade) < 60) is dark
+    check_phone(page, dark)
     page.close()
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,7 +22,6 @@ from icrl4aht_data.browsing.page import (
     spread_episodes,
     spread_histories,
 )
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError, UnknownNameError
 from icrl4aht_data.format.layouts_file import layout_title
 from icrl4aht_data.overcooked.drawing import state_parts
@@ -31,6 +29,7 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.browser_pages import embedded, episodes
+from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
 from tests.helpers.states import random_records
 
@@ -45,11 +44,7 @@ def release(tmp_path_factory) -> Path:
 
 
 def browse(*arguments: object, code: int = 0) -> str:
-    result = CliRunner().invoke(cli, ["browse", *map(str, arguments)])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == code, result.output
-    return result.output
+    return run_cli("browse", *arguments, code=code)
 
 
 def assert_embeds(page: bytes, dataset, shown: int | None = None) -> None:

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
 from icrl4aht_data import verify_release
-from icrl4aht_data.commands.cli import cli
+from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from tests.helpers.commands import run_cli
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import make_tasks
 from tests.helpers.spoiled import problems, spoil
@@ -58,21 +58,13 @@ class TestVerify:
         assert any("history 1: dones: expected 5 episodes of 20 steps, found 6" in line for line in found), found
 
 
-class TestCommand:
-    def run(self, *arguments: Any, code: int = 0) -> str:
-        result = CliRunner().invoke(cli, [str(a) for a in arguments])
-        assert result.exit_code == code, (result.output, result.exception)
-        return result.output if result.exception is None or code == 2 else f"{result.output}{result.exception}"
-
-    def test_convert_lists_missing_options(self, published_folder, tmp_path):
-        said = self.run("convert", published_folder[0], "--out", tmp_path / "out", "--kept-steps", KEPT)
-        assert said == f"{tmp_path / 'out'}: observations, no state records: nothing can be replayed or drawn\n"
-        self.run(
-            "convert", tmp_path / "out", "--out", tmp_path / "part", "--to", "observations", "--layout", "demo_wide"
-        )
-        self.run("convert", tmp_path / "out", "--out", tmp_path / "files", "--to", "published")
-        assert verify_release(tmp_path / "part").ok
-        assert "is made of state records" in self.run(
-            "convert", tmp_path / "out", "--out", tmp_path / "full", "--to", "full", code=1
-        )
-        assert "give the form to convert to" in self.run("convert", tmp_path / "out", "--out", tmp_path / "x", code=2)
+def test_convert_lists_missing_options(published_folder, tmp_path):
+    out = tmp_path / "out"
+    said = run_cli("convert", published_folder[0], "--out", out, "--kept-steps", KEPT)
+    assert said == f"{out}: observations, no state records: nothing can be replayed or drawn\n"
+    run_cli("convert", out, "--out", tmp_path / "part", "--to", "observations", "--layout", "demo_wide")
+    run_cli("convert", out, "--out", tmp_path / "files", "--to", "published")
+    assert verify_release(tmp_path / "part").ok
+    with pytest.raises(Icrl4ahtError, match="is made of state records"):
+        run_cli("convert", out, "--out", tmp_path / "full", "--to", "full")
+    assert "give the form to convert to" in run_cli("convert", out, "--out", tmp_path / "x", code=2)

@@ -19,17 +19,12 @@ from icrl4aht_data.commands.summaries import id_ranges
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.schema import FORMAT_VERSION
+from tests.helpers.commands import run_cli, run_python
 from tests.helpers.paths import ROOT
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess:
-    """Run the installed command in a subprocess."""
-    return subprocess.run([sys.executable, "-m", "icrl4aht_data", *arguments], capture_output=True, text=True)
-
-
 def test_list(lite):
-    result = CliRunner().invoke(cli, ["list", "--json", str(lite[0])])
-    rows = json.loads(result.output)
+    rows = json.loads(run_cli("list", "--json", lite[0]))
     assert [(row["layout"], row["histories"], row["transitions"]) for row in rows] == [
         ("coord_simple", 3, 360),
         ("coord_simple", 3, 360),
@@ -37,42 +32,37 @@ def test_list(lite):
         ("demo_wide", 3, 360),
     ]
     assert {(row["source"], row["expert_return"]) for row in rows} == {("ppo", None)}
-    text = CliRunner().invoke(cli, ["list", str(lite[0]), "--layout", "demo_wide"]).output
+    text = run_cli("list", lite[0], "--layout", "demo_wide")
     assert "demo_wide" in text
     assert "coord_simple" not in text
 
 
 def test_show_release_and_history(lite):
-    release = json.loads(CliRunner().invoke(cli, ["show", "--json", str(lite[0])]).output)
+    release = json.loads(run_cli("show", "--json", lite[0]))
     assert (release["kind"], release["histories"], release["format_version"]) == ("lite", 12, FORMAT_VERSION)
-    history = json.loads(CliRunner().invoke(cli, ["show", "--json", "--history", "7", str(lite[0])]).output)
+    history = json.loads(run_cli("show", "--json", "--history", "7", lite[0]))
     assert (history["history_id"], history["layout"], history["T"]) == (7, "demo_wide", 120)
     assert history["teammate"]["family"] == "utility_greedy"
-    assert "12 histories" in CliRunner().invoke(cli, ["show", str(lite[0])]).output
+    assert "12 histories" in run_cli("show", lite[0])
 
 
 def test_list_and_show_print_sources_learners_and_labels(two_sources):
     root = str(two_sources[0])
 
-    def say(*arguments: str) -> str:
-        result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-        return result.output
-
-    rows = json.loads(say("list", root, "--json", "--layout", "demo_wide"))
+    rows = json.loads(run_cli("list", root, "--json", "--layout", "demo_wide"))
     facts = [(row["split"], row["source"], row["learners"], row["histories"]) for row in rows]
     assert facts == [("train", "ppo", 2, 4)] * 2 + [("train", "noise", 1, 3)] * 2 + [("validation", "noise", 1, 3)] * 2
     assert {tuple(row["labels"]) for row in rows} == {("expert", "oracle")}
-    text = say("list", root, "--source", "noise", "--split", "validation")
+    text = run_cli("list", root, "--source", "noise", "--split", "validation")
     names, *lines = [line.split("\t") for line in text.splitlines()]
     found = [dict(zip(names, line, strict=True)) for line in lines]
     assert [(row["source"], row["labels"], row["expert_return"]) for row in found] == [
         ("noise", '["expert", "oracle"]', "5.0")
     ] * 4
-    shown = json.loads(say("show", root, "--json"))
+    shown = json.loads(run_cli("show", root, "--json"))
     assert (shown["splits"], shown["sources"]) == ({"train": 28, "validation": 12}, {"ppo": 16, "noise": 24})
     assert (shown["learners"], shown["labels"]) == (2, {"expert": 40, "oracle": 40})
-    assert "sources ppo (16), noise (24)" in say("show", root)
+    assert "sources ppo (16), noise (24)" in run_cli("show", root)
 
 
 @pytest.fixture
@@ -82,9 +72,8 @@ def on_terminal(monkeypatch):
     def say(*arguments: str) -> list[str]:
         monkeypatch.setenv("COLUMNS", "80")
         monkeypatch.setattr("icrl4aht_data.commands.release_commands.is_terminal", lambda: True)
-        result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-        return result.output.splitlines()
+        printed = run_cli(*arguments)
+        return printed.splitlines()
 
     return say
 
@@ -126,16 +115,14 @@ def test_filters_by_source_reach_every_command(two_sources, tmp_path):
         ["convert", root, "--source", "noise", "--to", "lite", "--out", out],
         ["verify", out, "--deep"],
     ):
-        result = CliRunner().invoke(cli, command)
-        assert result.exit_code == 0, result.output
+        run_cli(*command)
     assert read_info(tmp_path / "noise").histories == 24
 
 
 def test_show_plots(lite, tmp_path):
     from matplotlib.image import imread
 
-    result = CliRunner().invoke(cli, ["show", str(lite[0]), "--plot", str(tmp_path / "curves.png")])
-    assert result.exit_code == 0, result.output
+    run_cli("show", lite[0], "--plot", tmp_path / "curves.png")
     assert [path.name for path in tmp_path.iterdir()] == ["curves.png"]
     picture = imread(tmp_path / "curves.png")
     assert picture.shape[0] > 200
@@ -169,8 +156,8 @@ def test_commands_destroy_nothing(lite, full, tmp_path):
         assert result.exit_code != 0, command
         assert isinstance(result.exception, (SystemExit, OptionError)), (command, result.exception)
         assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before, command
-    result = CliRunner().invoke(cli, ["combine", ca, "--out", cb, "--overwrite", "-q"], catch_exceptions=False)
-    assert result.exit_code == 0 and read_info(tmp_path / "cb").kind == "lite"
+    run_cli("combine", ca, "--out", cb, "--overwrite", "-q")
+    assert read_info(tmp_path / "cb").kind == "lite"
 
 
 @pytest.mark.parametrize(("arguments", "code"), [(["list"], 0), (["show", "--json"], 0), (["list", "--nope"], 2)])
@@ -199,5 +186,4 @@ def test_a_closed_pipe_ends_a_command_quietly(program):
 
 
 def test_version():
-    result = subprocess.run([sys.executable, "-m", "icrl4aht_data", "--version"], capture_output=True, text=True)
-    assert result.stdout == f"icrl4aht-data {version('icrl4aht-data')}\n"
+    assert run_python("-m", "icrl4aht_data", "--version") == f"icrl4aht-data {version('icrl4aht-data')}\n"

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from click import BadParameter
-from click.testing import CliRunner
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import make_task, parse_task, read_tasks, task_fields, write_tasks
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.commands.options import LAYOUT
 from icrl4aht_data.errors import IndexFormatError, OptionError, TaskFormatError, UnknownNameError
 from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_tasks_and_layouts, write_layouts_file
@@ -26,6 +24,7 @@ from icrl4aht_data.overcooked import layouts as known_layouts
 from icrl4aht_data.overcooked.layouts import Layout, add_layouts, get_layout
 from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.utils.text import listed_names
+from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import make_tasks, random_release
 
 ROWS = ("WPWWW", "0A A1", "W   W", "WBWXW")
@@ -107,12 +106,10 @@ class TestRelease:
 
     def test_commands_take_their_names(self, root):
         """The names of a release's layouts are known once it is read, and those of the package's own tasks always."""
-        result = CliRunner().invoke(cli, ["list", str(root), "--layout", "mine-3-5"])
-        assert result.exit_code == 0, result.output
-        assert "mine-3-5" in result.output and "coord_simple" not in result.output
-        assert isinstance(
-            CliRunner().invoke(cli, ["list", str(root), "--layout", "nowhere"]).exception, UnknownNameError
-        )
+        printed = run_cli("list", root, "--layout", "mine-3-5")
+        assert "mine-3-5" in printed and "coord_simple" not in printed
+        with pytest.raises(UnknownNameError, match="unknown layout 'nowhere'"):
+            run_cli("list", root, "--layout", "nowhere")
         assert LAYOUT.convert("asymm_both_plain", None, None) == "asymm_both_plain"
         with pytest.raises(BadParameter, match="unknown layout 'nowhere'"):
             LAYOUT.convert("nowhere", None, None)

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from click.testing import CliRunner
 from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
 from icrl4aht_generation.teammates.instances import published_tasks
 
 from icrl4aht_data.benchmark import tasks
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import manifest_path, read_tasks, write_tasks
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import TaskFormatError
+from tests.helpers.commands import run_cli
 
 PUBLISHED_HASHES = """
 grounded_coord_simple recipe_aware_button 9bc579c9 57546c8f ebc58b53 5f64c6e3 f465bd31
@@ -85,11 +84,10 @@ def test_bundled_manifests_are_the_diverse_tasks(track, split):
 def test_check_fails_on_a_difference(monkeypatch, tmp_path):
     short = tmp_path / "short.jsonl"
     tasks.write_tasks(short, published_tasks("layout")[:-1])
-    assert CliRunner().invoke(cli, ["research", "manifests", "--check"]).exit_code == 0
+    run_cli("research manifests --check")
     monkeypatch.setattr("icrl4aht_generation.commands.manifest_path", lambda track, split, teammates="": short)
-    result = CliRunner().invoke(cli, ["research", "manifests", "--check"])
-    assert result.exit_code == 1
-    assert "differs from the parameter sets or draws" in str(result.exception)
+    with pytest.raises(TaskFormatError, match="differs from the parameter sets or draws"):
+        run_cli("research manifests --check")
 
 
 @pytest.mark.parametrize(

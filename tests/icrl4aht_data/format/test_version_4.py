@@ -22,8 +22,7 @@ from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
-from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
-from tests.helpers.random_releases import SHARD, make_tasks, random_history, random_release
+from tests.helpers.random_releases import SHARD, one_history_release, random_release
 from tests.helpers.spoiled import problems, spoiled
 
 SCRIPT = ExpertLabels(None, "the oracle's", return_greedy=40.0, episodes=200)
@@ -155,26 +154,22 @@ def last(content: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda a: a.update(oracle_actions=a["oracle_actions"] + 3), "oracle_actions: expected 0..5, found 3.."),
-        (lambda a: a.update(expert_actions=(a["oracle_actions"] + 1) % 6), "differ from the script's, oracle_actions"),
+        (lambda a: {"oracle_actions": a["oracle_actions"] + 3}, "oracle_actions: expected 0..5, found 3.."),
+        (lambda a: {"expert_actions": (a["oracle_actions"] + 1) % 6}, "differ from the script's, oracle_actions"),
     ],
 )
 def test_false_arrays_are_found(tmp_path, change, message):
-    (task,) = make_tasks(["demo_simple"])
-    arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
-    arrays["oracle_actions"] = arrays["expert_actions"]
-    change(arrays)
-    new = NewTask(task, Provenance(source="noise"), 1, lambda: [NewHistory(0, arrays)])
-    root = write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
+    def changed(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        labelled = arrays | {"oracle_actions": arrays["expert_actions"]}
+        return labelled | change(labelled)
+
+    root = one_history_release(tmp_path / "r", changed, provenance=Provenance(source="noise"))
     assert message in "\n".join(problems(root))
 
 
 def test_a_learner_that_provenance_does_not_have_is_not_written(tmp_path):
-    (task,) = make_tasks(["demo_simple"])
-    arrays = random_history(task.layout, 6, 20, np.random.default_rng(5))
-    new = NewTask(task, Provenance(learners=2), 1, lambda: [NewHistory(0, arrays, learner=2)])
     with pytest.raises(OptionError, match="learner: expected 0 to 1, since provenance has 2 learners, found 2"):
-        write_release(tmp_path / "r", "lite", [new], data_version="0.0.1", card="", kept_steps=20)
+        one_history_release(tmp_path / "r", provenance=Provenance(learners=2), learner=2)
     assert not (tmp_path / "r").exists()
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import sys
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -15,7 +12,6 @@ from icrl4aht_data.overcooked.cells import COOKED, INDICATOR, PLATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.render import draw_frame, save_episode
 from icrl4aht_data.overcooked.state import columns
-from icrl4aht_data.utils.install_hints import install_command
 from tests.helpers.states import random_records, state_record
 
 CELL = 32
@@ -150,9 +146,3 @@ def test_wrong_input_is_refused_with_what_was_expected_and_found(tmp_path):
         with pytest.raises(OptionError, match=match):
             call()
     assert not list(tmp_path.iterdir())
-
-
-def test_without_pillow_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "PIL.Image", None)
-    with pytest.raises(OptionError, match=re.escape(install_command("plot"))):
-        draw_frame(COORD, state_record(COORD, (2, 2, "up"), (5, 2, "up"))[0])

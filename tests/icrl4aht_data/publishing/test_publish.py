@@ -13,19 +13,17 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import OptionError, ReleaseError
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.publishing.build import build_release
-from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
+from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_history, random_release
 
@@ -102,17 +100,6 @@ def test_it_contains_the_source_and_is_valid(release, published):
     }
     for name in ("LICENSE", "CITATION.cff"):
         assert (published / name).read_bytes() == (ROOT / name).read_bytes()
-
-
-def test_a_combination_has_a_new_card(published, tmp_path):
-    random_release(tmp_path / "other", "full", ("demo_wide",))
-    both = combine_releases(tmp_path / "both", [published, tmp_path / "other"])
-    card = (both / "README.md").read_text()
-    tasks = len((both / "meta/tasks.jsonl").read_text().splitlines())
-    assert f"* {len(load_icrl4aht(both)):,} histories of {tasks} tasks" in card
-    assert "![" not in card
-    assert verify_release(both).ok
-    assert verify_release(build_release(both, tmp_path / "out")).ok
 
 
 def test_an_invalid_source_is_refused(damaged, tmp_path):
@@ -230,8 +217,7 @@ def test_releases_of_observations_are_built(release, tmp_path):
 
 def test_the_command_builds(release, tmp_path):
     out = tmp_path / "out"
-    result = CliRunner().invoke(cli, ["release", "build", "--json", str(release), "--out", str(out)])
-    assert result.exit_code == 0, result.output
-    summary = json.loads(result.output)
+    printed = run_cli("release", "build", "--json", release, "--out", out)
+    summary = json.loads(printed)
     assert set(summary["files"]) == set(read_manifest(out))
     assert summary["bytes"] > 10_000

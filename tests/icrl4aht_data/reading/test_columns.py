@@ -36,16 +36,6 @@ def measured(tmp_path_factory):
     return root
 
 
-def test_columns_of_names_are_names(lite):
-    """Regression: names were integer codes, so comparisons with a name found nothing."""
-    dataset = load_icrl4aht(lite[0])
-    layouts = dataset.column("layout")
-    assert layouts.dtype.kind == "U"
-    assert (layouts == "demo_wide").sum() == 6
-    assert dataset.ids[layouts == "demo_wide"].tolist() == dataset.filter(layout="demo_wide").ids.tolist()
-    assert np.unique(dataset.select([7, 0]).column("layout")).tolist() == ["coord_simple", "demo_wide"]
-
-
 def test_every_column_agrees_with_the_entries(measured):
     dataset = load_icrl4aht(measured).select([7, 0, 3])
     for name in ENTRY_HINTS:

@@ -106,15 +106,6 @@ class TestPictures:
         with pytest.raises(NotStoredError, match="this release has observations only"):
             load_icrl4aht(tmp_path / "o")[0].animate()
 
-    def test_figures(self, dataset, tmp_path):
-        for number, holder in enumerate((dataset, dataset[0])):
-            picture = holder.plot()
-            assert picture.figure is not None
-            assert any(axes.get_lines() for axes in picture.figure.axes)
-            picture.save(tmp_path / f"{number}.svg")
-            assert (tmp_path / f"{number}.svg").read_bytes().startswith(b"<?xml ")
-            assert "data:image/png;base64," in picture._repr_html_()
-
 
 class TestSplit:
     @pytest.mark.parametrize("by", ["teammate", "history"])

@@ -8,18 +8,6 @@ from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, UnknownNameError
 
 
-def test_filters(two_sources):
-    root = two_sources[0]
-    assert len(load_icrl4aht(root)) == 2 * (8 + 6 + 6)
-    assert set(load_icrl4aht(root, source="ppo").column("split")) == {"train"}
-    validation = load_icrl4aht(root, split="validation", layout="demo_wide")
-    assert (len(validation), set(validation.column("source"))) == (6, {"noise"})
-    training = {str(task) for task in load_icrl4aht(root, split="train").column("task_id")}
-    assert not training & set(validation.column("task_id"))
-    both = load_icrl4aht(root, source=["ppo", "noise"], split=["train", "validation"])
-    assert len(both) == len(load_icrl4aht(root))
-
-
 def test_learners(two_sources):
     dataset = load_icrl4aht(two_sources[0], source="ppo", learner=1)
     assert (len(dataset), set(dataset.column("learner"))) == (8, {1})

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
 import pytest
 
-from tests.helpers.paths import ROOT
+from tests.helpers.commands import run_python
 
 FORK = """
 import os
@@ -64,14 +62,7 @@ def test_a_child_makes_batches(lite, tmp_path):
     """Regression: the child hung on locks of a thread that existed only in the parent."""
     script = tmp_path / "fork.py"
     script.write_text(FORK)
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "ICRL4AHT_CACHE_DIR": str(tmp_path / "cache")}
-    run = subprocess.run(
-        # Python from 3.12 on warns of every fork of a process with threads.
-        [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", script, lite[0], "ram", "mmap", "stream"],
-        capture_output=True,
-        text=True,
-        timeout=200,
-        env=environment,
-    )
-    assert run.returncode == 0, run.stderr
-    assert run.stdout.splitlines() == ["ram 0", "mmap 0", "stream 0"]
+    # Python from 3.12 on warns of every fork of a process with threads.
+    arguments = ["-W", "error", "-W", "ignore::DeprecationWarning", script, lite[0], "ram", "mmap", "stream"]
+    printed = run_python(*arguments, ICRL4AHT_CACHE_DIR=str(tmp_path / "cache"))
+    assert printed.splitlines() == ["ram 0", "mmap 0", "stream 0"]

@@ -20,8 +20,6 @@ from icrl4aht_data.format.provenance import (
     NearestTest,
     Provenance,
     ReferenceEgos,
-    StreamFilter,
-    StreamReturns,
 )
 from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, HISTORIES, INFO, PROVENANCE, TASKS
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
@@ -136,45 +134,6 @@ def test_teammates_that_act_like_the_test_are_named(write):
     assert content["alike"] == ["H3 on demo_wide like H1/t0"]
     card = render_card(content)
     assert "(distance below 0.02): H3 on demo_wide like H1/t0." in card and "0.02 or more, with the exceptions" in card
-
-
-def test_teammates_without_a_measured_distance(write):
-    tasks = four_tasks()
-    tasks[1] = (tasks[1][0], replace(tasks[1][1], nearest_test=None), tasks[1][2])
-    assert write(tasks)["tested"] == [], "the same teammate was measured in another task"
-    tasks[3] = (tasks[3][0], replace(tasks[3][1], nearest_test=None), tasks[3][2])
-    content = write(tasks)
-    assert content["tested"] == ["H1"] and not content["untested"]
-
-
-def test_kinds_of_teammates_and_what_is_missing(write):
-    tasks = four_tasks()
-    for number, theta in enumerate(({"action_probability": 0.0}, {"random_actions": 0.5}, {"random_actions": 0.0})):
-        teammate = {"kind": "heuristic", "family": "territory", "theta_id": number, "base_seed": 4, "theta": theta}
-        tasks.append((make_task("teammate", "train", "demo_wide", teammate, 0), made("noise"), [(0, 0.0, 1.0)]))
-    rows = {kind: row for kind, *row in write(tasks)["teammate_kinds"]}
-    assert rows["H3 (`assembly_line`)"] == ["1", "1", "0", "0", "coord_simple"], "two tasks, one teammate"
-    assert rows["H1 (`recipe_aware_button`)"] == ["1", "0", "0", "0", "demo_wide"]
-    own = ["H2 (`territory`)", "heuristic that never acts", "heuristic mixed with random actions"]
-    assert [rows[kind] for kind in own] == [["1", "0", "0", "0", "coord_simple"]] * 3
-    assert rows["learned by comedi"] == ["0", "0", "0", "0", "all"]
-
-
-def test_the_stream_filter_is_stated_by_layout(write):
-    before = StreamReturns(128, 1.0, 2.0)
-    least = {"demo_wide": 5.0, "coord_simple": None}
-    tasks = [
-        (task, replace(of, streams_recorded=128, streams_kept=1, filter=StreamFilter(before, before, least[name])), own)
-        for task, of, own in four_tasks()
-        for name in [task.layout.name]
-    ]
-    content = write(tasks)
-    assert content["streams"] == {(128, 1, 5.0): ["demo_wide"], (128, 1, None): ["coord_simple"]}
-
-
-def test_label_views_by_source(write):
-    content = write(label_view="state")
-    assert content["views"] == {"state": {"ppo": 3, "noise": 3}}
 
 
 def test_the_bundled_card_is_short_and_current():

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from icrl4aht_data import load_icrl4aht, verify_release
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.errors import FormatTooNewError, OptionError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import INFO, Kind
 from icrl4aht_data.writing.combine import combine_releases
+from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
 
 _FIELDS = ("state", "actions", "rewards", "dones", "teammate_actions", "expert_actions", "episode_end_state")
@@ -31,8 +30,7 @@ def parts(request, tmp_path_factory) -> list[Path]:
 
 def test_histories_are_those_of_the_parts(parts, tmp_path):
     arguments = ["combine", *map(str, parts), "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0
+    run_cli(*arguments)
     report = verify_release(tmp_path / "out", level="deep")
     assert report.ok, report.findings
     combined = load_icrl4aht(tmp_path / "out")

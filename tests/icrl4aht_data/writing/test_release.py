@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -22,43 +21,12 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.errors import OptionError, RootNotFoundError
 from icrl4aht_data.format.chunks import decode_chunk, encode_chunk
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import FIELDS
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
-from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.damages import contents
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import make_tasks, random_history, random_release
-
-
-def test_plain_h5py_reads_every_array(lite_or_full):
-    root, written = lite_or_full
-    for entry in load_icrl4aht(root).entries:
-        with h5py.File(root / entry.shard) as file:
-            for name, array in written[entry.history_id].items():
-                dataset: Any = file[f"{entry.h5_group}/{name}"]
-                found = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
-                np.testing.assert_array_equal(found, array)
-
-
-def test_full_has_the_papers_fields_and_dtypes(full):
-    root, _ = full
-    entry = load_icrl4aht(root).entries[0]
-    with h5py.File(root / entry.shard) as file:
-        group: Any = file[entry.h5_group]
-        dtypes = {name: str(group[name].dtype.base) for name in group if FIELDS[name].row != "state"}
-        assert group["obs"][:].shape == (entry.T, *entry.obs_shape)
-        assert group["state"][()].shape == (entry.T, record_size(get_layout(entry.layout)))
-        assert group["state"][()].dtype == np.uint8
-    assert dtypes == {
-        "obs": "uint8",
-        "actions": "int32",
-        "rewards": "float32",
-        "dones": "bool",
-        "teammate_actions": "int32",
-        "expert_actions": "int32",
-    }
 
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import teammate_id
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.dataset import teammate_ids, teammate_names
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.manifest import write_manifest
@@ -21,6 +19,7 @@ from icrl4aht_data.writing.card import facts, render_card
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
+from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
 
 
@@ -107,7 +106,7 @@ def test_a_malformed_teammate_is_refused():
 
 
 def test_show(swapped):
-    output = CliRunner().invoke(cli, ["show", str(swapped), "--history", "1", "--json"], catch_exceptions=False).output
+    output = run_cli("show", swapped, "--history", "1", "--json")
     entry = load_icrl4aht(swapped)[1].entry
     assert json.loads(output)["teammate_of_episode"] == [list(pair) for pair in entry.teammate_of_episode or ()]
 

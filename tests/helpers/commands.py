@@ -1,0 +1,47 @@
+"""Runs of the program, in this process and in others."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from click import Command
+from click.testing import CliRunner
+
+from icrl4aht_data.commands.cli import cli
+from tests.helpers.paths import ROOT
+
+
+def run_cli(*words: object, code: int = 0, program: Command = cli) -> str:
+    """Run a command of the program, check its exit code, and return what it prints; errors of the package are raised.
+
+    Args:
+        words: the command and its arguments, or one text of them.
+        code: exit code of the program.
+        program: the program, if it is another one.
+    """
+    arguments = words[0].split() if len(words) == 1 and isinstance(words[0], str) else [str(word) for word in words]
+    result = CliRunner().invoke(program, arguments)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def run_python(*arguments: object, code: int = 0, cwd: Path = ROOT, **environment: str) -> str:
+    """Run Python in a process of its own, check its exit code, and return what it prints on both streams.
+
+    Args:
+        arguments: of Python, such as "-c" and a program.
+        code: exit code of the process.
+        cwd: working folder.
+        environment: variables added to those of this process.
+    """
+    command = [sys.executable, *map(str, arguments)]
+    variables = os.environ | environment
+    variables["PYTHONPATH"] = os.pathsep.join([str(ROOT), variables.get("PYTHONPATH", "")])
+    done = subprocess.run(command, cwd=cwd, env=variables, capture_output=True, text=True, timeout=300)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
