@@ -32,7 +32,6 @@ from icrl4aht_data.benchmark.facts import (
     LABEL_EPISODES,
     LEAST_HEADROOM,
     SAME_BEHAVIOUR,
-    TESTED_ON,
     TRACKS,
 )
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, alike_tasks, has_headroom, read_headroom

@@ -17,7 +17,7 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, RolloutState
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.report.cards import model_card
+from icrl4aht_baselines.reference import model_card
 from icrl4aht_baselines.report.results import note_results, read_run
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
@@ -68,7 +68,7 @@ def test_evaluation_on_an_untrained_layout(trained, tmp_path):
     results = evaluate(agent.name, agent.make, [task], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(results[0].returns) == (1, 1)
     note_results(tmp_path, folder)
-    card = model_card(read_run(tmp_path), "x-y", "make", [], {})
+    card = model_card(read_run(tmp_path), "x-y", "make")
     assert "| cramped_down | `" in card and ", manifest with SHA-256 `" in card
 
 

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 from icrl4aht_baselines.report.gifs import family_gifs
 from icrl4aht_baselines.report.results import read_run
 from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS, save_policy
@@ -18,15 +17,10 @@ from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.network import ActorCritic
 
 from icrl4aht_data.benchmark.tasks import make_task, write_tasks
-from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
+from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
-
-
-def run(command: str) -> None:
-    result = CliRunner().invoke(cli, command, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
 
 
 @pytest.fixture
@@ -48,15 +42,17 @@ def test_a_model_plays_with_held_out_teammates(suite, tmp_path):
     release, trained, results = tmp_path / "release", tmp_path / "run", tmp_path / "results"
     random_release(release, layouts=("cramped_up",), teammates=1, streams=2, episodes=2)
     small = "--steps 1 --context 8 --batch-size 2 --validation-batches 1 --layers 1 --width 8 --heads 2 --ta --next-obs"
-    run(f"train dpt --root {release} --layout cramped_up {small} --out {trained}")
+    run_cli(f"train dpt --root {release} --layout cramped_up {small} --out {trained}")
     losses = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
     assert {"prior_accuracy", "next_obs_loss"} <= losses[-1].keys()
-    run(f"evaluate --agent {trained} --manifest {suite / 'heldout.jsonl'} --suite {suite} --episodes 2 --out {results}")
+    run_cli(
+        f"evaluate --agent {trained} --manifest {suite / 'heldout.jsonl'} --suite {suite} --episodes 2 --out {results}"
+    )
     about = json.loads((results / "run.json").read_text())
     assert about["config"]["histories"]["layouts"] == ["cramped_up"]
     assert about["manifest_sha256"] == file_hash(release / "MANIFEST.sha256")
 
-    run(f"report {results} --html {tmp_path / 'report.html'} --suite {suite}")
+    run_cli(f"report {results} --html {tmp_path / 'report.html'} --suite {suite}")
     table = pd.read_csv(results / "report" / "report.csv")
     assert table[["agent", "protocol", "layout", "family", "kind"]].drop_duplicates().to_numpy().tolist() == [
         ["DPT+TA+next_obs+mlp", "seeded", "cramped_up", "rl", "held out"]

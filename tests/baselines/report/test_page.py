@@ -12,8 +12,9 @@ import pytest
 from icrl4aht_baselines import report
 from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.headroom import write_headroom_cards
+from icrl4aht_baselines.reference import training_sentence
 from icrl4aht_baselines.report import gifs, merge, write_report
-from icrl4aht_baselines.report.cards import training_sentence, write_headroom_cards
 from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
 from icrl4aht_baselines.report.page import REPORT_FILES, markdown, write_page, write_page_with_episodes

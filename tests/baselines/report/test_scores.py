@@ -7,7 +7,15 @@ from io import StringIO
 import numpy as np
 import pandas as pd
 import pytest
-from icrl4aht_baselines.report.page import csv_text, markdown
+from icrl4aht_baselines.report.page import (
+    AVERAGE,
+    csv_text,
+    markdown,
+    published_cells,
+    published_score,
+    returns_tables,
+    table_score,
+)
 from icrl4aht_baselines.report.results import (
     BLOCKS,
     CellReturns,
@@ -20,17 +28,10 @@ from icrl4aht_baselines.report.scores import (
     block_difference,
     bundled_cells,
     cell_scales,
+    find_headlines,
     find_score,
     open_cells,
     score_difference,
-)
-from icrl4aht_baselines.report.tables import (
-    AVERAGE,
-    find_headlines,
-    published_cells,
-    published_score,
-    returns_tables,
-    table_score,
 )
 from msgspec import structs
 
