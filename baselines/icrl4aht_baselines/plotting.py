@@ -19,7 +19,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     teammate, on one axis. Thick lines are running means over a twentieth of the points, thin ones the points.
     """
     lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
-    numbers = pd.DataFrame(lines).melt(["step", "part"], var_name="panel").dropna()
+    numbers = pd.DataFrame(lines).melt(["step", "part"], var_name="panel", value_name="number").dropna()
     numbers["label"] = numbers["part"]
     # Returns are named "return <layout> [rearranged] <kind of teammate>".
     is_return = numbers["panel"].str.startswith("return ")
@@ -29,7 +29,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     numbers.loc[is_return, "panel"] = "return, " + words.str[1]
     if numbers["panel"].nunique() > MOST_PANELS:
         numbers.loc[is_return, "panel"] = "return, mean over layouts"
-    curves = numbers.groupby(["panel", "label", "step"], sort=False)["value"].mean()
+    curves = numbers.groupby(["panel", "label", "step"], sort=False)["number"].mean()
     panels, labels = (list(dict.fromkeys(curves.index.get_level_values(name))) for name in ("panel", "label"))
     returns = [name for name in panels if name.startswith("return, ")]
     limits = return_limits(float(value) for name in returns for value in curves[name])
