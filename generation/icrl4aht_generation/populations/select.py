@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS, layout_number, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
@@ -72,11 +72,8 @@ def select_teammates(
 
 def _members_in_turn(points: Sequence[SuiteCheckpoint]) -> list[SuiteCheckpoint]:
     """Return the first of each member in the given order, then the second of each, and so on."""
-    seen: Counter[int] = Counter()
-    turns = []
-    for point in points:
-        turns.append(seen[point.card["member"]])
-        seen[point.card["member"]] += 1
+    members = pd.Series([point.card["member"] for point in points], dtype=int)
+    turns = members.groupby(members).cumcount()
     return [points[k] for k in np.argsort(turns, kind="stable")]
 
 
