@@ -42,7 +42,7 @@ COMPILATION_CACHE: dict[str, Any] = {
 }
 COSTLIEST = """
 collect notebooks wheel reference generate run heuristics scripted suite fetch gymnasium_env rl2 docs models trainer
-rollout ppo population_updates oracle hostile faults experiments responses commands controls
+rollout ppo population_updates oracle hostile faults responses commands controls
 """
 """The files that take longest, in their order; `test_collect.py` makes what others read."""
 QUICK_COMPILATION = (

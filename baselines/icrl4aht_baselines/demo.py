@@ -12,12 +12,12 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from icrl4aht_baselines.agents.egos import find_agent
+from icrl4aht_baselines.agents.egos import NamedEgo, find_agent
 from icrl4aht_baselines.evaluate.protocols import Protocol, bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.plotting import panel_grid
 from icrl4aht_baselines.report.page import write_page
-from icrl4aht_baselines.report.results import EPISODE_BLOCKS, EvaluationRun, evaluate_agent
+from icrl4aht_baselines.report.results import EPISODE_BLOCKS, EvaluationRun, evaluate_agent, mean_of
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
 from icrl4aht_baselines.training.histories import prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
@@ -130,21 +130,20 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     tasks = settings.tasks or demo_tasks()
     say(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
     agent = find_agent(run, greedy=False)
-    runs = [
-        evaluate_agent(one, tasks, settings.protocol, out / "results" / one.name, seeds=settings.seeds)
-        for one in (agent, *map(find_agent, _AGENTS))
-    ]
-    cleared = evaluate_agent(
-        agent, tasks, settings.protocol, out / "results" / "cleared", seeds=settings.seeds, control="cleared"
-    )
-    runs.insert(1, cleared)
+
+    def played(one: NamedEgo, folder: str, **control: Any) -> EvaluationRun:
+        rules, where = settings.protocol, out / "results" / folder
+        return evaluate_agent(one, tasks, rules, where, seeds=settings.seeds, **control)
+
+    own, cleared = played(agent, agent.name), played(agent, "cleared", control="cleared")
+    runs = [own, cleared, *(played(find_agent(name), name) for name in _AGENTS)]
     write(block_table(runs).to_string())
 
     say(6, "drawing")
     draw_adaptation(runs, picture)
     write_page(runs, page)
     write(f"return by episode: {picture}\nreport: {page}")
-    write(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(runs[0], cleared)}")
+    write(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(own, cleared)}")
     return page
 
 
@@ -156,20 +155,15 @@ def demo_tasks() -> tuple[Task, ...]:
 def block_table(runs: Sequence[EvaluationRun]) -> pd.DataFrame:
     """Return the mean returns of some agents (rows) in the blocks of episodes that were played (columns)."""
     means = {
-        run.agent: {block: np.mean([row.mean() for row in rows]) for block, rows in _blocks(run).items()}
+        run.agent: {block: mean_of(of.blocks[block] for of in run.returns.values()) for block in _blocks(run)}
         for run in runs
     }
     return pd.DataFrame(means).T.map("{:z.1f}".format).rename(columns="episodes {}".format)
 
 
-def _blocks(run: EvaluationRun) -> dict[str, list[np.ndarray]]:
-    """Return block of episodes -> mean returns of each cell, (U, S)."""
-    found: dict[str, list[np.ndarray]] = {}
-    for of_cell in run.returns.values():
-        for block in EPISODE_BLOCKS:
-            if block in of_cell.blocks:
-                found.setdefault(block, []).append(of_cell.blocks[block][0])
-    return found
+def _blocks(run: EvaluationRun) -> list[str]:
+    """Return the blocks of episodes that were played."""
+    return [block for block in EPISODE_BLOCKS if all(block in of.blocks for of in run.returns.values())]
 
 
 def find_rise(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
@@ -181,10 +175,10 @@ def find_rise(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInt
         run: the results.
         other: results of another agent; if given, the difference is to its last block, not to the first episode.
     """
-    blocks = _blocks(run)
-    last = list(blocks)[-1]
+    last = _blocks(run)[-1]
+    base, block = (run, "1") if other is None else (other, last)
     return mean_interval(
-        *(a - b for a, b in zip(blocks[last], blocks["1"] if other is None else _blocks(other)[last], strict=True))
+        *(of.blocks[last][0] - base.returns[cell].blocks[block][0] for cell, of in run.returns.items())
     )
 
 

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pandas as pd
 
 from icrl4aht_data.plotting import MOST_PANELS, legend_below, new_figure, return_limits, running_mean, save_figure
-
-LogCurves = dict[str, dict[str, dict[int, list[float]]]]
-"""Panel -> curve -> training step -> values."""
-
-_RETURN = "return"
-"""First word of the names of returns in a log, "return <layout> [<variant>] <kind of teammate>"."""
 
 
 def plot_training_log(metrics: Path, path: Path, title: str) -> None:
@@ -25,22 +19,30 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     teammate, on one axis. Thick lines are running means over a twentieth of the points, thin ones the points.
     """
     lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
-    panels = _log_curves(lines, by_layout=True)
-    if len(panels) > MOST_PANELS:
-        panels = _log_curves(lines, by_layout=False)
-    labels = list(dict.fromkeys(label for curves in panels.values() for label in curves))
-    of_returns = [curve for name, curves in panels.items() if name.startswith(_RETURN) for curve in curves.values()]
-    limits = return_limits(float(np.mean(values)) for curve in of_returns for values in curve.values())
+    numbers = pd.DataFrame(lines).melt(["step", "part"], var_name="panel", value_name="number").dropna()
+    numbers["label"] = numbers["part"]
+    # Returns are named "return <layout> [rearranged] <kind of teammate>".
+    is_return = numbers["panel"].str.startswith("return ")
+    words, parts = numbers["panel"][is_return].str.split(), numbers["part"][is_return]
+    kinds = words.str[-1].str.replace("_", " ")
+    numbers.loc[is_return, "label"] = kinds.where(parts == "train", kinds + ", " + parts)
+    numbers.loc[is_return, "panel"] = "return, " + words.str[1]
+    if numbers["panel"].nunique() > MOST_PANELS:
+        numbers.loc[is_return, "panel"] = "return, mean over layouts"
+    curves = numbers.groupby(["panel", "label", "step"], sort=False)["number"].mean()
+    panels, labels = (list(dict.fromkeys(curves.index.get_level_values(name))) for name in ("panel", "label"))
+    returns = [name for name in panels if name.startswith("return, ")]
+    limits = return_limits(float(value) for name in returns for value in curves[name])
     figure, grid = panel_grid(
-        [name if name.startswith(_RETURN) else name.replace("_", " ") for name in panels],
+        [name if name in returns else name.replace("_", " ") for name in panels],
         min(4 if len(panels) > 9 else 3, len(panels)),
         (4.2, 2.6),
         "training step",
     )
-    for axes, (name, curves) in zip(grid, panels.items(), strict=False):
-        for label, points in curves.items():
-            _plot_log_curve(axes, label, f"C{labels.index(label)}", points)
-        if name.startswith(_RETURN):
+    for axes, name in zip(grid, panels, strict=False):
+        for label, points in curves[name].groupby("label", sort=False):
+            _plot_log_curve(axes, str(label), f"C{labels.index(label)}", points.droplevel("label"))
+        if name in returns:
             axes.set_ylim(*limits)
     figure.suptitle(title, fontsize=10)
     legend_below(figure)
@@ -64,22 +66,8 @@ def panel_grid(
     return figure, grid
 
 
-def _log_curves(lines: Sequence[Mapping[str, Any]], by_layout: bool) -> LogCurves:
-    """Return the curves of a log, with a panel of returns for each layout, or one for all."""
-    found: LogCurves = {}
-    for line in lines:
-        for name in (name for name in line if name not in ("step", "part")):
-            panel, label = name, line["part"]
-            if name.startswith(f"{_RETURN} "):
-                words = name.split()
-                panel = f"{_RETURN}, {words[1]}" if by_layout else f"{_RETURN}, mean over layouts"
-                label = words[-1].replace("_", " ") + ("" if label == "train" else f", {label}")
-            found.setdefault(panel, {}).setdefault(label, {}).setdefault(line["step"], []).append(line[name])
-    return found
-
-
-def _plot_log_curve(axes: Any, label: str, color: str, points: Mapping[int, Sequence[float]]) -> None:
-    steps, values = list(points), np.array([np.mean(of_step) for of_step in points.values()])
+def _plot_log_curve(axes: Any, label: str, color: str, points: pd.Series) -> None:
+    steps, values = points.index, points.to_numpy()
     window = len(values) // 20
     if window > 1:
         axes.plot(steps, values, color=color, alpha=0.35, linewidth=0.7)

@@ -39,6 +39,9 @@ TEAMMATE_TRACK = "teammate"
 PROOF_PROTOCOL = get_protocol("seeded", 20)
 """Protocol of the evaluations: as many episodes as the longest block that the proof reports."""
 
+_SEEDS = {PREFERENCE: range(4), TEAMMATE_TRACK: range(1)}
+"""Set of tasks -> seeds of each. A rise compares with one episode of each task and seed, so one seed would be few."""
+
 COMPARED_EGOS = {PREFERENCE: ("stay", "search"), TEAMMATE_TRACK: ("stay", "rl2-reference")}
 """Set of tasks -> the egos that models are compared with."""
 
@@ -219,7 +222,8 @@ def play(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = Tru
     for control in (None, "cleared")[: 1 + controls]:
         for name, tasks in options.task_sets.items():
             folder = out / f"{name}{' cleared' if control else ''}"
-            run = evaluate_agent(agent, tasks, PROOF_PROTOCOL, folder, control=control, show=lambda *shown: None)
+            shared: Any = {"seeds": _SEEDS[name], "control": control, "show": lambda *shown: None}
+            run = evaluate_agent(agent, tasks, PROOF_PROTOCOL, folder, **shared)
             means = run.table.groupby("block")["return"].mean()
             found[folder.name] = {str(block): round(float(mean), 3) for block, mean in means.items()}
     return found

@@ -1,4 +1,4 @@
-"""Make the reference models step by step, from a release of noise histories to evaluated models.
+"""Make the reference models step by step, from a release of noise histories to evaluated models and their cards.
 
     OUT/noise/lite              release of noise histories, as `icrl4aht-data generate --profile noise` makes it
     OUT/rl2-reference-TRACK     RL^2, trained by playing with the training teammates of that release
@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,16 +30,18 @@ from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, ModelOptions
 from icrl4aht_baselines.online.agent_histories import collect_release, release_teammates
 from icrl4aht_baselines.online.prepare import prepare_play
-from icrl4aht_baselines.report.cards import model_card
-from icrl4aht_baselines.report.results import evaluate_agent, merge, read_run
+from icrl4aht_baselines.report.page import instances_range, markdown_sections
+from icrl4aht_baselines.report.results import EvaluationRun, ResultSource, evaluate_agent, merge, read_run
 from icrl4aht_baselines.training.histories import prepare, start_from
 from icrl4aht_baselines.training.options import HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import RUN_CURVES
+from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
 from icrl4aht_baselines.training.trainer import show_steps
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import load_icrl4aht
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError
+from icrl4aht_data.utils.templates import fill_template
 from icrl4aht_data.writing.combine import combine_releases
 
 PROFILE = "noise"
@@ -57,11 +60,13 @@ OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
 OWN_SHARE = 0.5
 """Learning rate of a training on own histories, as a share of the first training's."""
 
-TEST_SEEDS = {"seeded": 3, "published": 1}
-"""Protocol of the evaluation on test tasks -> number of seeds."""
-
-VALIDATION_KINDS = ("validation", "diverse")
-"""Kinds of tasks that models are chosen by."""
+EVALUATIONS = {
+    "validation": ("validation", "seeded", 1),
+    "diverse": ("diverse", "seeded", 1),
+    "test-seeded": ("test", "seeded", 3),
+    "test-published": ("test", "published", 1),
+}
+"""Folder of results -> split of the tasks, protocol, and number of seeds."""
 
 TRACK_VIEWS: dict[str, dict[str, Any]] = {
     "teammate": {},
@@ -91,7 +96,6 @@ class Recipe:
         own_round: whether a second training follows, with histories that the model plays and RL^2 labels, in addition
             to the first ones.
         greedy: whether it plays its most probable actions or draws them.
-        cleared: whether to evaluate it on test tasks with its memory cleared at the start of each episode as well.
         role: what the package bundles it for.
     """
 
@@ -102,7 +106,6 @@ class Recipe:
     histories: dict[str, Any] = field(default_factory=dict)
     own_round: bool = False
     greedy: bool = False
-    cleared: bool = False
     role: str = ""
 
 
@@ -122,7 +125,7 @@ RECIPES = {
     "dpt-reference": Recipe(
         "dpt", "agent", _TINY, {**_STEPS, "steps": 2000}, _QUERIES, own_round=True, role="best of DPT"
     ),
-    "ad-rising": Recipe("ad", "rising", _TINY, _LONG, cleared=True, role="gains most by its memory"),
+    "ad-rising": Recipe("ad", "rising", _TINY, _LONG, role="gains most by its memory"),
 }
 """Reference models by name; the bundled ones have the same names."""
 
@@ -134,7 +137,7 @@ class ReferenceOutcome(NamedTuple):
         name: name of the recipe.
         track: the track.
         run: the model's run folder.
-        results: kind of tasks -> folder of results.
+        results: name in `EVALUATIONS` -> folder of results.
     """
 
     name: str
@@ -163,16 +166,9 @@ def make_reference(
             it, RL^2 is trained first. Existing releases and runs are kept, even if they were made with another teacher.
 
     Raises:
-        UnknownNameError: for an unknown recipe or track.
         OptionError: if a run folder holds a run of other settings. Existing releases are not checked.
         TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
     """
-    if name not in RECIPES:
-        raise unknown("reference model", name, RECIPES)
-    if track not in TRACKS:
-        raise unknown("track", track, TRACKS)
-    if teacher is not None:
-        check_taught(name)
     steps, recipe = _Steps(out, track, show, teacher), RECIPES[name]
     run = out / f"{name}-{track}"
     if not recipe.data:
@@ -272,19 +268,12 @@ class _Steps:
         return mixed
 
     def evaluate(self, name: str, run: Path, recipe: Recipe) -> dict[str, Path]:
-        """Return the folders of a model's results, by the kind of tasks."""
-        found = {}
-        kinds = [(kind, "seeded", 1, False) for kind in VALIDATION_KINDS]
-        kinds += [(f"test-{protocol}", protocol, seeds, False) for protocol, seeds in TEST_SEEDS.items()]
-        kinds += [("test-seeded-cleared", "seeded", 1, True)] if recipe.cleared else []
-        for kind, protocol, seeds, cleared in kinds:
-            tasks = bundled_tasks(self.track, kind if kind in VALIDATION_KINDS else "test")
-            folder = self.out / "results" / f"{name}-{self.track}" / kind
-            agent = find_agent(run, greedy=recipe.greedy)._replace(name=name)
-            shown = {"show": self.show, "what": f"{name}-{self.track}, {kind}"}
-            control = "cleared" if cleared else None
-            evaluate_agent(agent, tasks, get_protocol(protocol), folder, seeds=range(seeds), control=control, **shown)
-            found[kind] = folder
+        """Return the folders of a model's results, by their names in `EVALUATIONS`."""
+        model, agent = f"{name}-{self.track}", find_agent(run, greedy=recipe.greedy)._replace(name=name)
+        found = {kind: self.out / "results" / model / kind for kind in EVALUATIONS}
+        for kind, (split, protocol, seeds) in EVALUATIONS.items():
+            tasks, shown = bundled_tasks(self.track, split), {"show": self.show, "what": f"{model}, {kind}"}
+            evaluate_agent(agent, tasks, get_protocol(protocol), found[kind], seeds=range(seeds), **shown)
         return found
 
 
@@ -300,11 +289,96 @@ def write_bundled_card(
         teacher: the agent that it was made with, see `make_reference`.
     """
     (run,) = merge([read_run(found.results["test-seeded"]) for found in outcomes])
-    validation = merge([read_run(found.results[kind]) for found in outcomes for kind in VALIDATION_KINDS])
+    validation = merge([read_run(found.results[kind]) for found in outcomes for kind in ("validation", "diverse")])
     taught = f" --teacher {teacher}" if teacher else ""
     command = f"icrl4aht-data research reference --name {outcomes[0].name}{taught} --bundle-as {name}"
-    drawn = {f"{found.track}/{RUN_CURVES}": f"Training of the model of track {found.track}" for found in outcomes}
-    pictures = {path: text for path, text in drawn.items() if (folder / name / path).is_file()}
+    drawn = [found.track for found in outcomes if (folder / name / found.track / RUN_CURVES).is_file()]
     card = folder / name / MODEL_CARD
-    card.write_text(model_card(run, name, command, validation, pictures), encoding="utf-8")
+    card.write_text(model_card(run, name, command, validation, drawn), encoding="utf-8")
     return card
+
+
+def model_card(
+    run: EvaluationRun,
+    title: str,
+    command: str,
+    validation: Sequence[EvaluationRun] = (),
+    drawn: Sequence[str] = (),
+) -> str:
+    """Return README.md of a bundled model, which has a model for each track.
+
+    Args:
+        run: results of all of its models on test tasks. The card's table of models has a row for each.
+        title: name of the bundled model.
+        command: command that makes it.
+        validation: further results, on validation tasks under the same protocol, which get tables, too.
+        drawn: tracks whose model has a picture of its training.
+    """
+    models: dict[str, list[ResultSource]] = defaultdict(list)
+    for source in run.sources:
+        if source.trained:
+            models[source.trained["run_hash"]].append(source)
+    configs: list[dict[str, Any]] = [(sources[0].trained or {})["config"] for sources in models.values()]
+    config = configs[0]
+    seeds = ", ".join(dict.fromkeys(str(config["train"]["seed"]) for config in configs))
+    overlaps = {name for one in (run, *validation) for name in one.overlaps(one.cells)}
+    limits = [
+        f"Each model is one run, of seed {seeds}: the variation between seeds is not known.",
+        "Its input at each step must be what the evaluator passes, see `docs/protocol.md` in the repository.",
+        *overlap_legend(overlaps),
+    ]
+    properties = [
+        f"| method | {config['method']} |",
+        f"| created with | icrl4aht-data {config['package_version']} |",
+        f"| made by | `{command}` |",
+    ]
+    sections = [section for one in (run, *validation) for section in markdown_sections([one], one.protocol)]
+    shown = [f"Training of the model of track {track}:\n\n![curves]({track}/{RUN_CURVES})" for track in drawn]
+    return fill_template(
+        "baseline.md",
+        title=title,
+        method=config["method"],
+        training=" ".join(dict.fromkeys(map(training_sentence, configs))),
+        properties="\n".join(properties),
+        models="\n".join(_model_row(run, sources) for sources in models.values()),
+        protocol=run.protocol,
+        results="\n\n".join(f"#{section}" for section in sections),
+        curves="\n\n".join(["## Curves", *shown, ""]) if shown else "",
+        limits="\n".join(f"* {limit}" for limit in limits),
+    )
+
+
+def training_sentence(config: Mapping[str, Any]) -> str:
+    """Return a sentence on what a model was trained on.
+
+    Args:
+        config: config.json of its run.
+    """
+    if "groups" in config["histories"]:
+        sentence, play = "It was trained by playing with teammates, not on learning histories.", config.get("play", {})
+        if not play.get("imitation"):
+            return sentence
+        part = f"In the first {play['imitation_end']:.0%} of its steps it also imitated the scripted oracle"
+        return f"{sentence} {part}, which sees the full state."
+    cells = config.get(TRAINED_ON, ())
+    sources = sorted({cell["source"] for cell in cells if cell.get("source")})
+    labels = sorted({cell["labels"] for cell in cells if cell.get("labels")})
+    named = f" of source {' and '.join(f'`{source}`' for source in sources)}" if sources else ""
+    targets = f", with {' and '.join(f'`{label}`' for label in labels)} labels" if labels else ""
+    return f"It was trained on learning histories{named}{targets}."
+
+
+def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
+    """Return a row of the table of models: training data and seed of one model, and its evaluation."""
+    trained: dict[str, Any] = sources[0].trained or {}
+    histories = trained["config"]["histories"]
+    instances = instances_range(len(run.cells[cell]) for source in sources for cell in source.tasks)
+    values = [
+        ", ".join(dict.fromkeys(layout for source in sources for layout in source.layouts)),
+        f"`{Path(histories['root']).name}`, data version {histories['data_version']}, manifest with SHA-256 "
+        f"`{trained['manifest_sha256']}`",
+        describe_training(sources[0].seen),
+        str(trained["config"]["train"]["seed"]),
+        f"{sources[0].conditions}, {instances} in a cell",
+    ]
+    return f"| {' | '.join(values)} |"

@@ -181,7 +181,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         seed: the learner's seed; -1 if the task is unknown.
         episodes: number of finished episodes.
         score: end + (end - start), see `curve_ends` (paper, App. F.1).
-        return_start: mean return of the first max(5, episodes // 10) episodes.
+        return_start: mean return of the first episodes, see `curve_ends`.
         return_end: mean return of as many last episodes.
         return_mean: mean return of all episodes.
         source: how the history was made: "ppo" (an ego learned), "noise" (a script played, and its random actions
@@ -309,13 +309,16 @@ def episode_returns(rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
 def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean returns of the first and the last w = max(5, floor(0.1 N)) of N episodes (paper, App. F.1).
 
+    With fewer than 10 episodes, which the paper does not have, w is half of them, at least 1.
+
     Args:
         returns: (B, N), episode returns.
 
     Returns:
         The means at the start and at the end, float64 (B,) each.
     """
-    window = max(5, returns.shape[-1] // 10)
+    episodes = returns.shape[-1]
+    window = max(1, min(max(5, episodes // 10), episodes // 2))
     return returns[..., :window].mean(axis=-1), returns[..., -window:].mean(axis=-1)
 
 

@@ -106,9 +106,9 @@ def parse_json(text: str) -> Any:
     raise IndexFormatError(f"not JSON as expected: more than {_DEPTH} levels deep")
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write indented JSON."""
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
+    """Write JSON, indented or on one line."""
+    path.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
 
 
 def json_hash(content: Any) -> str:

@@ -99,7 +99,7 @@ def write_card(root: Path) -> None:
     """
     content = facts(root)
     (root / RELEASE_CARD).write_text(render_card(content), encoding="utf-8")
-    write_json(root / CARD_TABLES, {name: content[name] for name in ("learning", "teammates", "left_out")})
+    write_json(root / CARD_TABLES, {name: content[name] for name in ("learning", "teammates", "left_out")}, indent=None)
 
 
 def render_card(content: Mapping[str, Any]) -> str:

@@ -172,7 +172,8 @@ def write_release(
         known = [] if named else [one.task for one in new]
         write_tasks(root / TASKS, known)
         provenance = {one.task.task_id: one.provenance for one in new}
-        write_json(root / PROVENANCE, {task_id: of_task.to_json() for task_id, of_task in provenance.items()})
+        content = {task_id: of_task.to_json() for task_id, of_task in provenance.items()}
+        write_json(root / PROVENANCE, content, indent=None)  # a kilobyte for each task even so
         sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in writer.entries)}
         statistics = layout_statistics(writer.entries, known, provenance, kept_steps, sizes)
         info = describe(kind, data_version, kept_steps, writer.entries)

@@ -24,7 +24,7 @@ def evaluated_run(
     agent: str,
     layouts=("demo_wide",),
     value=10.0,
-    variant=None,
+    note="",
     families=HEURISTICS,
     protocol="seeded",
     tasks=None,
@@ -37,6 +37,7 @@ def evaluated_run(
     """Every instance earns `value`, and 2 more in the second half.
 
     Args:
+        note: text that distinguishes runs of an agent.
         tasks: by default the published test tasks of the layouts and families.
         trained_on: record of training data; None for results without one.
         acting: way of acting of a trained model; None for other agents.
@@ -45,13 +46,13 @@ def evaluated_run(
     """
     played = tasks or [task for task in TEST_TASKS if task.layout.name in layouts and task.teammate_family in families]
     details = dict(details or {}) | ({} if trained_on is None else {"trained_on": list(trained_on)})
-    details |= {"variant": dict([variant])} if variant else {}
     details |= {"acting": acting} if acting else {}
     shortened = dataclasses.replace(PROTOCOLS[protocol], episodes=40, steps=steps)
     settings = {"agent": agent, "seeds": [0], "protocol": shortened.settings, "code_version": "0"}
     settings |= {"details": details} if details else {}
     returns = [[value] * 20 + [value + 2.0] * 20]
-    return as_run([Result(task.task_id, settings, returns) for task in played], folder or f"runs/{agent}", played)
+    run = as_run([Result(task.task_id, settings, returns) for task in played], folder or f"runs/{agent}", played)
+    return dataclasses.replace(run, note=note)
 
 
 SPAN = 20.0

@@ -32,7 +32,6 @@ from icrl4aht_data.benchmark.facts import (
     LABEL_EPISODES,
     LEAST_HEADROOM,
     SAME_BEHAVIOUR,
-    TESTED_ON,
     TRACKS,
 )
 from icrl4aht_data.benchmark.reference_returns import HEURISTICS, alike_tasks, has_headroom, read_headroom
@@ -163,7 +162,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ),
     ("docs/protocol", "Dropout {} is on the outputs", lambda: ModelOptions().dropout),
     ("docs/protocol", "{} GRU layers of {}", lambda: (ModelOptions().recurrent_layers, ModelOptions().width)),
-    ("docs/protocol", "for all {} training layouts", lambda: len(TESTED_ON)),
     ("docs/protocol", "A {} of the histories is held out", lambda: HistoryOptions(("demo_wide",)).held_out),
     (
         "docs/generating",

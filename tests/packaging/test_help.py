@@ -20,7 +20,7 @@ PUBLIC = (
     "list show browse verify download convert combine release upload doctor generate teammates layouts plan check "
     "train evaluate report results submit models best-response adaptation-headroom control demo watch play collect"
 )
-RESEARCH = "draws manifests diversity reference headroom sweep ablate tracks heldout-rl proof"
+RESEARCH = "draws manifests diversity reference headroom proof"
 
 
 def find(verb: Verb) -> click.Command:

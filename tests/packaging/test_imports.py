@@ -17,7 +17,7 @@ ORDER = {
     "environments dataset interop writing checking publishing browsing commands",
     "icrl4aht_generation": "policy env paths learners jobs experts layouts teammates profiles collection "
     "adapters populations releases planning verbs commands",
-    "icrl4aht_baselines": "plotting methods training agents evaluate play online control report proof experiments "
+    "icrl4aht_baselines": "plotting methods training agents evaluate play online control report headroom proof "
     "reference demo commands",
 }
 """Package -> its folders and files from the lowest to the highest; "" -> the packages. Imports go down or stay."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 from icrl4aht_baselines.demo import run_demo
-from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
 from icrl4aht_baselines.training.loggers import LOGGER_NAMES, check_loggers
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.build import build_releases
@@ -49,10 +48,6 @@ USES: list[tuple[str, str, Callable[[Any], object]]] = [
     ("PIL.Image", "plot", lambda dataset: draw_frame(dataset.layouts[0], dataset[0].state[0])),
     ("matplotlib.figure", "plot", lambda dataset: new_figure(1, 1)),
     *((library, "plot", lambda dataset: run_demo(Path("out"), QUIET)) for library in ("matplotlib", "PIL")),
-    *(
-        (library, "plot", lambda dataset: run_experiment("tracks", ExperimentPlan(), Path("out")))
-        for library in ("matplotlib", "PIL")
-    ),
     *(
         (library, "plot", lambda dataset: build_releases(load_profile("smoke"), Path("out"), ("lite",), QUIET))
         for library in ("matplotlib", "PIL")

@@ -9,7 +9,7 @@ import re
 import shlex
 
 import click
-from icrl4aht_baselines.report.cards import published_table
+from icrl4aht_baselines.headroom import published_table
 
 from icrl4aht_data.commands.cli import cli
 from icrl4aht_data.utils.templates import card_file

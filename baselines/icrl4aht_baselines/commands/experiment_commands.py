@@ -1,9 +1,8 @@
-"""Commands of the paper's experiments, of the positive control, of headroom, and of what a release teaches."""
+"""Commands of the positive control, of headroom, and of what a release teaches."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,74 +17,6 @@ from icrl4aht_data.utils.files import check_output, parse_json, read_text
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.proof import PROOF_FILE, proof_table
-
-
-def _experiment_command(name: str, text: str, *own: Callable[[Any], Any], usage: Sequence[str] = ()) -> click.Command:
-    """Return the command of an experiment, or of several that an argument `what` distinguishes.
-
-    Args:
-        name: of the command.
-        text: its help.
-        own: decorators that add the command's own arguments and options.
-        usage: examples.
-    """
-
-    def run(
-        root: Any, out: Path | None, train: Any, histories: Any, size: str | None, what: str = "", **plan: Any
-    ) -> None:
-        from icrl4aht_baselines.experiments import ExperimentPlan, run_experiment
-
-        experiment, size = f"{name} {what}".strip(), size or "small"
-        sizes: Any = {"size": size, "batch_size": shared.default_batch_size(size), "train": train}
-        chosen = ExperimentPlan(root=root and str(root), histories=histories, **sizes, **plan)
-        with progress_bars() as show:
-            found = run_experiment(experiment, chosen, out or Path("runs") / experiment.replace(" ", "-"), show)
-        for line in [*found.notes, *(f"wrote {path}" for path in found.report)]:
-            click.echo(line)
-
-    command = shared.add_options(run, [*own, shared.experiment_options(f"runs/{name}" + "-WHAT" * bool(usage))])
-    return click.command(name, help=text, epilog=examples(*usage) if usage else None)(command)
-
-
-sweep_command = _experiment_command(
-    "sweep",
-    """Train and evaluate over sizes, or context lengths.
-
-    WHAT is context (K of 250 to 10,000) or size (small, medium, large). Writes runs, results and OUT/report.
-    """,
-    click.argument("what", type=shared.variant_names("sweep")),
-    usage=(
-        "icrl4aht-data research sweep size --layout demo_wide",
-        "icrl4aht-data research sweep context --only K250 --steps 20 --layout demo_wide --tasks 1 --episodes 5",
-    ),
-)
-ablate_command = _experiment_command(
-    "ablate",
-    """Train and evaluate with and without parts.
-
-    WHAT is ta: none, +TA (teammate actions), +next_obs (auxiliary loss), both. Writes runs, results and OUT/report.
-    """,
-    click.argument("what", type=shared.variant_names("ablate")),
-    usage=("icrl4aht-data research ablate ta --layout demo_wide",),
-)
-tracks_command = _experiment_command(
-    "tracks",
-    """Train and evaluate on both tracks.
-
-    The paper's Tables 1 and 2; with other methods 4 and 5. The paper's numbers are shown with --protocol published.
-    Writes runs, results and OUT/report.
-    """,
-)
-heldout_rl_command = _experiment_command(
-    "heldout-rl",
-    """Train, and evaluate with held-out teammates.
-
-    These are a suite's learned teammates that are not in training. Writes runs, results and OUT/report.
-    """,
-    click.option(
-        "--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Folder of learned teammates."
-    ),
-)
 
 
 @click.command("control")
@@ -127,7 +58,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
     seeds 0, 1 and 2. Writes their results into OUT, and OUT/headroom.json, OUT/headroom.md and OUT/stay.json from them,
     and OUT/behaviours.json: which test teammates act alike.
     """
-    from icrl4aht_baselines.report.cards import (
+    from icrl4aht_baselines.headroom import (
         HEADROOM_FILES,
         find_alike_tasks,
         measure_headroom,

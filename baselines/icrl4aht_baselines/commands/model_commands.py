@@ -10,12 +10,14 @@ import click
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.commands.options import find_ego
+from icrl4aht_baselines.training.options import FILTERS, HistoryOptions
 from icrl4aht_data.benchmark.facts import TRACKS
-from icrl4aht_data.commands.dataclass_options import OptionValue
+from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options
 from icrl4aht_data.commands.options import (
     COUNT,
     TRACK,
     Folder,
+    Names,
     NewFile,
     examples,
     overwrite_option,
@@ -25,7 +27,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import check_output
-from icrl4aht_data.utils.options import Share
+from icrl4aht_data.utils.options import Share, option_hints
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.text import counted_noun
 
@@ -47,7 +49,7 @@ from icrl4aht_data.utils.text import counted_noun
 @shared.greedy_option
 @shared.root_option
 @shared.only_layouts_option
-@shared.history_filters
+@dataclass_options(HistoryOptions, "filters", exclude={*option_hints(HistoryOptions)} - {*FILTERS})
 @click.option("--histories", type=COUNT, default=8, help="Histories with each teammate.")
 @click.option("--episodes", type=click.IntRange(min=10), default=60, help="Episodes of each history, of 100 steps.")
 @click.option(
@@ -57,12 +59,6 @@ from icrl4aht_data.utils.text import counted_noun
     default=(0.0, 0.0),
     metavar="START END",
     help="Chance of a random action in a history's first and in its last episode.",
-)
-@click.option(
-    "--like",
-    type=shared.HISTORIES_NAME,
-    help="As many and as long histories as the reference models learn from, with their noise: agent, or rising, "
-    "which begin at random. Not with --histories, --episodes and --noise.",
 )
 @click.option(
     "--labeller",
@@ -88,7 +84,6 @@ def collect_command(
     histories: int,
     episodes: int,
     noise: tuple[float, float],
-    like: str | None,
     labeller: str | None,
     swap: int | None,
     manifests: tuple[Path, ...],
@@ -104,14 +99,10 @@ def collect_command(
     from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
     from icrl4aht_baselines.online.agent_histories import collect_release, plan_swaps, release_teammates
-    from icrl4aht_baselines.reference import RL2_HISTORIES
     from icrl4aht_baselines.training.histories import filter_histories
 
     start, end = noise
     config = NoiseConfig(histories, episodes, start=(start, start), end=(end, end))
-    if like is not None:
-        shared.check_alone("--like", "histories", "episodes", "noise")
-        config = RL2_HISTORIES[like]
     ego = find_ego("--agent", agent, greedy=greedy)
     other = find_ego("--labeller", labeller, greedy=True) if labeller else None
     names = [get_layout(name).name for name in layouts] or None
@@ -137,7 +128,7 @@ def collect_command(
 @click.option(
     "--name",
     "names",
-    type=shared.REFERENCE_NAME,
+    type=Names("reference model", shared.lazy_attribute("icrl4aht_baselines.reference", "RECIPES")),
     multiple=True,
     required=True,
     help="Model, such as ad-reference; repeat.",

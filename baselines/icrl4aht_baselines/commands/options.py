@@ -28,7 +28,6 @@ from icrl4aht_data.commands.options import (
     FAMILY,
     LAYOUT,
     RELEASE_LAYOUT,
-    SEED,
     TRACK,
     Folder,
     Names,
@@ -68,10 +67,6 @@ EGO_NAME = Names("agent", lambda: import_module("icrl4aht_baselines.agents.egos"
 """Name of a reference ego, or folder of a run; checked by `find_ego`."""
 TRAINING_LAYOUT = Names("layout", lambda: [ALL_LAYOUTS, *LAYOUT.valid()], checked_later)
 METHOD_NAME = Names("method", lambda: import_module("icrl4aht_baselines.methods.registry").all_methods())
-_HISTORY_METHOD = Names("method", lambda: [name for name in METHOD_NAME.valid() if name not in _playing()])
-_playing = lazy_attribute("icrl4aht_baselines.methods.registry", "PLAYING")
-REFERENCE_NAME = Names("reference model", lazy_attribute("icrl4aht_baselines.reference", "RECIPES"))
-HISTORIES_NAME = Names("kind of histories", lazy_attribute("icrl4aht_baselines.reference", "RL2_HISTORIES"))
 PROTOCOL_NAME = Names("protocol", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "PROTOCOLS"))
 
 protocol_option = click.option(
@@ -81,23 +76,12 @@ protocol_option = click.option(
     help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers. swap: seeded, with "
     "another teammate every 25 episodes.",
 )
-_ACTING = Names("acting", lazy_attribute("icrl4aht_baselines.agents.egos", "ACTING"))
-_ACTING_HELP = "Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster."
-acting_option = click.option("--acting", type=_ACTING, default="cached", help=_ACTING_HELP)
-forget_option = click.option("--forget", is_flag=True, help="Clear the agent's memory before each episode.")
-controls_option = click.option(
-    "--controls",
-    is_flag=True,
-    help="Also play with the memory cleared before each episode, into OUT/cleared, and with another task's teammate in "
-    "all but the last 20 episodes, into OUT/swapped. Prints what memory (M) and the right partner (P) are worth.",
-)
 greedy_option = click.option(
     "--greedy/--sampled",
     default=None,
     help="Take the most probable actions of a trained model, or draw its actions.",
     show_default="greedy; a bundled model's own, see `models`",
 )
-EVALUATION_SPLIT = Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS"))
 _ONLY_LAYOUTS: Any = {"multiple": True, "help": "Only on this layout; repeat for several."}
 only_layouts_option = click.option("--layout", "layouts", type=LAYOUT, **_ONLY_LAYOUTS)
 _MANIFEST: Any = {"type": click.Path(path_type=Path, exists=True, dir_okay=False), "metavar": "FILE"}
@@ -111,7 +95,7 @@ tasks_options = (
     ),
     click.option(
         "--split",
-        type=EVALUATION_SPLIT,
+        type=Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS")),
         multiple=True,
         default=("test",),
         help="Which tasks: test, or validation and diverse, by which models are chosen; repeat for several.",
@@ -125,33 +109,8 @@ tasks_options = (
 )
 """Options that choose tasks; `chosen_tasks` takes their values."""
 
-evaluation_split_option = click.option(
-    "--split",
-    type=EVALUATION_SPLIT,
-    help="Which tasks: test, or validation and diverse, by which models are chosen.",
-    show_default="test",
-)
-tasks_option = click.option(
-    "--tasks", type=COUNT, help="Most tasks of each cell, a layout with a teammate family: 2 are two a cell."
-)
-episodes_option = click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
-seeds_option = click.option("--seeds", type=COUNT, default=1, help="Play every task with the seeds 0 to N - 1.")
-seed_option = click.option(
-    "--seed", "chosen_seeds", type=SEED, multiple=True, help="Play every task with this seed, not with --seeds; repeat."
-)
 suite_option = click.option(
     "--suite", type=Folder("`icrl4aht-data teammates`"), metavar="FOLDER", help="Folder of learned teammates."
-)
-log_option = click.option(
-    "--log",
-    "log_to",
-    type=Names("logger", lazy_attribute("icrl4aht_baselines.training.loggers", "LOGGER_NAMES")),
-    multiple=True,
-    default=("json",),
-    help="Also log for tensorboard, wandb or trackio, into OUT; repeat. json is metrics.jsonl, always written.",
-)
-gifs_option = click.option(
-    "--gifs/--no-gifs", default=True, help="The first and last episode with each family on the page."
 )
 root_option = click.option(
     "--root", type=Root(), metavar="ROOT", help="A release: folder or address.", show_default="the bundled mini release"
@@ -196,23 +155,12 @@ def add_options(command: Any, options: Iterable[Callable[[Any], Any]]) -> Any:
     return functools.reduce(lambda decorated, option: option(decorated), reversed([*options]), command)
 
 
-_NO_FILTERS = ("order", "queries", "labels", "every", "first", "held_out", "channels", "mirror", "hide_recipe")
-history_filters = dataclass_options(HistoryOptions, "filters", exclude=_NO_FILTERS)
-"""Options that filter histories; the command receives them as the dict `filters`."""
-
 manifests_option = click.option(
     "--manifest",
     "manifests",
     **_MANIFEST,
     multiple=True,
     help="Also play with the teammates of this file's tasks, heuristics; repeat for several.",
-)
-_SIZE_NAME = Names("size", lambda: SIZES)
-size_option = click.option(
-    "--size",
-    type=_SIZE_NAME,
-    help="tiny, for a CPU, or the paper's small, medium or large: sets what has `the size's` as its default.",
-    show_default="tiny on a CPU, small elsewhere",
 )
 _PAPER_OR_CPU = "1024 as in the paper; on a CPU 16 of tiny, 8 of others"
 _BY_SIZE = dict.fromkeys(SIZES["tiny"].model | SIZES["tiny"].train, "the size's")
@@ -343,81 +291,3 @@ def join_processes(coordinator: str | None, processes: int, process: int) -> Non
         raise click.UsageError(f"--process {process}: expected a number below {processes}")
     if coordinator:
         jax.distributed.initialize(coordinator, processes, process)
-
-
-def variant_names(command: str) -> Names:
-    """Return the type of an experiment's second word, such as `size` in `sweep size`."""
-    experiments = lazy_attribute("icrl4aht_baselines.experiments", "EXPERIMENTS")
-    prefix = f"{command} "
-    return Names(command, lambda: [name.removeprefix(prefix) for name in experiments() if name.startswith(prefix)])
-
-
-_NOT_IN_EXPERIMENTS = ("order", "queries", "held_out", "labels", "every", "first", "mirror", "hide_recipe")
-
-
-def experiment_options(out: str) -> Callable[[Any], Any]:
-    """Return a decorator with the options of all experiments; `out` is shown as the default folder."""
-    options = [
-        click.option(
-            "--method",
-            "methods",
-            type=_HISTORY_METHOD,
-            multiple=True,
-            help="ad, dpt, hybrid_ad or amago_offline; repeat for several.",
-            show_default="ad and dpt",
-        ),
-        click.option(
-            "--layout",
-            "layouts",
-            type=TRAINING_LAYOUT,
-            multiple=True,
-            help="Training layout, such as demo_wide; repeat for several models, or all: one model of all layouts.",
-            show_default="the paper's that the release has",
-        ),
-        root_option,
-        click.option(
-            "--only",
-            "values",
-            metavar="SETTING",
-            multiple=True,
-            help="Only this setting, such as K250, medium or ta; repeat for several.",
-        ),
-        click.option(
-            "--family",
-            "families",
-            type=FAMILY,
-            multiple=True,
-            help="Evaluate only with teammates of this family, such as H4; repeat for several.",
-        ),
-        click.option(
-            "--size",
-            type=_SIZE_NAME,
-            help="tiny, for a CPU, or the paper's small, medium or large; not with `sweep size`, which varies it.",
-            show_default="small, as in the paper",
-        ),
-        dataclass_options(HistoryOptions, "histories", exclude=_NOT_IN_EXPERIMENTS),
-        evaluation_split_option,
-        tasks_option,
-        episodes_option,
-        seeds_option,
-        protocol_option,
-        click.option("--acting", type=_ACTING, help=_ACTING_HELP, show_default="cached; exact in `sweep context`"),
-        gifs_option,
-        click.option("--out", type=Folder(), metavar="FOLDER", help="Write runs and report here.", show_default=out),
-        dataclass_options(
-            TrainOptions,
-            "train",
-            default_text={
-                "steps": "the paper's",
-                "batch_size": _PAPER_OR_CPU,
-                "context": "500; varied by `sweep context`",
-            },
-        ),
-        dataclass_options(
-            ModelOptions,
-            "model",
-            default_text={"layers": "4; varied by `sweep size`", "width": "256; varied by `sweep size`"},
-        ),
-    ]
-
-    return lambda command: add_options(command, options)

@@ -11,9 +11,10 @@ from icrl4aht_generation.teammates.instances import published_task
 
 from icrl4aht_baselines.commands import options as shared
 from icrl4aht_baselines.commands.options import find_ego
+from icrl4aht_baselines.methods.options import SIZES
 from icrl4aht_baselines.training.options import HistoryOptions
 from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
-from icrl4aht_data.commands.options import LAYOUT, SEED, Folder, NewFile, examples, overwrite_option
+from icrl4aht_data.commands.options import COUNT, LAYOUT, SEED, Folder, Names, NewFile, examples, overwrite_option
 from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.install_hints import install_command
@@ -38,17 +39,29 @@ from icrl4aht_data.utils.text import counted_noun
     required=True,
     help="stay, random, oracle, search, a bundled model such as ad-reference, or a folder that `train` made.",
 )
-@shared.acting_option
+@click.option(
+    "--acting",
+    type=Names("acting", shared.lazy_attribute("icrl4aht_baselines.agents.egos", "ACTING")),
+    default="cached",
+    help="Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster.",
+)
 @shared.greedy_option
-@shared.forget_option
-@shared.controls_option
+@click.option("--forget", is_flag=True, help="Clear the agent's memory before each episode.")
+@click.option(
+    "--controls",
+    is_flag=True,
+    help="Also play with the memory cleared before each episode, into OUT/cleared, and with another task's teammate in "
+    "all but the last 20 episodes, into OUT/swapped. Prints what memory (M) and the right partner (P) are worth.",
+)
 @shared.protocol_option
 @functools.partial(shared.add_options, options=shared.tasks_options)
-@shared.tasks_option
-@shared.episodes_option
+@click.option("--tasks", type=COUNT, help="Most tasks of each cell, a layout with a teammate family: 2 are two a cell.")
+@click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
 @shared.suite_option
-@shared.seeds_option
-@shared.seed_option
+@click.option("--seeds", type=COUNT, default=1, help="Play every task with the seeds 0 to N - 1.")
+@click.option(
+    "--seed", "chosen_seeds", type=SEED, multiple=True, help="Play every task with this seed, not with --seeds; repeat."
+)
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the results here.")
 def evaluate_command(
     agent: str,
@@ -118,7 +131,7 @@ def evaluate_command(
     help="Also write one HTML page: the summary, curves, episodes, tables.",
 )
 @overwrite_option
-@shared.gifs_option
+@click.option("--gifs/--no-gifs", default=True, help="The first and last episode with each family on the page.")
 @shared.suite_option
 def report_command(
     runs: tuple[Path, ...], out: Path | None, html: Path | None, overwrite: bool, gifs: bool, suite: Path | None
@@ -200,7 +213,16 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     shared.root_option,
     dataclass_options(HistoryOptions, "histories"),
 )
-@topic("Model", shared.size_option, shared.model_options)
+@topic(
+    "Model",
+    click.option(
+        "--size",
+        type=Names("size", lambda: SIZES),
+        help="tiny, for a CPU, or the paper's small, medium or large: sets what has `the size's` as its default.",
+        show_default="tiny on a CPU, small elsewhere",
+    ),
+    shared.model_options,
+)
 @topic(
     "Training",
     click.option("--init", type=Folder(), metavar="RUN", help="Start from the parameters of this run."),
@@ -210,7 +232,14 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
 @topic(
     "Run",
     click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD"),
-    shared.log_option,
+    click.option(
+        "--log",
+        "log_to",
+        type=Names("logger", shared.lazy_attribute("icrl4aht_baselines.training.loggers", "LOGGER_NAMES")),
+        multiple=True,
+        default=("json",),
+        help="Also log for tensorboard, wandb or trackio, into OUT; repeat. json is metrics.jsonl, always written.",
+    ),
 )
 @shared.process_options
 def train_command(

@@ -5,7 +5,7 @@ from icrl4aht_data.commands.verbs import Verb
 _CLI, _MODELS, _LAB, _ADAPT = (
     f"icrl4aht_baselines.commands.{name}_commands" for name in ("train", "model", "experiment", "adaptation")
 )
-_TRAIN, _PAPER, _CHECKS = "Train and evaluate", "The paper's experiments", "Reference models and checks"
+_TRAIN, _CHECKS = "Train and evaluate", "Reference models and checks"
 
 VERBS = (
     Verb("demo", f"{_CLI}:demo_command", _TRAIN, "Demonstrate every step on the bundled release."),
@@ -31,10 +31,6 @@ VERBS = (
         "Estimate what memory across episodes can earn.",
     ),
     Verb("control", f"{_LAB}:control_command", _TRAIN, "Check that AD and DPT adapt in context."),
-    Verb("research tracks", f"{_LAB}:tracks_command", _PAPER, "Train and evaluate on both tracks."),
-    Verb("research sweep", f"{_LAB}:sweep_command", _PAPER, "Train and evaluate over sizes, or context lengths."),
-    Verb("research ablate", f"{_LAB}:ablate_command", _PAPER, "Train and evaluate with and without parts."),
-    Verb("research heldout-rl", f"{_LAB}:heldout_rl_command", _PAPER, "Train, and evaluate with held-out teammates."),
     Verb(
         "research reference",
         f"{_MODELS}:reference_command",

@@ -74,8 +74,6 @@ RL2_SETTINGS: dict[str, dict[str, Any]] = {
 }
 """Defaults of RL^2: values of `ModelOptions` and of `TrainOptions`, for two cores of a CPU."""
 
-PAPER_SIZES = ("small", "medium", "large")
-
 
 @dataclass(frozen=True)
 class ModelOptions:

@@ -21,6 +21,7 @@ from icrl4aht_baselines.report.results import (
     AgentReturns,
     ResultCell,
     in_order,
+    mean_of,
     returns_by_cell,
 )
 from icrl4aht_baselines.report.scores import (
@@ -36,7 +37,6 @@ from icrl4aht_baselines.report.scores import (
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, holm
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission, submitted_runs
-from icrl4aht_baselines.report.tables import mean_of
 from icrl4aht_baselines.training.seen import overlap_legend, overlap_marks
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
@@ -143,11 +143,7 @@ def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
 
 def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
     """Return stored results with those of a file, see `Submission.update`."""
-    parts = {one.control for one in found.evaluations}
-
-    def replaced(table: pd.DataFrame) -> pd.Series:
-        return (table["agent"] == found.agent) & (table["control"].isin(parts) | ("" in parts))
-
+    controls = {one.control for one in found.evaluations}
     tables, curves = [], defaultdict(list)
     for one, run in submitted_runs(found):
         tables.append(run.table.assign(agent=found.agent, training=one.training, control=one.control))
@@ -158,15 +154,17 @@ def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
         for (control, layout), parts in curves.items()
         for episode, value in enumerate(np.concatenate(parts).mean(axis=0).tolist(), start=1)
     ]
-    frames = (
-        (stored.table, pd.concat(tables, ignore_index=True)),
-        (stored.curves, pd.DataFrame(rows, columns=CURVE_COLUMNS)),
+
+    def updated(old: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
+        is_replaced = (old["agent"] == found.agent) & (old["control"].isin(controls) | ("" in controls))
+        return pd.concat([part for part in (old[~is_replaced], new) if len(part)], ignore_index=True)
+
+    facts = found.facts if "" in controls else stored.agents[found.agent]
+    return StoredResults(
+        updated(stored.table, pd.concat(tables, ignore_index=True)),
+        updated(stored.curves, pd.DataFrame(rows, columns=CURVE_COLUMNS)),
+        stored.agents | {found.agent: facts},
     )
-    merged = (
-        pd.concat([part for part in (old[~replaced(old)], new) if len(part)], ignore_index=True) for old, new in frames
-    )
-    facts = found.facts if "" in parts else stored.agents[found.agent]
-    return StoredResults(*merged, stored.agents | {found.agent: facts})
 
 
 def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
@@ -238,20 +236,17 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
     body = []
     for agent, cells in results.items():
         facts, marks = stored.agents.get(agent), {name for of in cells.values() for name in of.overlaps}
-        row = [f"`{agent}`{overlap_marks(marks)}", *_training_texts(facts)]
+        texts = [""] * 3
+        if facts:
+            hours = "" if facts.core_hours is None else f"{facts.core_hours:g} core-hours"
+            texts = [facts.data, facts.labels, ", ".join(filter(None, (facts.steps, hours))) or "–"]
+        row = [f"`{agent}`{overlap_marks(marks)}", *texts]
         for track in TRACKS:
             score = find_score(cells, track_cells(open_cells(scales), track), scales)
             row += [_shown(score and score.total), _shown(score and score.middle)]
         body.append(row)
     scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")]
     return markdown_table(["model", "data", "labels", "budget", *scored], body)
-
-
-def _training_texts(facts: AgentFacts | None) -> list[str]:
-    if facts is None:
-        return [""] * 3
-    hours = "" if facts.core_hours is None else f"{facts.core_hours:g} core-hours"
-    return [facts.data, facts.labels, ", ".join(filter(None, (facts.steps, hours))) or "–"]
 
 
 def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
@@ -274,24 +269,21 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
     The means are over the cells with headroom, or over all cells that the agent played if best responses were not
     measured. M and P are bold if they are above 0 with a p-value below 0.05, corrected for all M and P of the table.
     """
-    controls = {control: stored.returns(control) for control in ("cleared", "swapped")}
-    found: dict[tuple[str, str], MeanInterval] = {}
-    chosen = {}
-    for agent, cells in results.items():
-        chosen[agent] = _controlled_cells(cells, scales)
-        for name, control, block in (("M", "cleared", "all"), ("P", "swapped", "last 20")):
-            other = controls[control].get(agent, {})
-            played = [cell for cell in chosen[agent] if cell in other]
-            if difference := block_difference(cells, other, played, block):
-                found[agent, name] = difference
-    corrected = holm({key: difference.p for key, difference in found.items()})
+    chosen = {agent: _controlled_cells(cells, scales) for agent, cells in results.items()}
+    found = {
+        (agent, control): block_difference(cells, others.get(agent, {}), chosen[agent], block)
+        for control, block in (("cleared", "all"), ("swapped", "last 20"))
+        for others in [stored.returns(control)]
+        for agent, cells in results.items()
+    }
+    corrected = holm({key: difference.p for key, difference in found.items() if difference})
     body = []
     for agent, cells in results.items():
         row = [f"`{agent}`"]
-        for name in ("M", "P"):
-            text = _shown(found.get((agent, name)), 1, "+")
-            is_clear = (agent, name) in found and found[agent, name].mean > 0
-            row.append(f"**{text}**" if is_clear and corrected[agent, name] < _SIGNIFICANT else text)
+        for control in ("cleared", "swapped"):
+            difference, text = found[agent, control], _shown(found[agent, control], 1, "+")
+            is_clear = difference and difference.mean > 0 and corrected[agent, control] < _SIGNIFICANT
+            row.append(f"**{text}**" if is_clear else text)
         for block in EPISODE_BLOCKS:
             parts = [cells[cell].blocks[block] for cell in chosen[agent] if block in cells[cell].blocks]
             row.append(f"{mean_of(parts):z.1f}" if parts else "–")
@@ -310,10 +302,10 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
     for agent in agents:
         cells, cleared, texts = results.get(agent, {}), controls.get(agent, {}), []
         for track in TRACKS:
-            score = find_score(cells, track_cells(open_cells(scales), track), scales) if cells else None
+            score = find_score(cells, track_cells(open_cells(scales), track), scales)
             texts.append(f"N {_shown(score and score.total)} on track {track}")
-        played = [cell for cell in _controlled_cells(cells, scales) if cell in cleared]
-        texts.append(f"M {_shown(block_difference(cells, cleared, played, 'all'), 1, '+')}")
+        memory = block_difference(cells, cleared, _controlled_cells(cells, scales), "all")
+        texts.append(f"M {_shown(memory, 1, '+')}")
         found[agent] = ", ".join(texts)
     return found
 
@@ -403,8 +395,8 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
             first = [of.blocks["1"] for cell, of in results[agent].items() if cell.layout == layout]
             if first and (agent, "", layout) not in curves:
                 axes.plot([1], [mean_of(first)], "o", color=color, markersize=4, label=f"{agent}, first episode")
-        cells = [ResultCell(*cell) for cell in headroom if cell[0] == layout]
-        axes.axhline(np.mean([headroom[cell[:2]]["stay"] for cell in cells]), color="gray", linestyle=":", label="stay")
+        stays = [egos["stay"] for cell, egos in headroom.items() if cell[0] == layout]
+        axes.axhline(np.mean(stays), color="gray", linestyle=":", label="stay")
         if (best := mean_best(layout, scales)) is not None:
             axes.axhline(best, color="black", label="best response")
         axes.set_ylim(*return_limits(value for line in axes.lines for value in np.ravel(line.get_ydata())))

@@ -14,10 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, in_order
+from icrl4aht_baselines.report.results import TASK_KINDS, EvaluationRun, ResultCell, family_title, in_order, mean_of
 from icrl4aht_baselines.report.scores import cell_scales, cell_scores
 from icrl4aht_baselines.report.statistics import MeanInterval, mean_interval
-from icrl4aht_baselines.report.tables import mean_of
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.plotting import return_limits, running_mean

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from icrl4aht_generation.policy import Policy
 
 from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent
-from icrl4aht_baselines.evaluate.evaluator import play_tasks
+from icrl4aht_baselines.evaluate.evaluator import MakeEgo, play_tasks
 from icrl4aht_baselines.evaluate.protocols import Protocol
 from icrl4aht_baselines.evaluate.segments import controlled_name
 from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, ResultSource
@@ -20,13 +19,10 @@ from icrl4aht_baselines.report.scores import known_headroom
 from icrl4aht_baselines.training.seen import describe_overlap
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError
-from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import save_episode
 from icrl4aht_data.utils.system import usable_cores
 
 _PROGRESS = "episodes of the report"
-
-JaxEgoMaker = Callable[[Layout], Policy]
 
 
 class ShownEpisode(NamedTuple):
@@ -62,7 +58,7 @@ class EpisodePair(NamedTuple):
 def save_episodes(
     paths: Mapping[int, Path],
     task: Task,
-    make_ego: JaxEgoMaker,
+    make_ego: MakeEgo,
     protocol: Protocol,
     *,
     seed: int = 0,
@@ -141,7 +137,7 @@ def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path
         return EpisodePair(cell, title, f"No picture: {error}. {origin}")
 
 
-def restore_ego(source: ResultSource) -> JaxEgoMaker:
+def restore_ego(source: ResultSource) -> MakeEgo:
     """Return the function that makes the ego of some results, layout -> policy.
 
     Raises:
@@ -156,7 +152,6 @@ def restore_ego(source: ResultSource) -> JaxEgoMaker:
         raise OptionError(f"{name} is neither a reference ego, nor a bundled model, nor of a run folder")
     if "model" not in details and not Path(folder).is_dir():
         raise OptionError(f"its run folder {folder} is missing")
-    details.pop("variant", None)
     agent = find_agent(folder, **PlayMode.from_details(details)._asdict())
     if agent.details != details:
         raise OptionError(f"{folder} holds another model than these results are of: {agent.details}, not {details}")

@@ -1,20 +1,23 @@
 """Reports of results: Markdown, CSV, and one self-contained HTML page.
 
-The page has inline CSS and SVG and GIFs as data URIs, no script and no external files.
+Tables have the paper's numbers next to those of protocol `published`. The page has inline CSS and SVG and GIFs as data
+URIs, no script and no external files.
 """
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from functools import cache
 from html import escape
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -25,19 +28,208 @@ from icrl4aht_baselines.report.results import (
     PUBLISHED_PROTOCOL,
     TASK_KINDS,
     EvaluationRun,
+    ResultCell,
     family_title,
+    in_order,
 )
-from icrl4aht_baselines.report.scores import add_scales
-from icrl4aht_baselines.report.tables import describe_conditions, find_headlines, read_published, returns_tables
-from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend
+from icrl4aht_baselines.report.scores import (
+    add_scales,
+    blocks_text,
+    bundled_cells,
+    cell_scales,
+    find_headlines,
+    find_score,
+    known_headroom,
+    scored_cells,
+)
+from icrl4aht_baselines.training.seen import TRAINED_ON, describe_training, overlap_legend, overlap_marks
+from icrl4aht_data.benchmark.facts import TRACKS, family_order
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write, json_hash
-from icrl4aht_data.utils.templates import markdown_table
+from icrl4aht_data.utils.files import atomic_write, json_hash, parse_json, read_text
+from icrl4aht_data.utils.templates import card_file, markdown_table
+from icrl4aht_data.utils.text import counted_noun
 
 REPORT_FILES = ("report.md", "report.csv")
 """Files that `write_report` writes."""
 
 _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
+
+
+PAPER_METHODS = ("AD", "DPT")
+"""Published methods in tables next to an agent without published results."""
+
+AVERAGE = "Average"
+"""Label of the row of means over families, as in cards/published.json."""
+
+Published = tuple[float, float | None]
+"""A published mean and its standard deviation, which the paper does not always state."""
+
+
+class TableScore(NamedTuple):
+    """Results of an agent on a group of cells, one entry of a table.
+
+    Attributes:
+        text: mean return, std over the instances of a single cell or over cells, and marks of overlaps; a dash if
+            nothing was played.
+        notes: further numbers as text: what is missing, the paper's numbers, score, blocks of episodes.
+        is_flat: whether headroom was measured in a cell, and none has any, see `scores.known_headroom`.
+        overlaps: the ways in which training data and tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
+    """
+
+    text: str = "–"
+    notes: Sequence[str] = ()
+    is_flat: bool = False
+    overlaps: tuple[str, ...] = ()
+
+
+def table_score(
+    cells: Sequence[ResultCell], run: EvaluationRun | None, protocol: str, published: Published | None = None
+) -> TableScore:
+    """Return a run's results on a group of cells.
+
+    Args:
+        cells: the group.
+        run: None if the agent was not run.
+        protocol: of the run.
+        published: the paper's mean and std; left out if a cell was not played, or with another episode length.
+    """
+    played = [cell for cell in cells if run and cell in run.cells]
+    headroom, scales = known_headroom(protocol), cell_scales(protocol)
+    measured = [headroom[cell] for cell in cells if cell in headroom]
+    is_flat = bool(measured) and not any(measured)
+    std = f" ± {published[1]:z.1f}" if published and published[1] is not None else ""
+    paper = [f"paper {published[0]:z.1f}{std}"] if published else []
+    if run is None or not played:
+        return TableScore(notes=paper, is_flat=is_flat)
+    returns = [run.returns[cell] for cell in played]
+    means = [of.mean.mean(axis=1) for of in returns]
+    values = means[0] if len(cells) == 1 else np.array([of_cell.mean() for of_cell in means])
+    std = f" ± {values.std():z.1f}" if len(values) > 1 else ""
+    instances = {cell: len(bundled_cells()[cell]) for cell in played if cell.kind == "test"}
+    complete = all(len(run.tasks(cell)) == count for cell, count in instances.items())
+    counts = f"{len(means[0])} of {counted_noun(instances.get(cells[0], 0), 'instance')}"
+    score, overlaps = find_score(run.returns, scored_cells(run, played, scales), scales), run.overlaps(played)
+    blocks = blocks_text(returns)
+    notes = [
+        f"{len(played)} of {len(cells)} cells" if len(played) < len(cells) else "",
+        "" if complete else counts if len(cells) == 1 else "incomplete cells",
+        *(paper if len(played) == len(cells) and all(map(run.has_full_length, played)) else []),
+        f"score {score.total.mean:z.2f}" if score else "",
+        f"episodes {blocks}" if blocks else "",
+        "no headroom" if is_flat else "",
+    ]
+    text = f"{values.mean():z.1f}{std}{overlap_marks(overlaps)}"
+    return TableScore(text, [note for note in notes if note], is_flat, overlaps)
+
+
+class ScoreTable(NamedTuple):
+    """A table of scores of one kind of tasks.
+
+    Attributes:
+        title: heading of the table.
+        kind: kind of the tasks.
+        columns: name of a column -> layouts.
+        rows: label of a group of families and agent -> scores, one per column.
+        caption: conditions of the evaluation, as a sentence.
+    """
+
+    title: str
+    kind: str
+    columns: Mapping[str, Sequence[str]]
+    rows: Mapping[tuple[str, str], list[TableScore]]
+    caption: str
+
+
+def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTable]:
+    """Return a table for each kind of tasks that was played.
+
+    Tables of test tasks also have averages, and under the paper's protocol rows of the paper's AD, DPT and `random`.
+
+    Args:
+        runs: runs under one protocol.
+        protocol: name of the protocol.
+    """
+    tables = []
+    for kind in TASK_KINDS:
+        cells = in_order(cell for run in runs for cell in run.cells if cell.kind == kind)
+        if not cells:
+            continue
+        layouts = tuple(dict.fromkeys(cell.layout for cell in cells))
+        families = tuple(sorted({cell.family for cell in cells}, key=family_order))
+        columns, labels = ({name: (name,) for name in names} for names in (layouts, families))
+        if kind == "test":
+            columns |= {AVERAGE: layouts} if len(layouts) > 1 else {}
+            labels |= {AVERAGE: families} if len(families) > 1 else {}
+        played = {run.label: run for run in runs if not run.cells.keys().isdisjoint(cells)}
+        rows = {}
+        quoted = (*PAPER_METHODS, "random") if (kind, protocol) == ("test", PUBLISHED_PROTOCOL) else ()
+        for label, agent in product(labels, dict.fromkeys((*played, *quoted))):
+            run, scores = played.get(agent), []
+            for of_column in columns.values():
+                group = [ResultCell(*cell, kind) for cell in product(of_column, labels[label])]
+                stated = published_score(agent if run is None else run, group) if quoted else None
+                scores.append(table_score(group, run, protocol, stated))
+            if any(score.notes or score.text != TableScore().text for score in scores):
+                rows[label, agent] = scores
+        caption = describe_conditions(played.values(), cells)
+        tables.append(ScoreTable(f"{kind.capitalize()} tasks", kind, columns, rows, caption))
+    return tables
+
+
+@cache
+def read_published() -> dict[str, Any]:
+    """Return the paper's numbers, each part with its source, from cards/published.json."""
+    return parse_json(read_text(card_file("published.json")))
+
+
+def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return layout -> family or "Average" -> published mean and std; empty for an agent that is not in the paper."""
+    return read_published()["methods"].get(agent, {})
+
+
+def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> Published | None:
+    """Return the paper's mean and std of a cell, of a layout's four cells or of a track's cells; None of other groups.
+
+    The paper's text states the means of some contexts, and its tables are of K = 500 and the small size.
+
+    Args:
+        agent: name of a published method, or a run of it.
+        cells: the group.
+    """
+    name, context = (agent, None) if isinstance(agent, str) else (agent.agent, agent.sources[0].detail("context"))
+    layouts, families = (tuple(dict.fromkeys(cell[part] for cell in cells)) for part in (0, 1))
+    stated = read_published()["contexts"]["methods"].get(name, {}).get(layouts[0], {})
+    if context != 500 and str(context) in stated:
+        return (stated[str(context)], None) if (len(layouts), families) == (1, HEURISTICS) else None
+    if len(layouts) == 1:
+        label = AVERAGE if families == HEURISTICS else families[0]
+        found = published_cells(name).get(layouts[0], {}).get(label) if label == AVERAGE or len(cells) == 1 else None
+    else:
+        track = next((track for track in TRACKS if (layouts, families) == (TRACKS[track]["test"], HEURISTICS)), "")
+        found = read_published()["tracks"]["methods"].get(name, {}).get(track)
+    return found and (found[0], found[1])
+
+
+def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCell] | None = None) -> str:
+    """Return a sentence with protocol, seeds, length and instances of some runs' results, all or those of `cells`.
+
+    If the conditions differ, it says which agents they are of.
+    """
+    shown = [(run, cell) for run in runs for cell in run.cells if cells is None or cell in cells]
+    labels: dict[str, dict[str, None]] = {}
+    for run, cell in shown:
+        labels.setdefault(run.source(cell).conditions, {})[run.label] = None
+    several = len(labels) > 1
+    texts = [f"{' and '.join(names)} under {text}" if several else f"under {text}" for text, names in labels.items()]
+    instances = instances_range(len(run.cells[cell]) for run, cell in shown)
+    return f"Evaluated {'; '.join(texts)}; {instances} in a cell."
+
+
+def instances_range(numbers: Iterable[int]) -> str:
+    """Return numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
+    found = sorted(set(numbers))
+    return counted_noun(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
 
 
 def write_report(runs: Sequence[EvaluationRun], out: Path) -> list[Path]:
@@ -91,7 +283,7 @@ def summary_lines(runs: Sequence[EvaluationRun]) -> list[str]:
 def csv_text(runs: Sequence[EvaluationRun]) -> str:
     """Return the results of all runs as CSV, with the columns of docs/results.csv, see `results`.
 
-    The column `agent` has the runs' labels, which distinguish the entries of a sweep.
+    The column `agent` has the runs' labels, which distinguish several runs of an agent.
     """
     table = pd.concat([run.table.assign(agent=run.label) for run in runs], ignore_index=True)
     return add_scales(table).round(3).to_csv(index=False, lineterminator="\n")
@@ -103,10 +295,10 @@ def write_page(
     """Write the page. Return its path.
 
     Args:
-        runs: merged, see `results.merge`; of any protocols, sweeps among them.
+        runs: merged, see `results.merge`; of any protocols.
         path: ends in .html; replaced atomically.
         episodes: see `gifs.family_gifs`.
-        notes: facts about these runs for the reader, such as layouts that were left out.
+        notes: facts about these runs for the reader, such as those without episodes.
 
     Raises:
         OptionError: if the path does not end in .html, or there is no run.
@@ -127,7 +319,6 @@ def write_page_with_episodes(
     path: Path,
     *,
     episodes: bool = True,
-    notes: Sequence[str] = (),
     suite: Path | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
@@ -136,15 +327,16 @@ def write_page_with_episodes(
     Reference egos come after the other runs.
 
     Args:
-        runs, path, notes: see `write_page`.
+        runs, path: see `write_page`.
         episodes: False for a page without episodes.
         suite: folder of learned teammates' checkpoints.
         progress: called with (description, tasks drawn, tasks).
     """
     shown = sorted(runs, key=lambda run: run.agent in AGENTS)[:_RUNS_WITH_EPISODES] if episodes else []
     left = [run.label for run in runs if run not in shown]
+    notes = []
     if shown and left:
-        notes = [*notes, f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}"]
+        notes.append(f"episodes are of {_RUNS_WITH_EPISODES} runs at most; there is none of: {', '.join(left)}")
     with TemporaryDirectory() as folder:
         return write_page(runs, path, family_gifs(shown, Path(folder), suite, progress), notes)
 

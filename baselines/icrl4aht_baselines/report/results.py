@@ -93,14 +93,9 @@ class ResultCell(NamedTuple):
     kind: str = "test"
 
     @property
-    def group(self) -> str:
-        """Family and kind, such as "H4" and "H4 (validation)"."""
-        return self.family if self.kind == "test" else f"{self.family} ({self.kind})"
-
-    @property
     def title(self) -> str:
-        """Layout and teammates as people read them: learned teammates, family "rl", are called "learned"."""
-        return f"{self.layout}, {self._replace(family=family_title(self.family)).group}"
+        """Layout and teammates as people read them, such as "demo_wide, H4" and "demo_wide, learned (validation)"."""
+        return f"{self.layout}, {family_title(self.family)}{'' if self.kind == 'test' else f' ({self.kind})'}"
 
     @property
     def order(self) -> tuple[Any, ...]:
@@ -128,6 +123,11 @@ class CellReturns(NamedTuple):
     def mean(self) -> np.ndarray:
         """Mean returns in all episodes and trainings, float64 (U, S)."""
         return self.blocks["all"].mean(axis=0)
+
+
+def mean_of(cells: Iterable[np.ndarray]) -> float:
+    """Return the mean of the cells' means."""
+    return float(np.mean([values.mean() for values in cells]))
 
 
 AgentReturns = Mapping[ResultCell, CellReturns]
@@ -210,7 +210,6 @@ class EvaluationRun:
         table: the results, see the module's docstring.
         cells: cell -> returns of the team in each episode, float64 (instances, episodes), means over the seeds; in the
             paper's order.
-        variant: name and value of the varied quantity in a sweep, such as ("K", 250); None otherwise.
         note: text that distinguishes results of one agent on the same cells; usually empty.
         sources: origins of the results; each cell has one.
     """
@@ -219,7 +218,6 @@ class EvaluationRun:
     protocol: str
     table: pd.DataFrame
     cells: dict[ResultCell, np.ndarray]
-    variant: tuple[str, Any] | None = None
     note: str = ""
     sources: tuple[ResultSource, ...] = ()
 
@@ -241,23 +239,14 @@ class EvaluationRun:
         """The returns in each cell."""
         return returns_by_cell(self.table)
 
-    def is_complete(self, cell: ResultCell) -> bool:
-        """Return whether all published test tasks of a cell were played, and no others."""
-        return len(self.tasks(cell)) == published_instances(cell)
-
     def has_full_length(self, cell: ResultCell) -> bool:
         """Return whether the episodes in a cell have the benchmark's length."""
         return self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
 
-    def is_comparable(self, cell: ResultCell) -> bool:
-        """Return whether a cell has published test tasks, and its episodes have the benchmark's length."""
-        return cell.kind == "test" and self.has_full_length(cell)
-
-    @cached_property
+    @property
     def label(self) -> str:
-        """The agent with variant and note, which distinguishes this run from others of the agent."""
-        varied = "" if self.variant is None else ", {} = {}".format(*self.variant)
-        return self.agent + varied + (f" [{self.note}]" if self.note else "")
+        """The agent, with the note if there is one."""
+        return f"{self.agent} [{self.note}]" if self.note else self.agent
 
 
 def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
@@ -399,8 +388,7 @@ def as_run(
             for seed, value in zip(seeds, of_task, strict=True)
         ]
     sources = tuple(ResultSource(where, settings, trained, own, seen[track]) for track, own in tracks.items())
-    variant = next(iter(settings.get("details", {}).get("variant", {}).items()), None)
-    return EvaluationRun(*agent, pd.DataFrame(rows, columns=TABLE_COLUMNS), cells, variant, sources=sources)
+    return EvaluationRun(*agent, pd.DataFrame(rows, columns=TABLE_COLUMNS), cells, sources=sources)
 
 
 def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: str) -> dict[str, SeenInTraining | None]:
@@ -453,11 +441,6 @@ def _rules(run: EvaluationRun) -> tuple[Any, ...]:
 def bundled_by_id(split: str) -> dict[str, Task]:
     """Return the package's tasks of a split of both tracks by id; "test" has the 160 published ones."""
     return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
-
-
-def published_instances(cell: ResultCell) -> int:
-    """Return the number of published test tasks of a cell; 0 for cells of other kinds."""
-    return sum(cell_of(task) == cell for task in bundled_by_id("test").values())
 
 
 def cell_of(task: Task) -> ResultCell:

@@ -1,4 +1,4 @@
-"""Scores relative to best responses, and differences between agents.
+"""Scores relative to best responses, differences between agents, and the summary of a report.
 
 R is the mean return of an agent with a teammate, S that of the ego `stay`, B that of the best response. The score of a
 layout is N = sum(R - S) / sum(B - S) over its tasks, that of several layouts the mean over the layouts. Only tasks of
@@ -21,6 +21,8 @@ from icrl4aht_baselines.evaluate.controls import ControlledResults
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS
 from icrl4aht_baselines.report.results import (
     CELL_COLUMNS,
+    EPISODE_BLOCKS,
+    TASK_KINDS,
     AgentReturns,
     CellReturns,
     EvaluationRun,
@@ -28,11 +30,19 @@ from icrl4aht_baselines.report.results import (
     bundled_by_id,
     cell_of,
     in_order,
+    mean_of,
     task_label,
 )
-from icrl4aht_baselines.report.statistics import MeanInterval, Stratum, interquartile_mean, ratio_interval
-from icrl4aht_data.benchmark.best_responses import best_responses
-from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, TRACKS
+from icrl4aht_baselines.report.statistics import (
+    MeanInterval,
+    Stratum,
+    interquartile_mean,
+    mean_interval,
+    ratio_interval,
+)
+from icrl4aht_baselines.training.seen import overlap_marks
+from icrl4aht_data.benchmark.best_responses import best_responses, read_best_responses
+from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM, TRACKS
 from icrl4aht_data.benchmark.reference_returns import alike_tasks, has_headroom, read_headroom, stay_returns
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.utils.text import counted_noun
@@ -254,13 +264,11 @@ def block_difference(
 
     Args:
         one, other: the agents.
-        cells: the cells; None is returned unless both played all of them.
-        block: block of episodes, see `results.BLOCKS`.
+        cells: the cells, of which those count that both played; if there is none, None is returned.
+        block: block of episodes, see `results.BLOCKS`; None is returned unless both played it.
     """
     groups, alike = [], behaviour_names()
-    for cell in cells:
-        if cell not in one or cell not in other:
-            return None
+    for cell in (cell for cell in cells if cell in one and cell in other):
         first, second = paired(one[cell], other[cell])
         if block not in first.blocks or block not in second.blocks:
             return None
@@ -324,3 +332,83 @@ def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str
             f"track {track}, partner P: {partner}, return in the {last} minus return in them after another teammate",
         ]
     return lines
+
+
+def blocks_text(cells: Sequence[CellReturns]) -> str:
+    """Return the mean returns over cells in each block of episodes, such as "1: 10.0, 2-5: 12.0"."""
+    # Evaluations of different lengths may share a table: only blocks that all of them have can be compared.
+    names = [name for name in EPISODE_BLOCKS if all(name in of.blocks for of in cells)]
+    return ", ".join(f"{name}: {mean_of(of.blocks[name] for of in cells):z.1f}" for name in names)
+
+
+class Headline(NamedTuple):
+    """Summary of a run's results on one kind of tasks.
+
+    The numbers are of the cells with headroom that were played completely, or of all cells played if there is none.
+
+    Attributes:
+        label: the run's label with marks for overlap of its training data with these tasks.
+        protocol: name of the protocol.
+        tasks: the cells in words, such as "12 test cells with headroom, of 16 played".
+        score: the score; None without a cell with headroom.
+        mean: return of an episode, mean over cells.
+        blocks: mean returns in blocks of episodes in words; empty for one episode.
+        why_no_score: reason for a missing score, as a sentence; empty if there is a score.
+        overlaps: kinds of overlap of the training data with these tasks.
+    """
+
+    label: str
+    protocol: str
+    tasks: str
+    score: Score | None
+    mean: MeanInterval
+    blocks: str
+    why_no_score: str
+    overlaps: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """The summary as sentences for the console and Markdown."""
+        parts = [self.score.text] if self.score else []
+        parts.append(f"return {self.mean.text()}")
+        parts += [f"by episode {self.blocks}"] if self.blocks else []
+        text = f"{self.label} ({self.protocol}), {self.tasks}: {'; '.join(parts)}."
+        text += " Parentheses: 95 % intervals." if self.mean.range() else ""
+        return f"{text} {self.why_no_score}".rstrip()
+
+
+def find_headlines(run: EvaluationRun) -> list[Headline]:
+    """Return a run's summaries, one for each kind of tasks that was played, test tasks first."""
+    scales, found = cell_scales(run.protocol), []
+    for kind in TASK_KINDS:
+        played = [cell for cell in run.returns if cell.kind == kind]
+        scored = scored_cells(run, played, scales)
+        if not played:
+            continue
+        cells = scored or played
+        returns, counted = [run.returns[cell] for cell in cells], counted_noun(len(cells), f"{kind} cell")
+        overlaps = run.overlaps(cells)
+        found.append(
+            Headline(
+                label=run.label + overlap_marks(overlaps),
+                protocol=run.protocol,
+                tasks=f"{counted} with headroom, of {len(played)} played" if scored else counted,
+                score=find_score(run.returns, scored, scales),
+                mean=mean_interval(*(of.mean for of in returns)),
+                blocks=blocks_text(returns) if min(run.cells[cell].shape[1] for cell in cells) > 1 else "",
+                why_no_score="" if scored else _why_no_score(run, played, scales),
+                overlaps=overlaps,
+            )
+        )
+    return found
+
+
+def _why_no_score(run: EvaluationRun, cells: Sequence[ResultCell], scales: CellScales) -> str:
+    measured, known = read_best_responses(), [cell for cell in cells if cell in scales]
+    if measured.behaviours and run.protocol != measured.protocol:
+        return f"No score: best responses were measured under protocol {measured.protocol}."
+    if not known:
+        return "No score: no best response measured."
+    if not any(scales[cell].has_headroom for cell in known):
+        return f"No score: no best response earns {LEAST_HEADROOM:g} more than `stay` in these cells."
+    return f"No score: it needs all tasks of a cell with a best response, in episodes of {KEPT_STEPS} steps."

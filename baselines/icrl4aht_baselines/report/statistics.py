@@ -157,9 +157,7 @@ def holm(p_values: Mapping[_Key, float]) -> dict[_Key, float]:
 
     NaN stays NaN and does not count as a hypothesis.
     """
-    known = sorted(((p, key) for key, p in p_values.items() if not np.isnan(p)), key=lambda found: found[0])
-    corrected, largest = dict(p_values), 0.0
-    for rank, (p, key) in enumerate(known):
-        largest = max(largest, min(1.0, p * (len(known) - rank)))
-        corrected[key] = largest
-    return corrected
+    keys = sorted((key for key, p in p_values.items() if not np.isnan(p)), key=lambda key: p_values[key])
+    multiplied = [p_values[key] * (len(keys) - rank) for rank, key in enumerate(keys)]
+    corrected = np.maximum.accumulate(np.minimum(1.0, multiplied)).tolist()
+    return dict(p_values) | dict(zip(keys, corrected, strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -12,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 from icrl4aht_generation.learners.config import EncoderKind
 from icrl4aht_generation.learners.resume import Checkpoints, differing_settings
 
@@ -187,23 +187,17 @@ def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[
     `dataset.teammate_ids`; None if the release does not describe them. Histories that are held out for validation do
     not belong to `dataset`.
     """
-    columns = [dataset.column(field) for field in _CELL_FIELDS.values()]
-    tasks: dict[tuple[str, ...], list[str]] = defaultdict(list)
-    history_of: dict[str, int] = {}
-    for *cell, task_id, history_id in zip(*columns, dataset.column("task_id"), dataset.ids, strict=True):
-        tasks[tuple(map(str, cell))].append(str(task_id))
-        history_of[str(task_id)] = int(history_id)
-    return [
-        {
-            **dict(zip(_CELL_FIELDS, cell, strict=True)),
-            "labels": labels,
-            "tasks": len(set(ids)),
-            "histories": len(ids),
-            "tasks_hash": json_hash(sorted(set(ids))),
-            "teammates": teammate_ids(dataset, [history_of[task_id] for task_id in set(ids)]),
-        }
-        for cell, ids in sorted(tasks.items())
-    ]
+    fields = _CELL_FIELDS | {"task": "task_id"}
+    table = pd.DataFrame({name: dataset.column(field).astype(str) for name, field in fields.items()})
+    table["history"] = dataset.ids
+    cells = []
+    for cell, own in table.groupby([*_CELL_FIELDS]):
+        history_of = dict(zip(own["task"], own["history"].tolist(), strict=True))
+        sizes = {"labels": labels, "tasks": len(history_of), "histories": len(own)}
+        tasks_hash, teammates = json_hash(sorted(history_of)), teammate_ids(dataset, [*history_of.values()])
+        named = dict(zip(_CELL_FIELDS, cell, strict=True))
+        cells.append(named | sizes | {"tasks_hash": tasks_hash, "teammates": teammates})
+    return cells
 
 
 def _sampler(

@@ -78,29 +78,17 @@ def read_trained_on(entries: Any, where: str) -> SeenInTraining:
     return SeenInTraining(tuple(dict.fromkeys(layouts)), seen)
 
 
-class OverlapKind(NamedTuple):
-    """One way in which the training data and the tasks of an evaluation overlap.
-
-    Attributes:
-        mark: character behind a score.
-        meaning: explanation of the mark, for the reader of a table.
-    """
-
-    mark: str
-    meaning: str
-
-
 OVERLAPS = {
-    "teammate": OverlapKind("‡", "the agent was trained with one of these very teammates"),
-    "family": OverlapKind(
+    "teammate": ("‡", "the agent was trained with one of these very teammates"),
+    "family": (
         "†",
         "the agent was trained with other teammates of this family, or of this algorithm if they are learned; members "
         "of a family may act alike, so this is no result with unknown kinds of teammates",
     ),
-    "layout": OverlapKind("§", "the agent was trained on this layout, which the track reserves for tests"),
-    "unknown": OverlapKind("?", "unknown training data: nothing says what the agent was trained on"),
+    "layout": ("§", "the agent was trained on this layout, which the track reserves for tests"),
+    "unknown": ("?", "unknown training data: nothing says what the agent was trained on"),
 }
-"""Name in reports -> kind of overlap, in the order of marks."""
+"""Way in which training data and the tasks of an evaluation overlap -> its mark behind a score, and what it means."""
 
 
 def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[str, ...]:
@@ -123,25 +111,25 @@ def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[s
     return tuple(name for name in OVERLAPS if name in found)
 
 
-def _overlap_kinds(names: Iterable[str]) -> list[OverlapKind]:
-    """Return kinds of overlap in the order of `OVERLAPS`."""
+def _overlap_kinds(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Return marks and meanings in the order of `OVERLAPS`."""
     return [OVERLAPS[name] for name in sorted(set(names), key=[*OVERLAPS].index)]
 
 
 def overlap_marks(overlaps: Iterable[str]) -> str:
     """Return the marks of kinds of overlap, such as " †§"; empty if there is none."""
-    marks = "".join(kind.mark for kind in _overlap_kinds(overlaps))
+    marks = "".join(mark for mark, _ in _overlap_kinds(overlaps))
     return f" {marks}" if marks else ""
 
 
 def overlap_legend(overlaps: Iterable[str]) -> list[str]:
     """Return an explanation of each mark, such as "† ...", in the order of `OVERLAPS`."""
-    return [f"{kind.mark} {kind.meaning}" for kind in _overlap_kinds(overlaps)]
+    return [f"{mark} {meaning}" for mark, meaning in _overlap_kinds(overlaps)]
 
 
 def describe_overlap(overlaps: Iterable[str]) -> str:
     """Return a sentence on kinds of overlap."""
-    texts = "; ".join(kind.meaning for kind in _overlap_kinds(overlaps))
+    texts = "; ".join(meaning for _, meaning in _overlap_kinds(overlaps))
     return f"Overlap with the training data: {texts}." if texts else "No overlap with the training data."
 
 

@@ -37,7 +37,7 @@ class NoiseConfig:
     """
 
     histories: Count = 8
-    episodes: Annotated[int, Meta(ge=10)] = 60
+    episodes: Annotated[int, Meta(ge=2)] = 60
     start: Range = (1.0, 1.0)
     end: Range = (0.0, 0.0)
     begin: Range = (0.0, 0.0)

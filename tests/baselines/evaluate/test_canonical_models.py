@@ -11,15 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_baselines import experiments
 from icrl4aht_baselines.agents.egos import find_agent, with_view
 from icrl4aht_baselines.agents.host import EgoInput, from_host
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, RolloutState
-from icrl4aht_baselines.experiments import EXPERIMENTS, ExperimentPlan
 from icrl4aht_baselines.methods.options import ModelOptions
-from icrl4aht_baselines.report.cards import model_card
+from icrl4aht_baselines.reference import model_card
 from icrl4aht_baselines.report.results import note_results, read_run
 from icrl4aht_baselines.training.histories import prepare, read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
@@ -28,7 +26,6 @@ from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.instances import published_task
 
-from icrl4aht_data.benchmark.facts import TESTED_ON
 from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.overcooked.observe import observe
@@ -71,7 +68,7 @@ def test_evaluation_on_an_untrained_layout(trained, tmp_path):
     results = evaluate(agent.name, agent.make, [task], SHORT, details=agent.details, out=tmp_path)
     assert np.shape(results[0].returns) == (1, 1)
     note_results(tmp_path, folder)
-    card = model_card(read_run(tmp_path), "x-y", "make", [], {})
+    card = model_card(read_run(tmp_path), "x-y", "make")
     assert "| cramped_down | `" in card and ", manifest with SHA-256 `" in card
 
 
@@ -152,10 +149,3 @@ def test_all_layouts_means_those_that_pass_the_filters(lite, tmp_path):
         HistoryOptions(("all", "demo_wide"))
     with pytest.raises(UnknownNameError, match="unknown channels 'mine'; valid: own, canonical"):
         HistoryOptions(("all",), channels="mine")  # type: ignore[arg-type]
-
-
-def test_one_model_of_all_layouts_is_tested_on_every_test_layout(tmp_path):
-    random_release(tmp_path / "two", layouts=("asymm_both", "cramped_up"), teammates=1)
-    plan = ExperimentPlan(("ad",), ("all",), root=str(tmp_path / "two"), families=("H1",), tasks=2)
-    tested = [task.layout.name for task in experiments._test_tasks(EXPERIMENTS["tracks"], plan, "all")]
-    assert sorted(tested) == sorted(2 * [TESTED_ON["asymm_both"], TESTED_ON["cramped_up"]])

@@ -227,7 +227,7 @@ def test_unusable_teammates_are_refused_before_evaluation(tmp_path):
     wrong = dataclasses.replace(
         SIMPLE[1], teammate=SIMPLE[1].teammate | {"theta": SIMPLE[1].teammate["theta"] | {"inertia": 2.0}}
     )
-    with pytest.raises(TaskFormatError, match=r"task .*_t1_.*inertia = 2.0 \(expected a number in 0..1\)"):
+    with pytest.raises(TaskFormatError, match=r"task .*_t1_.*expected `float` <= 1.0 - at `\$.inertia`"):
         evaluate("stay", stay, [SIMPLE[0], wrong], PUBLISHED, out=tmp_path)
     assert not list(tmp_path.iterdir())
 

@@ -19,7 +19,6 @@ from icrl4aht_baselines.online.agent_histories import (
     release_teammates,
     with_noise,
 )
-from icrl4aht_baselines.reference import RL2_HISTORIES
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
@@ -205,14 +204,3 @@ def test_the_command(tmp_path):
     assert "describes it" in printed
     with pytest.raises(OptionError, match="--overwrite"):
         run_cli(*arguments)
-
-
-def test_histories_like_those_of_reference_models(monkeypatch, tmp_path):
-    made = []
-    monkeypatch.setattr(agent_histories, "collect_release", lambda *given, **options: made.append(given[2]))
-    arguments = ["collect", "--agent", "random", "--layout", "cramped_up", "--like", "rising", "--out", str(tmp_path)]
-    run_cli(*arguments)
-    assert made == [RL2_HISTORIES["rising"]]
-    printed = run_cli(*arguments, "--noise", "1", "0", "--episodes", "60", code=2)
-    assert len(made) == 1
-    assert "--like: not with --episodes, --noise, which it sets" in " ".join(printed.split())

@@ -28,7 +28,7 @@ def file(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("report")
     Image.fromarray(np.zeros((400, 900), np.uint8)).save(folder / "a.gif")
     runs = [evaluated_run(name, TEST_LAYOUTS, protocol="published") for name in ("AD", "random")]
-    runs += [evaluated_run("AD", variant=("K", k), protocol="published") for k in (250, 500)]
+    runs += [evaluated_run("AD", note=f"K{k}", protocol="published") for k in (250, 500)]
     runs.append(evaluated_run("AD+TA+next_obs-" + "x" * 60, protocol="published"))
     shown = tuple(ShownEpisode(number, 20.0 * number, folder / "a.gif") for number in (1, 100))
     caption = "Task 0123456789abcdef, protocol published"

@@ -12,8 +12,9 @@ import pytest
 from icrl4aht_baselines import report
 from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.headroom import write_headroom_cards
+from icrl4aht_baselines.reference import training_sentence
 from icrl4aht_baselines.report import gifs, merge, write_report
-from icrl4aht_baselines.report.cards import training_sentence, write_headroom_cards
 from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
 from icrl4aht_baselines.report.page import REPORT_FILES, markdown, write_page, write_page_with_episodes
@@ -55,7 +56,7 @@ class Elements(HTMLParser):
 
 def test_the_page_is_complete_and_fetches_nothing(tmp_path):
     runs = [evaluated_run(name, TEST_LAYOUTS, protocol="published") for name in ("AD", "random")]
-    runs.append(evaluated_run("AD", protocol="published", variant=("K", 250)))
+    runs.append(evaluated_run("AD", protocol="published", note="K250"))
     (tmp_path / "a.gif").write_bytes(GIF)
     shown = tuple(ShownEpisode(number, 20.0 * number, tmp_path / "a.gif") for number in (1, 2))
     episodes = [
@@ -68,7 +69,7 @@ def test_the_page_is_complete_and_fetches_nothing(tmp_path):
     for section in ("summary", "curves", "episodes", "tables", "settings", "paper"):
         assert f'<section id="{section}">' in text and f'href="#{section}"' in text
     parts = ["left out: &lt;nothing&gt;", "H1 &amp; an ego", "Episode 2: return 40", "&lt;its run&gt; is gone"]
-    parts += ["paper 12.5 ± 11.3", "AD, K = 250", 'name="viewport"', "prefers-color-scheme: dark"]
+    parts += ["paper 12.5 ± 11.3", "AD [K250]", 'name="viewport"', "prefers-color-scheme: dark"]
     assert [part for part in parts if part not in text] == []
     assert text.count("<table") == text.count("<caption>") and "url(" not in text and "@import" not in text
     with pytest.raises(OptionError, match=r"report\.txt: expected a name that ends in \.html"):
@@ -186,13 +187,13 @@ def test_shown_episodes_prefer_cells_with_headroom(measured, tmp_path, monkeypat
         layouts, folder = ("coord_simple", "demo_wide"), f"runs/{agent}{options}"
         return evaluated_run(agent, layouts, families=("H1", "H4"), folder=folder, **options)
 
-    runs = [run_of("stay"), run_of("oracle"), run_of("AD"), run_of("AD", variant=("K", 250)), run_of("DPT")]
+    runs = [run_of("stay"), run_of("oracle"), run_of("AD"), run_of("AD", note="K250"), run_of("DPT")]
     drawn: list[tuple[int, int]] = []
     path = tmp_path / "report.html"
     text = write_page_with_episodes(runs, path, progress=lambda what, *counts: drawn.append(counts)).read_text()
     assert drawn == [(done, 6) for done in range(7)]
     found = re.findall(r"<h4>([^<]+? with \S+ on \S+)</h4>", text)
-    agents = ("AD", "AD, K = 250", "DPT")
+    agents = ("AD", "AD [K250]", "DPT")
     assert found == [f"{agent} with {mate} on demo_wide" for mate in ("H1/t0", "H4/t0") for agent in agents]
     assert "episodes are of 3 runs at most; there is none of: stay, oracle" in text
     assert 'id="episodes"' not in write_page_with_episodes(runs, path, episodes=False).read_text()

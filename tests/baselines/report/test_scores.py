@@ -7,7 +7,15 @@ from io import StringIO
 import numpy as np
 import pandas as pd
 import pytest
-from icrl4aht_baselines.report.page import csv_text, markdown
+from icrl4aht_baselines.report.page import (
+    AVERAGE,
+    csv_text,
+    markdown,
+    published_cells,
+    published_score,
+    returns_tables,
+    table_score,
+)
 from icrl4aht_baselines.report.results import (
     BLOCKS,
     CellReturns,
@@ -20,17 +28,10 @@ from icrl4aht_baselines.report.scores import (
     block_difference,
     bundled_cells,
     cell_scales,
+    find_headlines,
     find_score,
     open_cells,
     score_difference,
-)
-from icrl4aht_baselines.report.tables import (
-    AVERAGE,
-    find_headlines,
-    published_cells,
-    published_score,
-    returns_tables,
-    table_score,
 )
 from msgspec import structs
 
@@ -182,11 +183,9 @@ def test_published_numbers_of_groups_of_cells():
     assert published_score("AD", track) == (2.6, 4.1)
     assert published_score("DPT+TA", DEMO_WIDE) == (9.4, 5.5) and published_score("DPT", DEMO_WIDE[:2]) is None
     wide = [cell._replace(layout="test_wide") for cell in DEMO_WIDE]
-    contexts = [evaluated_run("AD", ("test_wide",), variant=("K", k)) for k in (250, 500, 1000)]
+    contexts = [evaluated_run("AD", ("test_wide",), details={"context": k}) for k in (1000, 500, 250)]
     found = [published_score(run, wide) for run in contexts]
-    assert (found[0], found[2]) == (None, (-7.6, None)) and found[1] == tuple(
-        published_cells("AD")["test_wide"][AVERAGE]
-    )
+    assert found == [(-7.6, None), *2 * [tuple(published_cells("AD")["test_wide"][AVERAGE])]]
 
 
 def test_incomplete_and_flat_groups_are_marked(measured):
@@ -203,14 +202,14 @@ def test_incomplete_and_flat_groups_are_marked(measured):
 
 
 def test_csv_and_markdown_have_the_numbers_of_each_cell(measured):
-    runs = [evaluated_run("AD", protocol="published", trained_on=None), evaluated_run("AD", variant=("K", 250))]
+    runs = [evaluated_run("AD", protocol="published", trained_on=None), evaluated_run("AD", note="K250")]
     found = pd.read_csv(StringIO(csv_text(runs)), keep_default_na=False)
-    assert set(found["agent"]) == {"AD", "AD, K = 250"} and set(found["block"]) == {*BLOCKS}
+    assert set(found["agent"]) == {"AD", "AD [K250]"} and set(found["block"]) == {*BLOCKS}
     first, last = (found[found["agent"] == run.label].iloc[0] for run in runs)
     assert (first["return"], first["overlap"], first["best"]) == (11.0, "unknown", "")
     assert (float(last["stay"]), float(last["best"])) == (0.0, 20.0)
     text = markdown(runs)
     assert "| H1 | AD | 11.0 ± 0.0 ?<br>paper -3.2 ± 2.6<br>episodes 1: 10.0, " in text
-    assert text.count("\n## Test tasks, ") == 2 and "| H1 | AD, K = 250 | 11.0 ± 0.0<br>score 0.55<br>" in text
+    assert text.count("\n## Test tasks, ") == 2 and "| H1 | AD [K250] | 11.0 ± 0.0<br>score 0.55<br>" in text
     assert "* ? unknown training data: nothing says what the agent was trained on" in text
     assert "Evaluated under protocol published, 1 seed (0), 40 episodes of 100 steps; 5 instances in a cell." in text

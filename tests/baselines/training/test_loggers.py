@@ -7,6 +7,7 @@ import socket
 import sqlite3
 import struct
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,15 @@ def tensorboard_values(run: Path) -> list[Value]:
 
 
 def wandb_values(run: Path) -> list[Value]:
+    """Return (step, part/name, value) of each record, once wandb's own process has written them."""
+    for _ in range(100):
+        if found := wandb_records(run):
+            return found
+        time.sleep(0.1)
+    return []
+
+
+def wandb_records(run: Path) -> list[Value]:
     """Return (step, part/name, value) of each record in a run's offline file, a log of LevelDB of one block."""
     from wandb.proto import wandb_internal_pb2
 

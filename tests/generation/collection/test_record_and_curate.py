@@ -123,7 +123,7 @@ def best(returns: list[list[int]], keep: int, least_improvement: float | None = 
 
 
 def score_by_hand(curve: list[int]) -> float:
-    w = max(5, math.floor(0.1 * len(curve)))
+    w = max(5, math.floor(0.1 * len(curve))) if len(curve) >= 10 else len(curve) // 2
     start, end = sum(curve[:w]) / w, sum(curve[-w:]) / w
     return end + (end - start)
 

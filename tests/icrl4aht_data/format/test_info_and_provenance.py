@@ -18,7 +18,8 @@ def test_the_bundled_release_is_written_as_it_was_read(tmp_path):
     write_json(tmp_path / "info.json", read_info(MINI).to_json())
     assert (tmp_path / "info.json").read_bytes() == (MINI / INFO).read_bytes()
     found = read_provenance(MINI / PROVENANCE)
-    write_json(tmp_path / "provenance.json", {task_id: of_task.to_json() for task_id, of_task in found.items()})
+    content = {task_id: of_task.to_json() for task_id, of_task in found.items()}
+    write_json(tmp_path / "provenance.json", content, indent=None)
     assert (tmp_path / "provenance.json").read_bytes() == (MINI / PROVENANCE).read_bytes()
 
 

@@ -1,0 +1,113 @@
+"""Returns of the reference egos with every test task, and the cards of the package that state them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from icrl4aht_baselines.agents.egos import find_agent
+from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS, bundled_tasks, get_protocol
+from icrl4aht_baselines.online.responses import find_behaviours
+from icrl4aht_baselines.report.page import PAPER_METHODS, published_cells
+from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, evaluate_agent
+from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, SUBMITTED_SEEDS
+from icrl4aht_data.benchmark.facts import TRACKS
+from icrl4aht_data.benchmark.reference_returns import REFERENCES, has_headroom, headroom_table
+from icrl4aht_data.utils.templates import markdown_table
+
+HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json", "behaviours.json")
+
+HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
+"""Layout -> family -> reference ego -> mean return."""
+
+
+def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:
+    """Evaluate every reference ego under every protocol into out/<protocol>/<agent>; finished tasks are kept.
+
+    `stay` also plays the validation tasks, since scores are relative to it. Under the protocol of the scores, the egos
+    play with the seeds of the agents' results, under others with seed 0.
+
+    Args:
+        out: folder of the results.
+        protocols: their names.
+        show: called with (name, episodes played, episodes), for progress.
+    """
+    runs = []
+    for protocol, agent in product(protocols, REFERENCES):
+        seeds = SUBMITTED_SEEDS if protocol == SUBMITTED_PROTOCOL else (0,)
+        splits = EVALUATION_SPLITS if agent == "stay" else ("test",)
+        tasks = [task for split, track in product(splits, TRACKS) for task in bundled_tasks(track, split)]
+        rules, shown = get_protocol(protocol), {"show": show, "what": f"{agent}, {protocol}"}
+        runs.append(evaluate_agent(find_agent(agent), tasks, rules, out / protocol / agent, seeds=seeds, **shown))
+    return runs
+
+
+def find_alike_tasks() -> list[list[str]]:
+    """Return lists of test task ids; the teammates of the tasks in a list act alike."""
+    tasks = [task for track in TRACKS for task in bundled_tasks(track, "test")]
+    return [[task.task_id for task in alike] for alike in find_behaviours(tasks) if len(alike) > 1]
+
+
+def write_headroom_cards(runs: Sequence[EvaluationRun], alike: Sequence[Sequence[str]], folder: Path) -> list[Path]:
+    """Write `HEADROOM_FILES` into a folder. Return their paths.
+
+    headroom.json holds protocol -> layout -> family -> reference ego -> mean return with the test tasks, stay.json
+    protocol -> task id -> mean return of `stay`, behaviours.json `alike`, see `find_alike_tasks`.
+    """
+    content: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    stays: dict[str, dict[str, float]] = {}
+    for run in runs:
+        for cell, returns in run.returns.items():
+            means = returns.mean.mean(axis=1)  # of each task
+            if cell.kind == "test":
+                egos = content.setdefault(run.protocol, {}).setdefault(cell.layout, {}).setdefault(cell.family, {})
+                egos[run.agent] = round(float(means.mean()), 3)
+            if run.agent == "stay":
+                of_task = zip(run.tasks(cell), means.tolist(), strict=True)
+                stays.setdefault(run.protocol, {}).update({task.task_id: round(mean, 3) for task, mean in of_task})
+    numbers, *lists = (json.dumps(value, indent=1) + "\n" for value in (content, stays, alike))
+    paths = [folder / name for name in HEADROOM_FILES]
+    for path, text in zip(paths, (numbers, headroom_markdown(content), *lists), strict=True):
+        path.write_text(text, encoding="utf-8")
+    return paths
+
+
+def headroom_markdown(protocols: Mapping[str, HeadroomCells]) -> str:
+    """Return the headroom card: protocol -> cells, as Markdown."""
+    lines = [
+        "# Headroom: what an ego can change",
+        "",
+        "Mean return of the reference egos `stay` / `random` / `oracle` (scripted, full information) over the five",
+        "published test instances of a cell, each played for 100 episodes of 100 steps with seed 0, under `seeded`",
+        f"with the seeds {', '.join(map(str, SUBMITTED_SEEDS))}. **bold**: the oracle earns over one point more than",
+        "`stay`; elsewhere no reference ego can raise the return by more, so a method's score there says nothing about",
+        "adaptation.",
+    ]
+    for protocol, layouts in protocols.items():
+        names = [layout for layout in TEST_LAYOUTS if layout in layouts]
+        cells = {(layout, family): cell for layout in names for family, cell in layouts[layout].items()}
+        lines += ["", f"## Protocol `{protocol}`", "", headroom_table(cells, names)]
+    if "published" in protocols:
+        lines += ["", "## The paper's methods and the reference egos", "", published_table(protocols["published"])]
+    return "\n".join(lines) + "\n"
+
+
+def published_table(layouts: HeadroomCells) -> str:
+    """Return a Markdown table of reference egos and the paper's methods: a row per layout, means over families.
+
+    Args:
+        layouts: measured under the protocol `published`.
+    """
+    body, paper = [], ("random", *PAPER_METHODS)
+    for layout in (name for name in TEST_LAYOUTS if name in layouts):
+        cells = layouts[layout]
+        stay, drawn, oracle = (np.mean([cell[agent] for cell in cells.values()]) for agent in REFERENCES)
+        stated = [np.mean([published_cells(name)[layout][family][0] for family in cells]) for name in paper]
+        numbers = [f"{number:z.1f}" for number in (stay, drawn, *stated, oracle)]
+        body.append([layout, *numbers, f"{sum(map(has_headroom, cells.values()))} of {len(cells)}"])
+    names = ["stay", "random", *(f"{name} (paper)" for name in paper), "oracle", "cells with headroom"]
+    return markdown_table(["layout", *names], body)
