@@ -24,7 +24,7 @@ from icrl4aht_data.utils.files import NO_ROOM, add_filename, allocate, describe_
 from icrl4aht_data.utils.system import CACHE_VARIABLES, cache_folder, cache_limit
 
 _CONTENTS = "contents.json"  # name -> [dtype, shape] of every array
-_KEY = re.compile(r"[a-z]+(-\d+)?-[0-9a-f]{32,64}")  # only folders that match are evicted
+_KEY = re.compile(r"[a-z]+-[0-9a-f]{32,64}")  # only folders that match are evicted
 _ABANDONED = 24 * 3600  # seconds after which an unfinished set counts as left by a killed process
 
 Arrays = dict[str, np.ndarray]
@@ -50,7 +50,7 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
     mapped a removed set can still read it.
 
     Args:
-        key: identifies the content; a file name of the form `<letters>-<number>-<hash>` or `<letters>-<hash>`.
+        key: identifies the content; a file name of the form `<letters>-<hash>`.
         size: approximate size of the arrays in bytes.
         build: called with a new folder, into which it writes `<name>.npy` files.
 

@@ -56,6 +56,9 @@ _KNOWN = re.compile(
 .git/config, sitecustomize.py or x.pth could make other programs run its content."""
 
 
+_SOURCE_CARD = "meta/source_card.md"  # only in releases of earlier versions
+
+
 def is_known_file(name: str) -> bool:
     """Return whether a release may contain a file with this path; False for the manifest itself."""
     return _KNOWN.fullmatch(name) is not None
@@ -141,13 +144,13 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
 def check_meta(root: Path) -> None:
     """Check the files of meta/ except chunk tables; see `check_against_manifest`.
 
-    meta/source_card.md, which earlier versions of this package wrote, may be missing, since no code reads it.
+    meta/source_card.md, which earlier versions of this package wrote, may be missing: no code reads or fetches it.
     """
-    listed = [name for name in read_manifest(root) if re.fullmatch(r"meta/[^/]+", name)]
-    read = {
-        name for name in (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE) if name in listed or (root / name).exists()
-    }
-    check_against_manifest(root, sorted(read | {name for name in listed if (root / name).exists()}))
+    names = {name for name in read_manifest(root) if re.fullmatch(r"meta/[^/]+", name)}
+    if not (root / _SOURCE_CARD).exists():
+        names.discard(_SOURCE_CARD)
+    names |= {name for name in (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE) if (root / name).exists()}
+    check_against_manifest(root, sorted(names))
 
 
 def check_folder(root: Path, folder: str) -> None:

@@ -36,6 +36,7 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.chunks import chunk_table_name
+from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST
 from tests.helpers.batches import assert_equal
 from tests.helpers.commands import run_cli
@@ -91,6 +92,14 @@ def shards_in(folder: Path) -> set[str]:
 
 
 # Reading
+
+
+def test_a_source_card_of_an_earlier_version_is_not_needed(lite, tmp_path):
+    shutil.copytree(lite[0], tmp_path / "served")
+    (tmp_path / "served" / "meta" / "source_card.md").write_text("# card\n")
+    write_manifest(tmp_path / "served")
+    with http_server(tmp_path / "served") as server:
+        assert len(load_icrl4aht(server.url)) == len(load_icrl4aht(tmp_path / "served"))
 
 
 @KINDS

@@ -24,7 +24,6 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.fetch import fetch_planned, plan_download
-from icrl4aht_data.format import index
 from icrl4aht_data.format.manifest import parse_manifest, write_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, held_fields
 from icrl4aht_data.reading.sources import CacheMode
@@ -71,10 +70,9 @@ def batches(release) -> bytes:
 
 @pytest.fixture
 def caches(tmp_path, monkeypatch) -> Path:
-    """An empty cache folder, in which columns of every size are cached."""
+    """An empty cache folder."""
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setenv("ICRL4AHT_DATA_DIR", str(tmp_path / "data"))
-    monkeypatch.setattr(index, "_UNCACHED", 0)
     return tmp_path / "cache"
 
 
@@ -208,7 +206,7 @@ def test_mapped_arrays_that_fill_the_disk(release, batches, caches, size, mounte
         with pytest.raises(CacheError, match=f"{caches}: the cache folder has no room for arrays of "):
             hash_batches(dataset)
         left = [path.name for path in caches.iterdir()]
-        assert all(name.startswith(("histories-", "index-")) for name in left), left
+        assert all(name.startswith("histories-") for name in left), left
         enlarge()
         assert hash_batches(dataset) == batches
 
@@ -229,8 +227,6 @@ from pathlib import Path
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.fetch import open_root
-from icrl4aht_data.format import index
-index._UNCACHED = 0
 print(flush=True)
 sys.stdin.readline()
 """
@@ -257,7 +253,7 @@ def test_two_processes_at_once(release, batches, caches, tmp_path, what):
     if what == "download":
         assert contents(to) == contents(release)
     if what == "build":
-        assert {path.name.split("-")[0] for path in caches.iterdir()} <= {"index", "histories"}
+        assert {path.name.split("-")[0] for path in caches.iterdir()} <= {"histories"}
         made = contents(caches)
         assert hash_batches(load_icrl4aht(release, obs="uint8", cache="mmap")) == batches
         assert contents(caches) == made, "built again"

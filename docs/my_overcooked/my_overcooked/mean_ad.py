@@ -2,7 +2,6 @@
 
 import flax.linen as nn
 import jax.numpy as jnp
-
 from icrl4aht_baselines.methods.ad import action_method
 
 

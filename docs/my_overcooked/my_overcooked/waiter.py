@@ -1,9 +1,9 @@
 """`waiter`: takes a plate to a pot, waits for the soup and delivers it; never cooks."""
 
 import jax.numpy as jnp
-
 from icrl4aht_generation.paths import Rule, Scene
 from icrl4aht_generation.teammates.heuristics.heuristic import Heuristic, Sampling, draw
+
 from icrl4aht_data.overcooked.actions import STAY
 
 
