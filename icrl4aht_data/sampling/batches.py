@@ -189,6 +189,10 @@ class Batches(Iterator[B], Generic[B]):
         if not isinstance(state, Mapping):
             raise OptionError(f"state = {state!r:.100}: expected the result of state_dict()")
         expected, given = self._sampler.options(), {name: value for name, value in state.items() if name != "next"}
+        if "channels" in expected:
+            given.setdefault("channels", "own")  # states of version 0.1 do not contain this option
+        if "order" in expected:
+            given.setdefault("labels", "expert")  # older DPT states do not contain `labels`, which had one value
         wrong = [name for name in expected.keys() | given.keys() if expected.get(name) != given.get(name)]
         if wrong or "next" not in state:
             found = ", ".join(f"{name} = {given.get(name)!r}, not {expected.get(name)!r}" for name in sorted(wrong))

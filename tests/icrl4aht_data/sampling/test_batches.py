@@ -144,6 +144,15 @@ def test_positions_of_other_batches_are_not_resumed(two_sources, message):
         OTHER_BATCHES[message](dataset).batches(prefetch=0).load_state_dict(state)
 
 
+def test_positions_saved_before_an_option_existed_are_resumed(two_sources):
+    dataset = load_icrl4aht(two_sources[0], layout="demo_wide", split="train")
+    for sampler in (dataset.ad(**SIZES), dataset.dpt(batch_size=3, context=9)):
+        batches = sampler.batches(prefetch=0)
+        state = {name: value for name, value in batches.state_dict().items() if name not in ("channels", "labels")}
+        batches.load_state_dict(state | {"next": 7})
+        assert_equal(next(batches), sampler[7])
+
+
 @pytest.mark.parametrize("cache", CACHES)
 def test_memory_stays_flat(lite, cache):
     def resident() -> int:
