@@ -37,10 +37,13 @@ BYTES: dict[tuple[Kind, str], float] = {
     ("full", "ppo"): 9.23,
     ("lite", "noise"): 2.79,
     ("full", "noise"): 12.01,
-    ("lite", "search"): 2.22,
+    ("lite", "search"): 1.52,
     ("full", "search"): 12.01,
 }
 """Bytes of a transition in a release, by kind and source, measured on the bundled release."""
+
+HISTORY_BYTES = {"search": 570}
+"""Further bytes of a history by source, where histories are short: those of 500 and of 1,000 steps were measured."""
 
 ENVIRONMENT_STEPS_PER_SECOND = 180_000.0
 """Environment with a scripted teammate, on 2 CPU cores."""
@@ -125,7 +128,7 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
     """
     egos: list[tuple[Layout, PPOConfig]] = []
     scripted: list[tuple[Layout, NoiseConfig]] = []
-    tasks, kept = 0, Counter[str]()
+    tasks, kept, histories = 0, Counter[str](), Counter[str]()
     for source in profile.sources:
         for name in profile.layouts_of(source):
             layout, count = get_layout(name), profile.tasks_on(name, source)
@@ -136,6 +139,7 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
             else:
                 config = profile.scripted_on(name, source)
                 scripted += [(layout, config)] * count
+                histories[source] += count * config.histories
                 kept[source] += count * config.histories * config.episodes * KEPT_STEPS
     runs = population_runs(profile, profile.algorithms, 0)
 
@@ -145,7 +149,8 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
     scripted_seconds = [count / ENVIRONMENT_STEPS_PER_SECOND + SCRIPTED_SECONDS for count in transitions]
     seconds = [played + COMPILE_SECONDS for played in playing] + scripted_seconds
     teammate_seconds = sum(run.steps * step_seconds(run.config) + COMPILE_SECONDS for run in runs)
-    sizes = {kind: round(sum(kept[source] * BYTES[kind, source] for source in kept)) for kind in KINDS}
+    whole = sum(histories[source] * more for source, more in HISTORY_BYTES.items())
+    sizes = {kind: round(whole + sum(kept[source] * BYTES[kind, source] for source in kept)) for kind in KINDS}
     device = jax.devices()[0]
     return RebuildCost(
         profile=profile.name,
