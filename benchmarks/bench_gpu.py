@@ -13,9 +13,9 @@ running case is stopped and the others are skipped, each with a line. Learners r
 deterministic operations, as in `generate`. Models are untrained.
 
 `mfu` is the model FLOP utilisation: the operations of the matrix products in the traced program
-(`benchmarks.harness.product_flops`, backward pass included) per second of step time, divided by the speed of the
-large product with the same dtype. With `words` in training, the operations are those of a batch
-whose observations all differ; equal ones are computed once. `program_gib` is what the compiler planned for one program,
+(`benchmarks.harness.product_flops`, backward pass included) per second of step time, divided by the speed of the large
+product with the same dtype. With `words` in training, equal observations are computed once, but the operations are
+counted as if all observations of a batch differed. `program_gib` is what the compiler planned for one program,
 `process_peak_gib` the highest use so far, `accumulate` the number of parts of a batch that does not fit into memory.
 """
 

@@ -212,9 +212,11 @@ def plot_source_curves(curves: SourceCurves) -> Figure:
         ends += list(axes.dataLim.intervaly)
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
+        if axes.dataLim.x1 < 10:  # the powers of ten alone would leave one number on the axis
+            axes.xaxis.set_minor_formatter("{x:g}")
         axes.set_title(f"source {source}, {counted_histories(sum(map(len, by_split.values())))}", fontsize=9)
         axes.set_xlabel("episode", fontsize=8)
-        axes.tick_params(labelsize=7)
+        axes.tick_params(which="both", labelsize=7)
         axes.grid(alpha=0.3)
     for axes in grid:
         axes.set_ylim(*return_limits(ends))

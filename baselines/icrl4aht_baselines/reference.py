@@ -312,7 +312,7 @@ def model_card(
         title: name of the bundled model.
         command: command that makes it.
         validation: further results, on validation tasks under the same protocol, which get tables, too.
-        drawn: tracks whose model has a picture of its training.
+        drawn: tracks for which the folder has a figure of the model's training.
     """
     models: dict[str, list[ResultSource]] = defaultdict(list)
     for source in run.sources:

@@ -47,7 +47,7 @@ def how_to_play(layout: Layout) -> str:
     return (
         f"You are the blue chef: move with the arrow keys; space takes, puts down, cooks and serves what is in front "
         f"of you. Put the recipe's three ingredients into a pot, wait {POT_STEPS} steps, take the soup with a plate "
-        f"and bring it to the green bell. The right soup earns {DELIVERY_REWARD:+g}, a wrong one "
+        f"and serve it at the green cell with the bell. The right soup earns {DELIVERY_REWARD:+g}, a wrong one "
         f"{WRONG_DELIVERY_REWARD:g}.{button}"
     )
 

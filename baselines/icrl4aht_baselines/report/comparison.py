@@ -357,7 +357,7 @@ def describe_trainings() -> str:
     better = sum(not one.agent.startswith("best response") for one in behaviours)
     return (
         f"Behaviours: {len(behaviours)}. Trainings with each: {_span([len(one.seeds) for one in behaviours], 'd')}, of "
-        f"{steps} steps and width {width}. Behaviours whose B is the higher return of a stored model: {better}."
+        f"{steps} steps and width {width}. With {better} of these behaviours a stored model earns more: B is its return."
     )
 
 

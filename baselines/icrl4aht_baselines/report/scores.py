@@ -264,8 +264,11 @@ def block_difference(
 
     Args:
         one, other: the agents.
-        cells: the cells, of which those count that both played; if there is none, None is returned.
-        block: block of episodes, see `results.BLOCKS`; None is returned unless both played it.
+        cells: the cells to compare. Those that only one of the agents played are left out.
+        block: block of episodes, see `results.EPISODE_BLOCKS`.
+
+    Returns:
+        The difference; None if the agents have no cell or not this block in common.
     """
     groups, alike = [], behaviour_names()
     for cell in (cell for cell in cells if cell in one and cell in other):

@@ -154,8 +154,8 @@ def test_the_page_describes_the_trainings_of_best_responses(cards, monkeypatch):
     write_best_responses(cards / "two.json", BestResponseCard("0", "seeded", "Two.", tuple(behaviours)))
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "two.json")
     assert describe_trainings() == (
-        "Behaviours: 2. Trainings with each: 1 to 2, of 100 steps and width 128. Behaviours whose B is the higher "
-        "return of a stored model: 1."
+        "Behaviours: 2. Trainings with each: 1 to 2, of 100 steps and width 128. With 1 of these behaviours a "
+        "stored model earns more: B is its return."
     )
 
 
