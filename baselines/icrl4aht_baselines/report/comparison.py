@@ -357,7 +357,8 @@ def describe_trainings() -> str:
     better = sum(not one.agent.startswith("best response") for one in behaviours)
     return (
         f"Behaviours: {len(behaviours)}. Trainings with each: {_span([len(one.seeds) for one in behaviours], 'd')}, of "
-        f"{steps} steps and width {width}. With {better} of these behaviours a stored model earns more: B is its return."
+        f"{steps} steps and width {width}. With {better} of these behaviours a stored model earns more: B is its "
+        f"return."
     )
 
 
