@@ -265,15 +265,22 @@ _PART_BYTES = 200  # bytes of a path component; leaves room for the longer names
 
 
 def files_below(folder: Path) -> Iterator[str]:
-    """Yield the relative paths of all files below a folder, and of folders that cannot be listed.
-
-    Symbolic links are not followed.
-    """
-    unlisted: list[str] = []
-    for parent, folders, files in os.walk(folder, onerror=lambda error: unlisted.append(error.filename)):
-        links = [name for name in folders if os.path.islink(os.path.join(parent, name))]  # noqa: PTH114, PTH118 - faster
-        yield from (Path(parent, name).relative_to(folder).as_posix() for name in (*files, *links))
-    yield from (f"{Path(name).relative_to(folder).as_posix()}/" for name in unlisted if Path(name) != folder)
+    """Yield the relative paths of all files below a folder; symbolic links are not followed."""
+    folders = [""]  # not `os.walk`, which fails on folders that are deeper than Python's recursion limit
+    while folders:
+        prefix = folders.pop()
+        try:
+            with os.scandir(folder / prefix) as found:
+                entries = [(prefix + entry.name, entry.is_dir(follow_symlinks=False)) for entry in found]
+        except OSError:
+            if prefix:  # a folder that cannot be listed is itself reported
+                yield prefix
+            continue
+        for name, is_folder in entries:
+            if is_folder:
+                folders.append(f"{name}/")
+            else:
+                yield name
 
 
 def is_inside(name: str) -> bool:
