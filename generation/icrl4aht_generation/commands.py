@@ -307,10 +307,10 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
 def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: bool) -> None:
     """Measure the heuristic teammates that tasks may draw.
 
-    Draws parameters from the training ranges and diverse ones, of each 32 for training and 8 for validation of each
-    family on each layout. Writes for each draw which test instance acts most like it, and what the egos stay, random
-    and oracle earn with it. With --spread, chooses widely different teammates for the profiles' tasks.spread. Layouts
-    that the table has are kept, so that a stopped command resumes.
+    Draws parameters from the training ranges, and from wider ones (diverse): for each layout and family 32 for training
+    and 8 for validation. Writes for each draw which test instance acts most like it, and what the egos stay, random and
+    oracle earn with it. With --spread, chooses widely different teammates for the profiles' tasks.spread. Layouts that
+    the table has are kept, so that a stopped command resumes.
     """
     import pandas as pd
 
