@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +53,7 @@ from icrl4aht_data.utils.text import counted_noun
     "all but the last 20 episodes, into OUT/swapped. Prints what memory (M) and the right partner (P) are worth.",
 )
 @shared.protocol_option
-@functools.partial(shared.add_options, options=shared.tasks_options)
+@shared.add_options(*shared.tasks_options)
 @click.option("--tasks", type=COUNT, help="Most tasks of each cell, a layout with a teammate family: 2 are two a cell.")
 @click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
 @shared.suite_option
