@@ -84,11 +84,9 @@ def evaluate_command(
     training nor test. Split diverse has validation tasks with more kinds of teammates than the published training
     ranges.
     """
-    from icrl4aht_baselines.evaluate.controls import evaluate_controls
-    from icrl4aht_baselines.evaluate.evaluator import evaluate
-    from icrl4aht_baselines.evaluate.programs import Programs
-    from icrl4aht_baselines.evaluate.protocols import get_protocol, hidden_recipe_note, limit_tasks
-    from icrl4aht_baselines.evaluate.segments import CONTROLS
+    from icrl4aht_baselines.evaluate.evaluator import evaluate, evaluate_controls
+    from icrl4aht_baselines.evaluate.protocols import CONTROLS, get_protocol, hidden_recipe_note, limit_tasks
+    from icrl4aht_baselines.evaluate.rollout import Programs
     from icrl4aht_baselines.report.page import summary_lines
     from icrl4aht_baselines.report.results import note_results, read_run
     from icrl4aht_baselines.report.scores import control_lines
