@@ -34,7 +34,7 @@ from icrl4aht_data.plotting import check_can_draw, legend_below, plot_learning_c
 from icrl4aht_data.utils.files import check_output
 from icrl4aht_data.utils.progress import progress_bars
 
-DEMO_LAYOUT = "asymm_both_plain"
+DEMO_LAYOUT = "rooms-0-46"
 _SOURCE = "search"
 _EPISODES = 5  # of a window, which begins where a history begins, as an evaluation does; later ones show nothing new
 
