@@ -150,11 +150,8 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         "has {} behaviours on cramped_down, H2 has {} on test_wide, and all other cells have {}.",
         behaviours_of_tests,
     ),
-    ("docs/protocol", "canonical channels takes (5, 5, {})", lambda: len(CANONICAL_CHANNELS)),
     ("docs/protocol", "its oldest {} is dropped", lambda: dropped_steps(500) / 500),
-    ("docs/protocol", "*No headroom*: [{} of the {} cells", cells_without_headroom),
     ("docs/protocol", "{} steps in profile `paper`", lambda: load_profile("paper").ego.shaping_horizon),
-    ("docs/protocol", "`tiny`: {} layers of width {}, a dense encoder, K = {}", tiny_size),
     (
         "docs/protocol",
         "batch size {}, or {} of size tiny",
@@ -162,7 +159,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ),
     ("docs/protocol", "Dropout {} is on the outputs", lambda: ModelOptions().dropout),
     ("docs/protocol", "{} GRU layers of {}", lambda: (ModelOptions().recurrent_layers, ModelOptions().width)),
-    ("docs/protocol", "A {} of the histories is held out", lambda: HistoryOptions(("demo_wide",)).held_out),
     (
         "docs/generating",
         "lists {} draws for training and {} for validation of each family",
