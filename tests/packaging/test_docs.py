@@ -19,6 +19,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
+from icrl4aht_baselines.headroom import published_table
 from icrl4aht_baselines.methods.registry import METHODS
 
 from icrl4aht_data import load_icrl4aht
@@ -29,6 +30,7 @@ from icrl4aht_data.overcooked import state
 from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_positions
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.commands import run_cli, run_python
 from tests.helpers.damages import flip_bit
@@ -272,3 +274,8 @@ def test_listed_variables_are_those_that_the_code_reads():
     listed = {name for cells in rows("scale", "variable") for name in cells[0].split(", ")}
     assert used <= listed
     assert {name for name in listed if name.startswith("ICRL4AHT")} <= used
+
+
+def test_published_returns_are_those_of_headroom_json():
+    table = published_table(json.loads(card_file("headroom.json").read_text())["published"])
+    assert table in PAGES["evaluating"] and table in card_file("headroom.md").read_text()
