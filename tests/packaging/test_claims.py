@@ -136,7 +136,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("README", "{} histories of {} tasks on {} layouts: {} steps in {} MB", size_of_the_bundle),
     ("README", "a delivery is worth {}.", lambda: DELIVERY_REWARD),
     ("README", "more than `stay` in {} of the {} cells", cells_without_headroom),
-    ("docs/index", "the benchmark's {} test tasks", lambda: len(tasks("test"))),
+    ("docs/index", "benchmark's {} test tasks", lambda: len(tasks("test"))),
     ("docs/evaluating", "There are {} published test tasks", lambda: len(tasks("test"))),
     ("docs/evaluating", "of {} episodes with {} steps each", lambda: (SEEDED.episodes, SEEDED.steps)),
     ("docs/evaluating", "canonical channels, the same {} on every layout", lambda: len(CANONICAL_CHANNELS)),
