@@ -157,7 +157,6 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
         "batch size {}, or {} of size tiny",
         lambda: (SIZES["small"].cpu_batch, TINY_SIZE.cpu_batch),
     ),
-    ("docs/protocol", "Dropout {} is on the outputs", lambda: ModelOptions().dropout),
     ("docs/protocol", "{} GRU layers of {}", lambda: (ModelOptions().recurrent_layers, ModelOptions().width)),
     (
         "docs/generating",
