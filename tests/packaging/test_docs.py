@@ -27,7 +27,7 @@ from icrl4aht_data.commands.cli import all_verbs, cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.schema import FIELDS, Field, Kind
 from icrl4aht_data.overcooked import state
-from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_positions
+from icrl4aht_data.overcooked.channels import canonical_positions
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.utils.templates import card_file
@@ -155,12 +155,6 @@ def reader() -> dict[str, Any]:
     return runpy.run_path(str(DOCS / "read_release.py"))
 
 
-def _numbers(ranges: str) -> list[int]:
-    """Return the integers of a text such as "0 to 8, 44"."""
-    bounds = [list(map(int, part.split(" to "))) for part in ranges.split(", ")]
-    return [number for first, *last in bounds for number in range(first, (last or [first])[0] + 1)]
-
-
 class TestFormat:
     def test_reading_gives_the_arrays_of_the_package(self, reader, lite, full, tmp_path):
         to_release(load_icrl4aht(full[0]), tmp_path / "observations", "observations")
@@ -199,11 +193,6 @@ class TestFormat:
                 np.testing.assert_array_equal(reader["observe"](parsed, record, agent), observe(layout, record, agent))
 
     def test_canonical_channels(self, reader):
-        listed = [(_numbers(cells[0]), cells[1]) for cells in rows("format", "positions")]
-        assert [place for places, _ in listed for place in places] == list(range(len(CANONICAL_CHANNELS)))
-        for places, text in listed:
-            for beginning in re.findall(r"\b[a-z]+_[a-z_0-9]*", text):
-                assert any(CANONICAL_CHANNELS[place].startswith(beginning) for place in places), beginning
         for layout in LAYOUTS.values():
             parsed = reader["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
             assert reader["canonical_positions"](parsed) == canonical_positions(layout).tolist()
