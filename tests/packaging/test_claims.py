@@ -146,7 +146,7 @@ CLAIMS: list[tuple[str, str, Callable[[], float | tuple[float, ...]]]] = [
     ("docs/protocol", "{} of its modes do not cooperate", uncooperative_modes),
     (
         "docs/protocol",
-        "have {} behaviours of {} tasks (`cards/behaviours.json`). All instances of H4 are one on every layout. H1 "
+        "have {} behaviours of {} tasks (`cards/behaviours.json`). H4 has one behaviour on every layout. H1 "
         "has {} behaviours on cramped_down, H2 has {} on test_wide, and all other cells have {}.",
         behaviours_of_tests,
     ),
