@@ -22,7 +22,7 @@ from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownName
 from icrl4aht_data.fetch import ReleaseLocation, check_root, chosen_files, open_root
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask, read_provenance
 from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import History
@@ -118,12 +118,14 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     except Icrl4ahtError as error:
         if PROVENANCE not in report.files_at_fault:
             report.add(PROVENANCE, str(error))
-    check_references(listed, index, tasks, provenance, report)
+    made = provenance or ProvenanceByTask()
+    played = [one for task in tasks for one in made.of(task.task_id).played(task)]
+    check_references(listed, index, played, provenance, report)
     if report.level == "deep":
-        report.notes += _unchecked_values(index, provenance or {})
+        report.notes += _unchecked_values(index, made)
     if provenance is not None:
         check_provenance(index, tasks, provenance, report)
-    check_index(index, tasks, provenance, report)
+    check_index(index, tasks, played, provenance, report)
     shards = [name for name in index.values("shard") if name in chosen]
     skipped = len(index.values("shard")) - len(shards)
     if skipped:

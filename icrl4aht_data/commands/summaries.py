@@ -90,19 +90,17 @@ def layout_table(dataset: Dataset) -> Table:
     table = Table(box=None, pad_edge=False, show_footer=True)
     columns = [dataset.column(name) for name in ("return_start", "return_end", "T", "episodes")]
     numbers, tasks = dataset.layout_numbers, dataset.column_codes("task_id")
-    rows = []
-    for name, members in [
-        *((layout.name, numbers == number) for number, layout in enumerate(dataset.layouts)),
-        ("total", np.ones(len(dataset), bool)),
-    ]:
+
+    def row(name: str, members: np.ndarray) -> list[str]:
         start, end, steps, episodes = (column[members] for column in columns)
         counts = [len(np.unique(tasks[members])), int(members.sum()), int(episodes.sum()), int(steps.sum())]
-        rows.append([name, *(f"{count:,}" for count in counts), f"{start.mean():.1f}", f"{end.mean():.1f}"])
+        return [name, *(f"{count:,}" for count in counts), f"{start.mean():.1f}", f"{end.mean():.1f}"]
+
     headings = ("layout", "tasks", "histories", "episodes", "steps", "return at start", "at end")
-    for heading, total in zip(headings, rows[-1], strict=True):
+    for heading, total in zip(headings, row("total", np.ones(len(dataset), bool)), strict=True):
         table.add_column(heading, footer=total, justify="left" if heading == "layout" else "right", overflow="fold")
-    for row in rows[:-1]:
-        table.add_row(*row)
+    for number, layout in enumerate(dataset.layouts):
+        table.add_row(*row(layout.name, numbers == number))
     return table
 
 
