@@ -39,7 +39,7 @@ def check_files(
     """
     root, quick = origin.folder, report.level == "quick"
     expected, present = listed.keys() & chosen, set(files_below(root))
-    if not quick or origin.remote is None:  # a quick check does not download files
+    if not quick or not isinstance(origin, Remote):  # a quick check does not download files
         for name in sorted(expected - present):
             report.add(name, "listed in the manifest, but missing")
     for name in sorted(present - listed.keys() - {MANIFEST}):

@@ -19,7 +19,7 @@ from icrl4aht_data.checking.shards import check_chunks, check_history, check_str
 from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, check_choice
-from icrl4aht_data.fetch import ReleaseLocation, check_root, chosen_files, open_root
+from icrl4aht_data.fetch import ReleaseLocation, Remote, check_root, chosen_files, open_root
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask, read_provenance
@@ -102,8 +102,8 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         raise
     except Icrl4ahtError as error:  # reported after problems of files, which may be the cause
         unreadable = error
-    if origin.remote is not None and report.level != "quick":
-        origin.remote.fetch(sorted(chosen))
+    if report.level != "quick":
+        origin.fetch(sorted(chosen))
     check_files(origin, listed, chosen, report, advance)
     if unreadable is not None:
         report.add("meta", str(unreadable))
@@ -132,8 +132,8 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         report.notes.append(f"{skipped} of {skipped + len(shards)} shards were not selected")
     if report.level != "quick":
         _check_shards(index, {task.task_id: task.layout for task in tasks}, shards, report, advance)
-    elif origin.remote is not None:
-        check_remote_sizes(origin.remote, index, shards, report)
+    elif isinstance(origin, Remote):
+        check_remote_sizes(origin, index, shards, report)
 
 
 def _unchecked_values(index: Index, provenance: Mapping[str, Provenance]) -> Iterator[str]:
@@ -149,7 +149,7 @@ def _check_shards(
     index: Index, layouts: Mapping[str, Layout], shards: list[str], report: Report, advance: NamedProgress
 ) -> None:
     """Check shards and their histories; `layouts` are those of the tasks by id, with the tasks' recipes."""
-    local = ReleaseLocation(index.root)  # no remote, since files that could not be fetched are already reported
+    local = ReleaseLocation(index.root)  # fetches nothing, since files that could not be fetched are already reported
     members = grouped(index.entries, lambda entry: entry.shard)
     total = sum(len(members[name]) for name in shards)
     for name in shards:

@@ -11,6 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.info import describe
 from icrl4aht_data.format.schema import FIELDS, Entry
 from icrl4aht_data.reading.history import LABELS
@@ -127,14 +128,14 @@ def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
 
 def summarize_selection(dataset: Dataset) -> dict[str, Any]:
     """Return a JSON object with the location, kind, versions and counts of a selection."""
-    info, remote = dataset.info, dataset.origin.remote
+    info, origin = dataset.info, dataset.origin
     content = describe(
         info.kind, info.data_version, info.environment.kept_steps, dataset.entries, info.format_version
     ).to_json()
     return {
         "summary": repr(dataset),
-        "root": str(dataset.origin),
-        **({"revision": remote.revision, "folder": str(dataset.root)} if remote else {}),
+        "root": str(origin),
+        **({"revision": origin.revision, "folder": str(origin.folder)} if isinstance(origin, Remote) else {}),
         **content,
         "splits": dataset.counts("split"),
         "sources": dataset.counts("source"),
