@@ -42,7 +42,7 @@ _MODEL = ModelOptions(
     width=128, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05
 )
 _TRAINING = TrainOptions(
-    1250, batch_size=32, context=_EPISODES * KEPT_STEPS, learning_rate=2e-3, validate_every=500, validation_batches=1
+    900, batch_size=32, context=_EPISODES * KEPT_STEPS, learning_rate=2e-3, validate_every=500, validation_batches=1
 )
 _PROTOCOL = get_protocol("seeded", 10)
 
