@@ -19,8 +19,7 @@ from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import PLAYING, get_method, overcooked_world
 from icrl4aht_baselines.methods.tokens import BatchView, plain_view
-from icrl4aht_baselines.methods.view_change import changed_view
-from icrl4aht_baselines.training.layout_numbers import number_layouts
+from icrl4aht_baselines.methods.view_change import changed_view, number_layouts
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, read_config
 from icrl4aht_baselines.training.seen import TRAINED_ON
