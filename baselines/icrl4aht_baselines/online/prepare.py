@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts, with_four_recipes
@@ -40,19 +40,7 @@ REARRANGED_SHARE = 1.5
 """Number of tasks on all rearranged versions of a layout, as a share of that on the layout."""
 
 
-class _Teammate(NamedTuple):
-    """A training teammate on one layout.
-
-    Attributes:
-        entry: its kind, family and parameters, as in a task.
-        policy: how it plays.
-    """
-
-    entry: dict[str, Any]
-    policy: Policy
-
-
-_Teammates = dict[tuple[Layout, str], dict[str, _Teammate]]
+_Teammates = dict[tuple[Layout, str], dict[str, Policy]]
 """(layout, kind of the teammates) -> task id -> teammate. A task with a dish of its own has a layout with that dish."""
 
 
@@ -157,15 +145,15 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
         for task_id, history_id in history_of.items():
             layout, teammate = dataset.history_task(history_id).layout, dataset.recover_teammate(history_id)
             if teammate["kind"] == "rl":
-                mate = _Teammate(teammate, recover_teammate(dataset, history_id))
-                found.setdefault((layout, teammate["family"]), {})[task_id] = mate
+                mates = found.setdefault((layout, teammate["family"]), {})
+                mates[task_id] = recover_teammate(dataset, history_id)
             else:
                 scripted.append((layout, task_id, teammate))
     # Heuristics of one family play in one program, so all need the same parameters.
     entries = with_equal_parameters([teammate for _, _, teammate in scripted])
     for (layout, task_id, teammate), entry in zip(scripted, entries, strict=True):
         mates = found.setdefault((layout, teammate["family"]), {})
-        mates[task_id] = _Teammate(teammate, build_teammate(None, entry))
+        mates[task_id] = build_teammate(None, entry)
     return found
 
 
@@ -208,19 +196,15 @@ def _groups(
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
     rearranged = {layout: REARRANGED_SHARE * shares[layout.name] for layout in heuristics if play.rearranged}
     fixed = round(tasks * total / (total + sum(rearranged.values())))
-    groups = make_groups({key: _policies(mates) for key, mates in everywhere.items()}, fixed, shares, hidden)
+    groups = make_groups(everywhere, fixed, shares, hidden)
     for layout, share in rearranged.items():
         count = round((tasks - fixed) * share / sum(rearranged.values()))
         groups += _rearranged_groups(layout, heuristics[layout], count, play.rearranged, layout.name in hidden)
     return groups
 
 
-def _policies(mates: Mapping[str, _Teammate]) -> dict[str, Policy]:
-    return {task: mate.policy for task, mate in mates.items()}
-
-
-def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Teammate]]]:
-    """Return the heuristic teammates of each layout by kind: they can be built on other layouts as well.
+def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Policy]]]:
+    """Return the heuristic teammates of each layout by kind: they see a `Situation`, and so play every layout.
 
     Raises:
         OptionError: if a layout has learned teammates alone, or tasks with a dish of their own, which other versions of
@@ -232,9 +216,9 @@ def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Team
                 f"{layout.name}: has tasks with a fixed dish, which rearranged layouts and four recipes do not keep; "
                 f"leave out --rearranged and --four-recipes, or these tasks"
             )
-    found: dict[Layout, dict[str, dict[str, _Teammate]]] = {layout: {} for layout, _ in teammates}
+    found: dict[Layout, dict[str, dict[str, Policy]]] = {layout: {} for layout, _ in teammates}
     for (layout, kind), mates in teammates.items():
-        if all(mate.entry["kind"] == "heuristic" for mate in mates.values()):
+        if all(mate.sees == "situation" for mate in mates.values()):
             found[layout][kind] = mates
     for layout, kinds in found.items():
         if not kinds:
@@ -246,7 +230,7 @@ def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Team
 
 
 def _rearranged_groups(
-    layout: Layout, kinds: Mapping[str, dict[str, _Teammate]], tasks: int, versions: int, hidden: bool
+    layout: Layout, kinds: Mapping[str, dict[str, Policy]], tasks: int, versions: int, hidden: bool
 ) -> Iterator[TaskGroup]:
     """Yield a group of each kind of teammates on rearranged versions of a layout.
 
@@ -261,7 +245,7 @@ def _rearranged_groups(
         count = max(len(own), round(tasks * len(own) / versions))
         # In turn, so that the numbers of tasks of two versions differ by one at most.
         where = [own[task % len(own)] for task in range(count)]
-        yield make_group(where, kind, _policies(mates), hidden, f"{layout.name} rearranged")
+        yield make_group(where, kind, mates, hidden, f"{layout.name} rearranged")
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:

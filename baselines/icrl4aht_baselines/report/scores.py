@@ -149,20 +149,16 @@ def add_scales(table: pd.DataFrame) -> pd.DataFrame:
     return scaled
 
 
-def open_cells(scales: CellScales) -> list[ResultCell]:
-    """Return the test cells with headroom, in the paper's order."""
-    return in_order(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
+def open_cells(scales: CellScales, track: str | None = None) -> list[ResultCell]:
+    """Return the test cells with headroom, all or those of a track, in the paper's order."""
+    cells = in_order(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
+    return [cell for cell in cells if track is None or cell.layout in TRACKS[track]["test"]]
 
 
 def known_headroom(protocol: str) -> dict[ResultCell, bool]:
     """Return whether each measured cell has headroom: by best responses, or by the oracle where there are none."""
     egos = {ResultCell(*cell): has_headroom(of_cell) for cell, of_cell in read_headroom(protocol).items()}
     return egos | {cell: scale.has_headroom for cell, scale in cell_scales(protocol).items()}
-
-
-def track_cells(cells: Iterable[ResultCell], track: str) -> list[ResultCell]:
-    """Return the test cells of a track among some cells."""
-    return [cell for cell in cells if cell.kind == "test" and cell.layout in TRACKS[track]["test"]]
 
 
 class Score(NamedTuple):
