@@ -17,7 +17,7 @@ from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup, make_group, make_groups
 from icrl4aht_baselines.online.teammates import check_heuristics
-from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cells
+from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cell, training_cells
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import TASKS_SOURCE
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
@@ -28,7 +28,6 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
-from icrl4aht_data.utils.files import json_hash
 
 FLAT_SHARE = 0.3
 """Number of tasks on a layout on which no ego earns more than `stay` does, as a share of that on other layouts."""
@@ -282,18 +281,7 @@ def _played_cells(
     for task in tasks:
         if task.task_id in played:
             cells[task.layout.name, task.split, task.teammate_family, task.teammate_kind].append(task)
-    return found + [
-        {
-            "layout": layout,
-            "split": split,
-            "family": family,
-            "algorithm": kind,
-            "source": TASKS_SOURCE,
-            "labels": labels,
-            "tasks": len(of_cell),
-            "histories": 0,
-            "tasks_hash": json_hash(sorted(task.task_id for task in of_cell)),
-            "teammates": sorted({teammate_id(task.teammate) for task in of_cell}),
-        }
-        for (layout, split, family, kind), of_cell in cells.items()
-    ]
+    for cell, own in cells.items():
+        ids, mates = [task.task_id for task in own], sorted({teammate_id(task.teammate) for task in own})
+        found.append(training_cell((*cell, TASKS_SOURCE), labels, ids, 0, mates))
+    return found
