@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -278,17 +278,16 @@ def block_difference(
 
 def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
     """Return the results of two agents in a cell on the tasks, seeds and trainings that both have, in one order."""
-    tasks = tuple(task for task in one.tasks if task in other.tasks)
-    seeds = tuple(seed for seed in one.seeds if seed in other.seeds)
-    trainings = tuple(number for number in one.trainings if number in other.trainings)
+    axes = [(of.trainings, of.tasks, of.seeds) for of in (one, other)]
+    common = [tuple(key for key in first if key in second) for first, second in zip(*axes, strict=True)]
 
-    def chosen(found: CellReturns) -> CellReturns:
-        rows, columns = [found.tasks.index(task) for task in tasks], [found.seeds.index(seed) for seed in seeds]
-        numbers = [found.trainings.index(number) for number in trainings]
-        blocks = {name: values[numbers][:, rows][:, :, columns] for name, values in found.blocks.items()}
+    def chosen(found: CellReturns, own: tuple[tuple[Any, ...], ...]) -> CellReturns:
+        places = np.ix_(*([axis.index(key) for key in keys] for axis, keys in zip(own, common, strict=True)))
+        blocks = {name: values[places] for name, values in found.blocks.items()}
+        trainings, tasks, seeds = common
         return CellReturns(tasks, seeds, blocks, found.overlaps, trainings)
 
-    return chosen(one), chosen(other)
+    return chosen(one, axes[0]), chosen(other, axes[1])
 
 
 def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellScales) -> list[ResultCell]:
