@@ -66,8 +66,8 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
     """Return the timing of a collection of the profile's last heuristic task, stopped after `updates` updates."""
     work = _first_heuristic(profile)
 
-    def report(update: int, metrics: dict[str, float]) -> None:
-        if update + 1 == updates:
+    def report(done: int, speed: float) -> None:
+        if done == updates:
             raise _EnoughError
 
     with tempfile.TemporaryDirectory() as folder:

@@ -8,7 +8,7 @@ from pathlib import Path
 from icrl4aht_data.overcooked.layouts import Layout, add_layouts
 from icrl4aht_generation.collection.scripted import play_histories
 from icrl4aht_generation.collection.scripted_rollout import scripted_pieces
-from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, UpdateCallback, learn_histories
+from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, learn_histories
 from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing, partial_folder, publish_artefact
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.resume import run_lock
@@ -22,7 +22,7 @@ def run_task(
     work: Work,
     profile: Profile,
     folder: Path,
-    on_update: UpdateCallback = lambda update, metrics: None,
+    on_update: OnUpdate = lambda updates, speed: None,
     *,
     suite: Path | None = None,
     wait: bool = False,
@@ -95,9 +95,9 @@ class CollectionJob:
     @property
     def updates(self) -> int:
         """Updates of the ego, or pieces that a script plays."""
-        if self.work.source == "ppo":
-            return self.profile.ego_on(self.work.task.layout.name).updates
         layout, source = self.work.task.layout.name, self.work.source
+        if source == "ppo":
+            return self.profile.ego_on(layout).updates
         return len(scripted_pieces(source, self.profile.scripted_on(layout, source)))
 
     @property
@@ -122,11 +122,7 @@ class CollectionJob:
     def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
         """Make the artefact, see `jobs.job.Job`."""
         add_layouts(self.layouts)
-
-        def on_metrics(update: int, metrics: dict[str, float]) -> None:
-            on_update(update + 1, metrics["steps_per_second"])
-
-        run_task(self.work, self.profile, self.folder, on_metrics, suite=self.suite, wait=wait)
+        run_task(self.work, self.profile, self.folder, on_update, suite=self.suite, wait=wait)
 
     def finished_text(self) -> str:
         """Return the text on the finished artefact."""

@@ -34,8 +34,8 @@ from pathlib import Path
 from icrl4aht_generation.collection.job import run_task
 from icrl4aht_generation.profiles import Profile, load_profile
 
-def report(update, metrics):
-    print(update, flush=True)
+def report(updates, speed):
+    print(updates, flush=True)
     time.sleep(0.1)
 
 profile = load_profile(sys.argv[1])
@@ -53,9 +53,9 @@ def run_task(task: tuple[Work, Profile], *arguments, **options) -> bool:
     return collection_job.run_task(task[0], task[1], *arguments, **options)
 
 
-def stop_after(update: int):
-    def report(number, metrics):
-        if number == update:
+def stop_after(updates: int):
+    def report(done, speed):
+        if done == updates:
             raise KeyboardInterrupt
 
     return report
@@ -83,7 +83,7 @@ def test_runs_killed_at_random_write_the_same_artefact(built, tmp_path):
     output, errors = start(*command).communicate()
     assert folder.exists(), errors
     firsts.append(int(output.split()[0]))
-    assert firsts[0] == 0
+    assert firsts[0] == 1
     assert firsts == sorted(set(firsts)), f"killed {killed}, began at {firsts}"
     assert not compare_rebuilds(folder, artefact(built / "a")).differences, killed
     assert not partial_folder(folder).exists()
@@ -92,7 +92,7 @@ def test_runs_killed_at_random_write_the_same_artefact(built, tmp_path):
 def test_updates_after_the_last_save_are_repeated(built, task, tmp_path):
     folder = tmp_path / "task"
     with pytest.raises(KeyboardInterrupt):
-        run_task(task, folder, stop_after(6), save_seconds=0)
+        run_task(task, folder, stop_after(7), save_seconds=0)
     partial = partial_folder(folder)
     assert StateFile(partial / LEARNER).progress == 6
     with (partial / METRICS).open("a") as stream:
@@ -129,7 +129,7 @@ def test_killed_before_renaming(built, task, tmp_path):
 def test_a_partial_of_other_settings_is_started_again(built, task, tmp_path, monkeypatch):
     folder = tmp_path / "task"
     with pytest.raises(KeyboardInterrupt):
-        run_task(task, folder, stop_after(3), save_seconds=0)
+        run_task(task, folder, stop_after(4), save_seconds=0)
     (tmp_path / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 80\nclip = 0.1"))
     firsts = []
 
@@ -148,14 +148,14 @@ def test_a_finished_task_is_unchanged(built, task, tmp_path):
     folder = tmp_path / "task"
     shutil.copytree(artefact(built / "a"), folder)
     before = (folder / METADATA).stat().st_mtime_ns
-    assert not run_task(task, folder, stop_after(0))
+    assert not run_task(task, folder, stop_after(1))
     assert (folder / METADATA).stat().st_mtime_ns == before
 
 
 # A full disk: a clear error, no SIGBUS, no leftover files.
 
 
-def never(update, metrics):
+def never(updates, speed):
     raise AssertionError("the task was started")
 
 
@@ -188,8 +188,8 @@ def test_a_failed_allocation_leaves_no_files(task, tmp_path):
 
 
 def test_a_full_disk_keeps_the_saved_state(task, tmp_path):
-    def fill(update, metrics):
-        if update == 6:
+    def fill(updates, speed):
+        if updates == 7:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with pytest.raises(DiskFullError, match="task: the disk is full: this task needs "):

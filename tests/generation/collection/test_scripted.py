@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from icrl4aht_generation.collection.job import run_task
 from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules, play_scripted_histories
 from icrl4aht_generation.collection.task_folder import METADATA, TIMING, last_timing, partial_folder
+from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.releases.check import compare_rebuilds
@@ -71,9 +71,9 @@ def arrays(made) -> dict[str, np.ndarray]:
     return {path.stem: np.load(path) for path in made.glob("*.npy")}
 
 
-def stop_after(history: int) -> Callable[[int, dict[str, float]], None]:
-    def report(number, metrics):
-        if number >= history:
+def stop_after(pieces: int) -> OnUpdate:
+    def report(done, speed):
+        if done >= pieces:
             raise KeyboardInterrupt
 
     return report
@@ -168,10 +168,10 @@ def test_schedules():
 def test_a_stopped_task_is_made_again(made, profile, tmp_path):
     folder, seen = tmp_path / WORK.name, []
     with pytest.raises(KeyboardInterrupt):
-        run_task(WORK, profile, folder, stop_after(1))
+        run_task(WORK, profile, folder, stop_after(2))
     assert (partial_folder(folder) / "rewards.npy").exists()
-    assert run_task(WORK, profile, folder, lambda number, metrics: seen.append(number))
-    assert seen == [0, 1, 2]
+    assert run_task(WORK, profile, folder, lambda done, speed: seen.append(done))
+    assert seen == [1, 2, 3]
     assert not compare_rebuilds(folder, made).differences
     assert not partial_folder(folder).exists()
 
@@ -185,7 +185,7 @@ def test_wall_clock_figures_are_apart_from_what_is_hashed(made):
 
 
 def test_a_full_disk(profile, tmp_path, monkeypatch):
-    def fill(piece, metrics):
+    def fill(pieces, speed):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
@@ -195,7 +195,7 @@ def test_a_full_disk(profile, tmp_path, monkeypatch):
     with pytest.raises(
         DiskFullError, match=r"other: the disk is full: this task needs [\d,]{6,} bytes, 5,000 are free"
     ):
-        run_task(WORK, profile, tmp_path / "other", stop_after(0))
+        run_task(WORK, profile, tmp_path / "other", stop_after(1))
     assert not partial_folder(tmp_path / "other").exists()
 
 
