@@ -60,7 +60,7 @@ def test_the_best_streams_are_kept_best_first(built):
     assert kept == np.argsort(-scores, kind="stable")[:3].tolist()
 
 
-def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
+def test_checkpoints_of_the_ego_are_evenly_spaced(built):
     folder = artefact(built / "a")
     metadata = json.loads((folder / METADATA).read_text())
     assert metadata["checkpoint_updates"] == [5, 10, 15, 20, 25]
@@ -71,10 +71,6 @@ def test_checkpoints_of_the_ego_are_evenly_spaced_and_hashed(built, tmp_path):
         kernels.append(params["params"]["actor"]["kernel"])
     for one, other in pairwise(kernels):
         assert (one != other).any()
-    shutil.copytree(folder, tmp_path / "copy")
-    shutil.copy(tmp_path / "copy/checkpoints/c1/policy.json", tmp_path / "copy/checkpoints/c0/policy.json")
-    profile = load_profile(str(built / "tiny.toml"))
-    assert not artefacts.is_task_finished(tmp_path / "copy", profile.units()[0], profile)
 
 
 def test_damaged_or_different_artefacts_are_unfinished(built, tmp_path):
@@ -85,10 +81,11 @@ def test_damaged_or_different_artefacts_are_unfinished(built, tmp_path):
     assert artefacts.is_task_finished(folder, work, profile)
     (built / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 40"))
     assert not artefacts.is_task_finished(folder, work, load_profile(str(built / "other.toml")))
-    actions = bytearray((folder / "actions.npy").read_bytes())
-    actions[-1] ^= 1
-    (folder / "actions.npy").write_bytes(actions)
-    assert not artefacts.is_task_finished(folder, work, profile)
+    for name in ("actions.npy", "checkpoints/c0/policy.json"):
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+        assert not artefacts.is_task_finished(folder, work, profile)
+        (folder / name).write_bytes(content)
     (folder / METADATA).unlink()
     assert not artefacts.is_task_finished(folder, work, profile)
 

@@ -147,7 +147,7 @@ def key_of(memory: Any) -> jax.Array:
     return getattr(memory, "key", memory)
 
 
-@pytest.mark.parametrize("family", [H1, H2, H3])
+@pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
 def test_fixed_noise_ignores_the_episode_and_seeded_does_not(family):
     for slot in (0, 1):
         teammate = heuristic_teammate(family, "default", 0)
