@@ -151,8 +151,7 @@ def teammate_facts(
             "teammates": [[task.teammate, task.recipes] for task in chosen],
             "episodes": REFERENCE_EPISODES,
         }
-        measure = partial(_measure, chosen, suite, headroom)
-        measured = measured_once(kept, settings, list[TeammateFacts], measure)
+        measured = measured_once(kept, settings, list[TeammateFacts], partial(_measure, chosen, suite, headroom))
         found |= dict(zip(keys, measured, strict=True))
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
 
@@ -206,13 +205,10 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     nearest: dict[str, NearestTest] = {}
     layout = tasks[0].layout
     if learned and layout.name in TESTED_ON:  # other layouts have no test teammates
-        for task, near in zip(learned, nearest_test(layout, [_build(task, suite) for task in learned]), strict=True):
+        mates = [build_teammate(layout, task.teammate, suite=suite) for task in learned]
+        for task, near in zip(learned, nearest_test(layout, mates), strict=True):
             nearest[task.task_id] = NearestTest(near.teammate, round(near.distance, _DIGITS), near.behaviour)
     return [TeammateFacts(returns[task.task_id], nearest.get(task.task_id)) for task in tasks]
-
-
-def _build(task: Task, suite: Path) -> Any:
-    return build_teammate(task.layout, task.teammate, TEAMMATE, suite=suite)
 
 
 def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
