@@ -179,8 +179,7 @@ def labelled():
     rng = np.random.default_rng(3)
     states = random_records(LAYOUT, 400, rng).reshape(2, 200, -1)
     obs = observe(LAYOUT, states, EGO)
-    hidden = network.initial_hidden(2)
-    tree = jax.eval_shape(network.init, jax.random.key(0), hidden, obs[None, :, 0], np.zeros((1, 2), bool))
+    tree = jax.eval_shape(lambda key: network.untrained(key, LAYOUT.channels), jax.random.key(0))
 
     def random(weight) -> np.ndarray:  # actions as different as the states
         if len(weight.shape) == 1:
