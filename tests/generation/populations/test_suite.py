@@ -45,6 +45,7 @@ from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
+from tests.helpers.damages import flip_bit
 from tests.helpers.paths import ROOT
 from tests.helpers.xla_flags import add_xla_flag
 
@@ -235,9 +236,7 @@ def test_a_changed_byte_or_a_missing_file_makes_a_population_unfinished(trained,
     folder, job = population(tmp_path, "lbrdiv"), job_of("lbrdiv", tmp_path)
     shutil.copytree(population(trained("lbrdiv"), "lbrdiv"), folder)
     assert job.is_finished()
-    content = bytearray((folder / name).read_bytes())
-    content[len(content) // 2] ^= 1
-    (folder / name).write_bytes(content)
+    flip_bit(folder / name)
     assert not job.is_finished()
     (folder / name).unlink()
     assert not job.is_finished()

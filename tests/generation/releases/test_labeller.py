@@ -35,6 +35,7 @@ from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.utils.hashes import file_hash
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
+from tests.helpers.damages import flip_bit
 from tests.helpers.tiny import artefact
 
 # Choice of the checkpoint
@@ -232,9 +233,7 @@ def test_policies_are_in_the_release_if_the_profile_says_so(built, with_policies
 def test_verify_compares_policies_and_index_with_the_provenance(with_policies):
     root = with_policies
     weights = next(root.glob("experts/*/policy.safetensors"))
-    content = bytearray(weights.read_bytes())
-    content[-1] ^= 1
-    weights.write_bytes(content)
+    flip_bit(weights)
     provenance = json.loads((root / "meta/provenance.json").read_text())
     (of_task,) = provenance.values()
     of_task["expert"]["return_greedy"] = 99.0
