@@ -63,11 +63,10 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceE
         folders = [checkpoint_folder(suite, task.teammate) for task in own]
         mates = [build_learned(layout, folder) for folder in folders]
         partners = [build_learned(layout, _partner(folder), "sampled") for folder in folders]
-        returns = reference_returns(layout, mates)
-        for k, (task, ego, mate) in enumerate(zip(own, partners, mates, strict=True)):
+        for task, ego, mate, returns in zip(own, partners, mates, reference_returns(layout, mates), strict=True):
             play = _self_play_program(layout, ego._replace(params=()), mate._replace(params=()))
             self_play = float(np.asarray(play(ego.params, mate.params)).mean())
-            found[task.task_id] = reference_egos(returns, k, self_play)
+            found[task.task_id] = reference_egos(returns, self_play)
     return found
 
 
@@ -200,8 +199,8 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     returns = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
     returns |= learned_headroom(missing, suite) if missing else {}
     for task in heuristics:  # one at a time: tasks may want dishes of their own, and all of a family share a program
-        egos = reference_returns(task.layout, [build_teammate(None, task.teammate)])
-        returns[task.task_id] = reference_egos(egos, 0)
+        (egos,) = reference_returns(task.layout, [build_teammate(None, task.teammate)])
+        returns[task.task_id] = reference_egos(egos)
     nearest: dict[str, NearestTest] = {}
     layout = tasks[0].layout
     if learned and layout.name in TESTED_ON:  # other layouts have no test teammates

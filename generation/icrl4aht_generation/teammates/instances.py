@@ -36,18 +36,13 @@ def _test_teammates() -> dict[tuple[str, str], list[dict[str, Any]]]:
     return dict(found)
 
 
-def published_teammate(layout: str, family: str, number: int) -> dict[str, Any]:
-    """Return the teammate entry of a test instance on a layout (short name), as in a task.
+def published_teammates(layout: str, family: str) -> list[dict[str, Any]]:
+    """Return the teammate entries of the test instances t0..t4 of a family on a layout (short name), as in tasks.
 
     Layouts without test tasks have the parameters that all layouts but cramped_down share.
     """
     found = _test_teammates()
-    return found.get((layout, family), found["demo_wide", family])[number]
-
-
-def published_thetas(layout: str, family: str) -> list[dict[str, Any]]:
-    """Return the published parameter sets t0..t4 of a family on a layout (short name)."""
-    return [published_teammate(layout, family, number)["theta"] for number in range(INSTANCES)]
+    return found.get((layout, family), found["demo_wide", family])
 
 
 def published_task(layout: str, teammate: str) -> Task:
@@ -57,8 +52,12 @@ def published_task(layout: str, teammate: str) -> Task:
         UnknownNameError: for an unknown layout, family or instance.
     """
     name = get_layout(layout).name
-    names = {f"{short}/t{t}": (family, t) for family, short in HEURISTIC_KINDS.items() for t in range(INSTANCES)}
+    names = {
+        f"{short}/t{number}": entry
+        for family, short in HEURISTIC_KINDS.items()
+        for number, entry in enumerate(published_teammates(name, family))
+    }
     check_choice("teammate", teammate, names)
     track = track_of(name)
     split = "test" if name in TRACKS[track]["test"] else "train"
-    return make_task(track, split, name, published_teammate(name, *names[teammate]), seed=0)
+    return make_task(track, split, name, names[teammate], seed=0)
