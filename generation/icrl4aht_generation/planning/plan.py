@@ -201,19 +201,14 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
     def forward(params: Any, records: jax.Array) -> Any:
         return network.apply(params, network.initial_hidden(count), view(records), reset)
 
-    return _seconds(forward, params, records) / (steps * count)
+    def call() -> None:
+        jax.block_until_ready(forward(params, records))
+
+    call()  # compiles
+    # The fastest of a few calls, since other programs may slow some down.
+    return min(repeat(call, number=1, repeat=3)) / (steps * count)
 
 
 def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
     """Return the uncompressed size of the histories of egos."""
     return sum(arrays_bytes(array_shapes(layout, ego.environments, ego.episodes)) for layout, ego in egos)
-
-
-def _seconds(function: Any, *arguments: Any) -> float:
-    """Return the time of the fastest of a few calls, after one that compiles; other programs may slow some down."""
-
-    def call() -> None:
-        jax.block_until_ready(function(*arguments))
-
-    call()
-    return min(repeat(call, number=1, repeat=3))
