@@ -106,14 +106,9 @@ def test_recording_is_idempotent_and_independent_of_order():
 
 
 def rewards_of(returns: list[list[int]]) -> np.ndarray:
-    """int8 (N, T): rewards, at any steps, that add up to these episode returns."""
-    rng = np.random.default_rng(0)
-    rewards = np.zeros((len(returns), len(returns[0]), 100), np.int8)
-    for n, curve in enumerate(returns):
-        for e, total in enumerate(curve):
-            steps = rng.permutation(100)
-            pieces = [5 * int(np.sign(total))] * (abs(total) // 5)
-            rewards[n, e, steps[: len(pieces)]] = pieces
+    """int8 (N, T): rewards of 5 or -5 that add up to these episode returns."""
+    totals = np.array(returns)[..., None] // 5
+    rewards = np.where(np.arange(100) < abs(totals), 5 * np.sign(totals), 0).astype(np.int8)
     assert rewards.sum(axis=-1).tolist() == returns
     return rewards.reshape(len(returns), -1)
 

@@ -8,10 +8,7 @@ Fast tests train LBRDiv alone.
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import cache, partial
@@ -46,7 +43,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.hashes import file_hash
 from tests.helpers.damages import flip_bit
-from tests.helpers.paths import ROOT
+from tests.helpers.tiny import start
 from tests.helpers.xla_flags import add_xla_flag
 
 LAYOUT = get_layout("cramped_up")
@@ -116,14 +113,6 @@ def population(root: Path, algorithm: str) -> Path:
 def weights(folder: Path) -> dict[str, str]:
     """Return the hash of every policy of a population."""
     return {str(path.relative_to(folder)): file_hash(path) for path in sorted(folder.rglob(POLICY_WEIGHTS))}
-
-
-def child(script: str, *arguments: str, devices: int = 1) -> subprocess.Popen[str]:
-    settings = {"PYTHONPATH": str(ROOT)}
-    if devices > 1:
-        settings["XLA_FLAGS"] = add_xla_flag(f"--xla_force_host_platform_device_count={devices}")
-    command = [sys.executable, "-c", script, *arguments]
-    return subprocess.Popen(command, env=os.environ | settings, stdout=subprocess.PIPE, text=True)
 
 
 # What a population is on disk.
@@ -252,9 +241,10 @@ def test_a_population_learns_the_same_on_two_devices(tmp_path):
     """To rounding: half of the policies on each device, one update."""
     (stage,) = run_of("fcp").stages
     state, _ = jax.jit(stage.update)(jax.jit(stage.init)(jax.random.fold_in(jax.random.key(0), 0)))
-    process = child(TWO_DEVICES, str(tmp_path / "weights.npz"), devices=2)
-    process.communicate(timeout=300)
-    assert process.returncode == 0
+    flags = add_xla_flag("--xla_force_host_platform_device_count=2")
+    process = start("-c", TWO_DEVICES, str(tmp_path / "weights.npz"), XLA_FLAGS=flags)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
     found = np.load(tmp_path / "weights.npz")
     for path, leaf in jax.tree.leaves_with_path(state.params):
         name = "/".join(str(part.key) for part in path)
