@@ -222,10 +222,10 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
 
     Prints tasks, environment steps, disk space, and hours at the speed that is measured here. Writes nothing.
     """
-    from icrl4aht_generation.planning.plan import estimate_cost
+    from icrl4aht_generation.planning.plan import cost_rows, estimate_cost
 
     cost = estimate_cost(_profile_with_threads(profile_name, None), devices)
-    print_result(asdict(cost), "\n".join(f"{name:<28} {value}" for name, value in cost.rows()), as_json)
+    print_result(cost, "\n".join(f"{name:<28} {value}" for name, value in cost_rows(cost)), as_json)
 
 
 @click.command(epilog=examples("icrl4aht-data check build/smoke build/again"))
