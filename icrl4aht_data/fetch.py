@@ -37,7 +37,6 @@ from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import check_against_manifest, check_folder, parse_manifest, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, LAYOUTS_FILE, MANIFEST, PARQUET_EPISODES, PROVENANCE, TASKS
 from icrl4aht_data.utils import files as disk
-from icrl4aht_data.utils.hashes import file_hash, short_hash
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.system import data_folder
 
@@ -166,7 +165,7 @@ class Remote:
             _remove_from_cache(target)  # a changed file, which the client would take
         most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
         path = _get(self.client, address, name, scratch, advance, most)
-        size, found = path.stat().st_size, file_hash(path)
+        size, found = path.stat().st_size, disk.file_hash(path)
         if found != self.manifest[name]:
             if scratch is None:
                 _remove_from_cache(path)
@@ -192,7 +191,7 @@ class Remote:
         if is_shard and not by_hash:
             return True
         is_hashable = is_shard or path.stat().st_size <= disk.LARGEST  # a sparse file may have a terabyte
-        return is_hashable and file_hash(path) == self.manifest[name]
+        return is_hashable and disk.file_hash(path) == self.manifest[name]
 
     def path(self, name: str) -> Path:
         """Return the path of a file in the folder; it need not exist."""
@@ -302,7 +301,7 @@ def _open_hub(url: str, to: Path | None) -> Remote:
 def _open_address(address: str, to: Path | None) -> Remote:
     check_credentials(address)
     client, url = FsspecClient(address), without_credentials(address).rstrip("/")
-    base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{short_hash(url.encode(), 8)}"
+    base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{disk.short_hash(url.encode(), 8)}"
     latest = base / "latest"  # the version that this address had when it was last opened
     if offline_switches():
         path = (to or base / (latest.read_text() if latest.is_file() else "none")) / MANIFEST
@@ -313,12 +312,12 @@ def _open_address(address: str, to: Path | None) -> Remote:
         with TemporaryDirectory() as scratch:
             _, text = _fetch_manifest(client, url, Path(scratch))
         if to is None:
-            (base / short_hash(text)).mkdir(parents=True, exist_ok=True)
+            (base / disk.short_hash(text)).mkdir(parents=True, exist_ok=True)
             with disk.process_lock(disk.lock_path(latest)), disk.atomic_write(latest) as partial:
-                partial.write_text(short_hash(text))
-    folder = to or base / short_hash(text)
+                partial.write_text(disk.short_hash(text))
+    folder = to or base / disk.short_hash(text)
     _prepare_folder(folder, text, url, is_ours=to is None)
-    return Remote(url, short_hash(text), folder, _parse_manifest(text, url), client)
+    return Remote(url, disk.short_hash(text), folder, _parse_manifest(text, url), client)
 
 
 def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | None) -> tuple[Path, bytes]:

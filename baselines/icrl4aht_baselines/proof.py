@@ -31,8 +31,7 @@ from icrl4aht_data.benchmark.facts import PREFERENCE
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.format.schema import HISTORIES
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_text, write_json
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import atomic_write, file_hash, parse_json, read_text, write_json
 
 TEAMMATE_TRACK = "teammate"
 

@@ -7,8 +7,8 @@ each, or are the return of a model that earns more. Tasks whose teammates behave
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable
-from functools import lru_cache
 from pathlib import Path
 
 import msgspec
@@ -100,17 +100,12 @@ def read_best_responses(path: Path | None = None) -> BestResponseCard:
     path = path or best_responses_file()
     if not path.is_file():
         raise OptionError(f"{path}: no such file, expected best responses; restore it: `{RESTORE}`")
-    return _read(path, path.stat().st_mtime_ns)
-
-
-@lru_cache(maxsize=4)
-def _read(path: Path, changed: int) -> BestResponseCard:
     try:
         card = msgspec.json.decode(path.read_bytes(), type=BestResponseCard)
     except msgspec.MsgspecError as error:
         raise OptionError(f"{path}: not a file of best responses: {error}; restore it: `{RESTORE}`") from error
-    tasks = [task for behaviour in card.behaviours for task in behaviour.tasks]
-    if twice := sorted({task for task in tasks if tasks.count(task) > 1}):
+    counts = Counter(task for behaviour in card.behaviours for task in behaviour.tasks)
+    if twice := sorted(task for task, number in counts.items() if number > 1):
         raise OptionError(f"{path}: two best responses to task {twice[0]}, expected one; remove the other")
     return card
 

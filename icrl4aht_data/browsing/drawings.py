@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,37 +16,12 @@ Drawings = dict[str, dict[str, list]]
 """Name of a part -> values of its columns, joined by commas -> shapes, see `layout_drawings`."""
 
 
-class ShapeRecorder(Canvas):
-    """Canvas that records shapes as lists: the kind of shape, then the arguments of the method of `Canvas`.
-
-    Attributes:
-        shapes: ["box", x, y, width, height, fill, radius], ["disc", x, y, radius, fill, part],
-            ["line", thickness, fill, x, y, x, y, ...], ["frame", left, top, right, bottom, thickness, fill] or
-            ["text", x, y, words, size, fill, anchor, room]; a fill is a colour such as "#2b303a".
-    """
-
-    def __init__(self) -> None:
-        self.shapes: list[list[Any]] = []
-
-    def box(self, x: float, y: float, width: float, height: float, fill: Colour, radius: float = 0) -> None:
-        self._add("box", x, y, width, height, hex_colour(fill), radius)
-
-    def disc(self, x: float, y: float, radius: float, fill: Colour, part: float = 1) -> None:
-        self._add("disc", x, y, radius, hex_colour(fill), part)
-
-    def line(self, points: Sequence[tuple[float, float]], thickness: float, fill: Colour) -> None:
-        self._add("line", thickness, hex_colour(fill), *(value for point in points for value in point))
-
-    def frame(self, corners: Sequence[float], thickness: float, fill: Colour) -> None:
-        self._add("frame", *corners, thickness, hex_colour(fill))
-
-    def text(
-        self, x: float, y: float, words: str, size: float, fill: Colour, anchor: str = "mm", room: float = 99
-    ) -> None:
-        self._add("text", x, y, words, size, hex_colour(fill), anchor, room)
-
-    def _add(self, kind: str, *values: Any) -> None:
-        self.shapes.append([kind, *(value if isinstance(value, str) else _rounded(value) for value in values)])
+def shape_to_json(shape: tuple[Any, ...]) -> list[str | float]:
+    """Return a shape of a `Canvas` as a list of texts, colours such as "#2b303a", and rounded numbers."""
+    return [
+        value if isinstance(value, str) else hex_colour(value) if isinstance(value, tuple) else _rounded(value)
+        for value in shape
+    ]
 
 
 def _rounded(value: float) -> float:
@@ -83,9 +57,9 @@ def add_drawings(layout: Layout, records: np.ndarray, known: Drawings) -> Drawin
         for values in _distinct(records[:, list(part.columns)]):
             key = ",".join(map(str, values))
             if key not in of_part:
-                recorder = ShapeRecorder()
-                part.draw(recorder, 0.0, 0.0, *values)
-                of_part[key] = new.setdefault(part.name, {})[key] = recorder.shapes
+                canvas = Canvas()
+                part.draw(canvas, 0.0, 0.0, *values)
+                of_part[key] = new.setdefault(part.name, {})[key] = list(map(shape_to_json, canvas.shapes))
     return new
 
 
@@ -102,7 +76,7 @@ def layout_drawings(layout: Layout, records: np.ndarray) -> dict[str, Any]:
         view: name of the part that outlines the cells that the ego observes.
         parts: [name, moves, anchor, columns] of each part, in drawing order, see `StatePart`.
         drawings: name of a part -> values of its columns, joined by commas -> shapes relative to the centre of the
-            cell, see `ShapeRecorder`; only for values in the records.
+            cell, see `Canvas`, with colours such as "#2b303a"; only for values in the records.
     """
     drawings: Drawings = {}
     add_drawings(layout, records, drawings)

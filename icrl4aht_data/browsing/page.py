@@ -27,6 +27,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.state import faults
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.files import atomic_write
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_histories
 
 PAGE_START = b'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>ICRL4AHT histories</title>'
@@ -163,19 +164,6 @@ class BrowserPage:
     shown_episodes: int
 
 
-def check_drawable(dataset: Dataset) -> None:
-    """Check that the episodes of a release can be drawn.
-
-    Raises:
-        NotStoredError: if the release has no state records.
-    """
-    if not dataset.has_states:
-        raise NotStoredError(
-            f"{dataset.origin}: a release of kind {dataset.info.kind} has no state records, so there is nothing to "
-            f"draw; browse a full or lite release"
-        )
-
-
 def make_browser_page(
     dataset: Dataset,
     *,
@@ -197,7 +185,11 @@ def make_browser_page(
         OptionError: if the page would be too large even with two episodes per history.
         ReleaseError: if the release cannot be read.
     """
-    check_drawable(dataset)
+    if not dataset.has_states:
+        raise NotStoredError(
+            f"{dataset.origin}: a release of kind {dataset.info.kind} has no state records, so there is nothing to "
+            f"draw; browse a full or lite release"
+        )
     most: int | None = None
     while True:
         embedded = []
@@ -226,15 +218,16 @@ def save_browser_page(page: BrowserPage, path: Path) -> None:
 
 def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
     name, info = _release_name(dataset), dataset.info
-    records: dict[str, list[np.ndarray]] = {}
-    for one in embedded:
-        records.setdefault(one.facts["layout"], []).append(one.records)
+    by_layout = grouped(embedded, lambda one: one.facts["layout"])
     index = {
         "release": {"name": name, "kind": info.kind, "version": info.data_version, "histories": info.histories},
         "actions": ACTIONS,
         "no_action": NO_ACTION,
         "window": WINDOW,
-        "layouts": {one: layout_drawings(get_layout(one), np.concatenate(own)) for one, own in records.items()},
+        "layouts": {
+            layout: layout_drawings(get_layout(layout), np.concatenate([one.records for one in own]))
+            for layout, own in by_layout.items()
+        },
         "histories": [one.facts | {"teammate": _teammate(dataset, one.facts["history_id"])} for one in embedded],
     }
     packed = zlib.compress(json.dumps(index, separators=(",", ":")).encode(), 9)

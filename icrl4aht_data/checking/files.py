@@ -15,8 +15,7 @@ from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import EXPERTS, INFO, MANIFEST, PROVENANCE, TEAMMATES
-from icrl4aht_data.utils.files import LARGEST, files_below, plain_size, resolve_inside
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import LARGEST, file_hash, files_below, plain_size, resolve_inside
 
 _HUB_FILES = (".gitattributes", ".cache/huggingface/")
 """Files that the Hub and its client add to a repository's."""

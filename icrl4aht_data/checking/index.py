@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
@@ -22,6 +21,7 @@ from icrl4aht_data.format.info import ReleaseInfo, describe, layout_statistics
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text, resolve_inside
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun
 
 _ROUNDING = 1e-3  # tolerance of the mean returns that a stream filter records
@@ -131,9 +131,7 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
         provenance: task id -> how its histories were made.
         report: receives the problems.
     """
-    members: dict[str, list[Entry]] = defaultdict(list)
-    for entry in index.entries:
-        members[entry.task_id].append(entry)
+    members = grouped(index.entries, lambda entry: entry.task_id)
     seeds = {task.task_id: task.seed for task in tasks}
     for task_id in provenance.keys() - members.keys():
         report.add(PROVENANCE, f"task {task_id!r}: has no history")

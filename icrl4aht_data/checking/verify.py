@@ -23,12 +23,13 @@ from icrl4aht_data.fetch import ReleaseLocation, check_root, chosen_files, open_
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.provenance import Provenance, read_provenance
-from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS, Entry
+from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.selection import FilterValues
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.files import resolve_inside
+from icrl4aht_data.utils.groups import grouped
 
 _NOT_RECOMPUTED = {
     "references": "returns of reference egos, of {} tasks: taken from meta/provenance.json, not measured again",
@@ -147,12 +148,10 @@ def _check_shards(
 ) -> None:
     """Check shards and their histories; `layouts` are those of the tasks by id, with the tasks' recipes."""
     local = ReleaseLocation(index.root)  # no remote, since files that could not be fetched are already reported
-    members: dict[str, list[Entry]] = {name: [] for name in shards}
-    for entry in index.entries:
-        if entry.shard in members:
-            members[entry.shard].append(entry)
-    total = sum(map(len, members.values()))
-    for name, entries in members.items():
+    members = grouped(index.entries, lambda entry: entry.shard)
+    total = sum(len(members[name]) for name in shards)
+    for name in shards:
+        entries = members[name]
         try:
             shard = Shard(local, name, index.info, entries)
         except Icrl4ahtError as error:

@@ -19,6 +19,7 @@ import click
 from msgspec import Meta
 
 from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.options import Option, annotation_parts, convert_option, option_choices, option_hints
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -28,13 +29,10 @@ class TopicCommand(click.Command):
     """Command whose help lists options under headings set by `topic`, and other options under "Options"."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        topics: dict[str, list[tuple[str, str]]] = {}
-        for param in self.get_params(ctx):
-            if isinstance(param, click.Option) and (record := param.get_help_record(ctx)):
-                topics.setdefault(getattr(param, "topic", "Options"), []).append(record)
-        for heading, records in topics.items():
+        listed = [param for param in self.get_params(ctx) if param.get_help_record(ctx)]
+        for heading, params in grouped(listed, lambda param: getattr(param, "topic", "Options")).items():
             with formatter.section(heading):
-                formatter.write_dl(records)
+                formatter.write_dl([record for param in params if (record := param.get_help_record(ctx))])
 
 
 def topic(heading: str, *options: Callable[[Any], Any]) -> Callable[[Command], Command]:

@@ -27,8 +27,8 @@ from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, get_layout
 from icrl4aht_data.utils.install_hints import EXTRAS, PACKAGE, RESTORE, install_command
 from icrl4aht_data.utils.plugins import METHOD_GROUP, Plugins
 from icrl4aht_data.utils.system import (
-    CACHE_VARIABLES,
-    DATA_VARIABLES,
+    CACHE_VARIABLE,
+    DATA_VARIABLE,
     cache_folder,
     cache_limit,
     data_folder,
@@ -137,10 +137,7 @@ def _query_jax() -> str:
 def _folders(problems: Problems) -> dict[str, Any]:
     """Return path and free space of the cache and data folders, which need not exist yet."""
     facts: dict[str, Any] = {}
-    for name, path, variables in (
-        ("cache", cache_folder(), CACHE_VARIABLES),
-        ("data", data_folder(), DATA_VARIABLES),
-    ):
+    for name, path, variable in (("cache", cache_folder(), CACHE_VARIABLE), ("data", data_folder(), DATA_VARIABLE)):
         facts[name] = {"path": str(path)}
         try:
             existing = next(folder for folder in (path, *path.parents) if folder.exists())
@@ -149,7 +146,7 @@ def _folders(problems: Problems) -> dict[str, Any]:
                 pass
         except OSError as error:
             problem = f"{path}: the {name} folder cannot be written: {error.strerror or error}"
-            problems[problem] = f"set {variables[0]} to another folder, or make it writable"
+            problems[problem] = f"set {variable} to another folder, or make it writable"
     try:
         facts["cache"]["limit"] = cache_limit()
     except OptionError as error:

@@ -17,7 +17,6 @@ from icrl4aht_data.browsing.page import (
     PAGE_HISTORIES,
     PAGE_MEGABYTES,
     PAGE_START,
-    check_drawable,
     make_browser_page,
     save_browser_page,
     spread_histories,
@@ -195,7 +194,6 @@ def browse(
         overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
     check_output(out, overwrite)
     matching = load_icrl4aht(root, **filters)
-    check_drawable(matching)
     chosen = matching.select(list(dict.fromkeys(wanted)) or spread_histories(matching, histories))
     with progress_bars(quiet) as show:
         page = make_browser_page(

@@ -14,6 +14,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.format.info import describe
 from icrl4aht_data.format.schema import FIELDS, Entry
 from icrl4aht_data.reading.history import LABELS
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun
 
 _IDS_SHOWN = 11  # maximum characters of a task's history ids in the table
@@ -21,9 +22,6 @@ _IDS_SHOWN = 11  # maximum characters of a task's history ids in the table
 
 def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
     """Return the facts of each task with histories among `entries`, as JSON."""
-    by_task: dict[str, list[Entry]] = {}
-    for entry in entries:
-        by_task.setdefault(entry.task_id, []).append(entry)
     return [
         {
             "task_id": task_id,
@@ -43,7 +41,7 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
             "expert_return_sampled": some[0].expert_return_sampled,
             "history_ids": [entry.history_id for entry in some],
         }
-        for task_id, some in by_task.items()
+        for task_id, some in grouped(entries, lambda entry: entry.task_id).items()
     ]
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, OptionError
 from icrl4aht_data.utils.files import NO_ROOM, add_filename, allocate, describe_disk
-from icrl4aht_data.utils.system import CACHE_VARIABLES, cache_folder, cache_limit
+from icrl4aht_data.utils.system import CACHE_VARIABLE, cache_folder, cache_limit
 
 _CONTENTS = "contents.json"  # name -> [dtype, shape] of every array
 _KEY = re.compile(r"[a-z]+-[0-9a-f]{32,64}")  # only folders that match are evicted
@@ -142,7 +142,7 @@ def _unusable(folder: Path, size: int, error: OSError) -> CacheError:
     else:
         reason = f"cannot be used: {error.strerror or error} ({error.filename}); check its permissions and content"
     return CacheError(
-        f"{folder}: the cache folder {reason}, set {CACHE_VARIABLES[0]} to another folder, or "
+        f"{folder}: the cache folder {reason}, set {CACHE_VARIABLE} to another folder, or "
         f'take cache="ram" or cache="stream"'
     )
 

@@ -41,6 +41,7 @@ from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, K
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import LARGEST, plain_size, read_lines, resolve_inside, wrap_read_errors
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_histories, listed_names
 
@@ -66,11 +67,12 @@ class Columns(Sequence[Entry]):
     columns and as "" in string columns. Fields in `schema.ENCODED` are string columns of JSON text.
 
     Args:
-        arrays: every column by name, and the distinct values of each string column as `<name>.values`.
+        arrays: every column by name.
+        values: the distinct values of each string column, in the order of their codes.
     """
 
-    def __init__(self, arrays: dict[str, np.ndarray]) -> None:
-        self._arrays = arrays
+    def __init__(self, arrays: dict[str, np.ndarray], values: dict[str, list[str]]) -> None:
+        self._arrays, self._values = arrays, values
 
     def __len__(self) -> int:
         return len(self._arrays["T"])
@@ -81,7 +83,7 @@ class Columns(Sequence[Entry]):
 
     def values(self, name: str) -> list[str]:
         """Return the distinct values of a string column, in the order of their codes."""
-        return [value.decode() for value in self._arrays[f"{name}.values"].tolist()]
+        return self._values[name]
 
     def matches(self, name: str, wanted: Collection[str]) -> np.ndarray:
         """Return bool (H,), True for histories with one of the wanted values in a string column."""
@@ -98,8 +100,7 @@ class Columns(Sequence[Entry]):
             return [self[i] for i in range(len(self))[row]]
         row = range(len(self))[row]
         values: dict[str, Any] = {name: self._arrays[name][row].item() for name in _NUMBERS}
-        for name in _STRINGS:
-            values[name] = self._arrays[f"{name}.values"][self._arrays[name][row]].item().decode()
+        values |= {name: self._values[name][self._arrays[name][row]] for name in _STRINGS}
         for name, absent in _ABSENT.items():
             if values[name] == absent or values[name] != values[name]:  # NaN differs from itself
                 values[name] = None
@@ -131,12 +132,10 @@ def read_columns(path: Path) -> Columns:
             parts[name].append(np.array(values[name], dtype))
         for name, known in codes.items():
             parts[name].append(np.fromiter(map(known.__getitem__, values[name]), np.int32, len(block)))
-    arrays: dict[str, np.ndarray] = {
+    arrays = {
         name: np.concatenate([np.zeros(0, _NUMBERS.get(name, np.int32)), *blocks]) for name, blocks in parts.items()
     }
-    for name, known in codes.items():
-        arrays[f"{name}.values"] = np.array([value.encode() for value in known] or [b""], np.bytes_)[: len(known)]
-    return Columns(arrays)
+    return Columns(arrays, {name: list(known) for name, known in codes.items()})
 
 
 def _entries(path: Path) -> Iterator[Entry]:
@@ -269,9 +268,7 @@ class Index:
 
     def _of_families(self, families: Iterable[str]) -> list[str]:
         """Return the layouts of the release that belong to families."""
-        by_family: dict[str, list[str]] = {PUBLISHED: []}
-        for layout in self.values("layout"):
-            by_family.setdefault(self.layouts.family(layout), []).append(layout)
+        by_family = {PUBLISHED: []} | grouped(self.values("layout"), self.layouts.family)
         for family in families:
             check_choice(LAYOUT_FAMILY, family, by_family)
         return [layout for family in families for layout in by_family[family]]

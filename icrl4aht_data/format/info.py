@@ -39,6 +39,7 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import parse_json, read_text, resolve_inside
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.install_hints import PACKAGE
 from icrl4aht_data.utils.text import counted_histories, counted_noun
 
@@ -256,8 +257,7 @@ def describe(
 ) -> ReleaseInfo:
     """Return the info of a release with these histories, without shard sizes and statistics."""
     layouts = {}
-    for name in dict.fromkeys(entry.layout for entry in entries):
-        members = [entry for entry in entries if entry.layout == name]
+    for name, members in grouped(entries, lambda entry: entry.layout).items():
         layout = get_layout(name)
         layouts[name] = LayoutSummary(
             environment_name=layout.alias,
@@ -299,8 +299,7 @@ def layout_statistics(
         sizes: shard -> size in bytes.
     """
     statistics = {}
-    for layout in dict.fromkeys(entry.layout for entry in entries):
-        members = [entry for entry in entries if entry.layout == layout]
+    for layout, members in grouped(entries, lambda entry: entry.layout).items():
         lengths = {entry.task_id: entry.T for entry in members}
         recorded = [provenance.get(task_id, Provenance()).streams_recorded for task_id in lengths]
         streams = [number for number in recorded if number is not None]

@@ -28,13 +28,13 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.utils.files import (
     LARGEST,
     atomic_write,
+    file_hash,
     is_inside,
     plain_size,
     read_text,
     resolve_inside,
     wrap_read_errors,
 )
-from icrl4aht_data.utils.hashes import file_hash
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 

@@ -147,7 +147,7 @@ def record_field(kind: Kind) -> Field:
 LONGEST = 2**40
 """Upper limit of the steps of a history, so that sums of steps fit into 64 bits."""
 
-_NAME_LENGTH = 512  # characters; limited because a name column is as wide as its longest name
+_NAME_LENGTH = 512  # characters
 _FINITE = 1e15  # sums of numbers below this stay finite
 
 _Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]

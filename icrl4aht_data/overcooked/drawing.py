@@ -1,16 +1,15 @@
-"""Draws the parts of a state (cells, pots, buttons, items, chefs) from a few primitive shapes on any `Canvas`.
+"""Draws the parts of a state (cells, pots, buttons, items, chefs) as a list of a few primitive shapes, see `Canvas`.
 
-`render` draws them as pixels; other canvases may record the shapes. Positions and lengths are in cells, (0, 0) is the
-map's top left corner.
+`render` draws the shapes as pixels, and a page draws them from JSON, see `browsing.drawings`. Positions and lengths are
+in cells, (0, 0) is the map's top left corner.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -62,30 +61,39 @@ _INGREDIENTS = {
 _OTHER_INGREDIENT = (INK, (1.6, _STEEL, (0, 0)))
 
 
-class Canvas(ABC):
-    """Base class of canvases; positions and lengths are in cells."""
+class Canvas:
+    """Records shapes, with positions and lengths in cells.
 
-    @abstractmethod
+    Attributes:
+        shapes: ("box", x, y, width, height, fill, radius), ("disc", x, y, radius, fill, part),
+            ("line", thickness, fill, x, y, x, y, ...), ("frame", left, top, right, bottom, thickness, fill) or
+            ("text", x, y, words, size, fill, anchor, room), in the order in which they are drawn.
+    """
+
+    def __init__(self) -> None:
+        self.shapes: list[tuple[Any, ...]] = []
+
     def box(self, x: float, y: float, width: float, height: float, fill: Colour, radius: float = 0) -> None:
-        """Draw a filled rectangle with centre (x, y) and rounded corners."""
+        """Add a filled rectangle with centre (x, y) and rounded corners."""
+        self.shapes.append(("box", x, y, width, height, fill, radius))
 
-    @abstractmethod
     def disc(self, x: float, y: float, radius: float, fill: Colour, part: float = 1) -> None:
-        """Draw a disc, or a sector of `part` (0..1) of it, clockwise from the top."""
+        """Add a disc, or a sector of `part` (0..1) of it, clockwise from the top."""
+        self.shapes.append(("disc", x, y, radius, fill, part))
 
-    @abstractmethod
     def line(self, points: Sequence[tuple[float, float]], thickness: float, fill: Colour) -> None:
-        """Draw a line through the points, with round ends; one point is a disc."""
+        """Add a line through the points, with round ends; one point is a disc."""
+        self.shapes.append(("line", thickness, fill, *(value for point in points for value in point)))
 
-    @abstractmethod
     def frame(self, corners: Sequence[float], thickness: float, fill: Colour) -> None:
-        """Draw the inner border of the rectangle (left, top, right, bottom)."""
+        """Add the inner border of the rectangle (left, top, right, bottom)."""
+        self.shapes.append(("frame", *corners, thickness, fill))
 
-    @abstractmethod
     def text(
         self, x: float, y: float, words: str, size: float, fill: Colour, anchor: str = "mm", room: float = 99
     ) -> None:
-        """Draw text, shrunk if it is wider than `room`; `anchor` is one of Pillow's."""
+        """Add text, shrunk if it is wider than `room`; `anchor` is one of Pillow's."""
+        self.shapes.append(("text", x, y, words, size, fill, anchor, room))
 
     def strokes(
         self,
@@ -97,7 +105,7 @@ class Canvas(ABC):
         edge: Colour | None = None,
         rim: float = 0.0,
     ) -> None:
-        """Draw lines or discs, each given as (thickness, fill, *points), with a common outline of colour `edge`.
+        """Add lines or discs, each given as (thickness, fill, *points), with a common outline of colour `edge`.
 
         The points are relative to (x, y), in units of `size`; their first axis points in the direction `turn`.
         """

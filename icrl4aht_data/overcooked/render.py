@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.overcooked.drawing import FOOTER, INK, PAPER, VIEW, Canvas, Colour, cell_centre, state_parts
+from icrl4aht_data.overcooked.drawing import FOOTER, INK, PAPER, VIEW, Canvas, cell_centre, state_parts
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import faults, record_size
 from icrl4aht_data.utils.files import atomic_write
@@ -143,8 +142,8 @@ def _font(pixels: int) -> Any:
     return _pillow("ImageFont").load_default(pixels)
 
 
-class _Picture(Canvas):
-    """Canvas that draws an enlarged Pillow image."""
+class _Picture:
+    """Draws the shapes of a `Canvas` in an enlarged Pillow image, each kind by the method with its name."""
 
     def __init__(self, width: float, height: float, cell: int) -> None:
         self.unit = cell * _ENLARGE
@@ -152,7 +151,7 @@ class _Picture(Canvas):
         self.image = _pillow("Image").new("RGB", size, PAPER)
         self.pen = _pillow("ImageDraw").Draw(self.image)
 
-    def box(self, x: float, y: float, width: float, height: float, fill: tuple, radius: float = 0) -> None:
+    def box(self, x: float, y: float, width: float, height: float, fill: tuple, radius: float) -> None:
         left, top, wide, high = (self.unit * v for v in (x - width / 2, y - height / 2, width, height))
         self.pen.rounded_rectangle((left, top, left + wide - 1, top + high - 1), self.unit * radius, fill)
 
@@ -161,16 +160,16 @@ class _Picture(Canvas):
         bounds = [self.unit * v for v in (x - radius, y - radius, x + radius, y + radius)]
         self.pen.pieslice(bounds, -90, 360 * part - 90, fill)
 
-    def line(self, points: Sequence[tuple[float, float]], thickness: float, fill: Colour) -> None:
-        self.pen.line([self.unit * v for end in points for v in end], fill, round(self.unit * thickness))
-        for end in points:
-            self.disc(*end, thickness / 2, fill)
+    def line(self, thickness: float, fill: tuple, *points: float) -> None:
+        self.pen.line([self.unit * v for v in points], fill, round(self.unit * thickness))
+        for x, y in zip(points[::2], points[1::2], strict=True):
+            self.disc(x, y, thickness / 2, fill)
 
-    def frame(self, corners: Sequence[float], thickness: float, fill: Colour) -> None:
-        scaled = [self.unit * v for v in corners]
-        self.pen.rectangle(scaled, outline=fill, width=round(self.unit * thickness))
+    def frame(self, left: float, top: float, right: float, bottom: float, thickness: float, fill: tuple) -> None:
+        corners = [self.unit * v for v in (left, top, right, bottom)]
+        self.pen.rectangle(corners, outline=fill, width=round(self.unit * thickness))
 
-    def text(self, x: float, y: float, words: str, size: float, fill: tuple, anchor="mm", room: float = 99) -> None:
+    def text(self, x: float, y: float, words: str, size: float, fill: tuple, anchor: str, room: float) -> None:
         """Draw text, shrunk if it is wider than `room`."""
         width = self.pen.textlength(words, _font(round(self.unit * size))) / self.unit
         font = _font(max(1, int(self.unit * size * room / max(room, width))))
@@ -178,11 +177,13 @@ class _Picture(Canvas):
 
 
 def _picture(layout: Layout, record: np.ndarray, size: int, caption: str, view: bool) -> Image.Image:
-    canvas = _Picture(layout.width, layout.height + FOOTER, size)
+    canvas, picture = Canvas(), _Picture(layout.width, layout.height + FOOTER, size)
     for part in state_parts(layout):
         if view or part.name != VIEW:
             cell = int(record[part.anchor]) if part.moves else part.anchor
             part.draw(canvas, *cell_centre(layout, cell), *(int(record[column]) for column in part.columns))
     middle = layout.height + FOOTER / 2
     canvas.text(layout.width - 0.15, middle, caption, 0.34, INK, "rm", room=layout.width - 2.9)
-    return canvas.image.reduce(_ENLARGE)
+    for kind, *values in canvas.shapes:
+        getattr(picture, kind)(*values)
+    return picture.image.reduce(_ENLARGE)

@@ -24,8 +24,7 @@ from icrl4aht_data.format.schema import (
 )
 from icrl4aht_data.plotting import plot_layouts, plot_learning_curves, save_figure
 from icrl4aht_data.publishing.croissant import CROISSANT, croissant
-from icrl4aht_data.utils.files import files_below, write_json
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash, files_below, write_json
 from icrl4aht_data.utils.install_hints import install_command
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.card import CURVES_FIGURE, LAYOUTS_FIGURE, write_card

@@ -15,10 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from icrl4aht_data.format.index import read_index
-from icrl4aht_data.format.info import ReleaseInfo
-from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, FIELDS, KINDS, PARQUET_EPISODES, PARQUET_INDEX, TEXTS
-from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS, record_width
+from icrl4aht_data.format.schema import FIELDS, PARQUET_EPISODES, PARQUET_INDEX
 from icrl4aht_data.utils.install_hints import AUTHORS, import_optional, project_url
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.card import card_texts, episode_texts, rai_texts
@@ -39,9 +36,7 @@ _FORMATS = {
     ".parquet": "application/x-parquet",
     ".safetensors": "application/vnd.safetensors",
 }
-_SHAPE = tuple[int, int, int]
-_TYPES = {bool: "BOOL", float: "FLOAT", int: "INTEGER", _SHAPE: "INTEGER", int | None: "INTEGER", float | None: "FLOAT"}
-_TYPES |= dict.fromkeys((*TEXTS, *(ENTRY_HINTS[name] for name in ENCODED)), "TEXT")
+_TYPES = {"bool": "BOOL", "string": "TEXT", "float": "FLOAT", "double": "FLOAT"}  # of Arrow; others are integers
 _TERMS_OF_1_1 = {
     "arrayShape": "cr:arrayShape",
     "containedIn": "cr:containedIn",
@@ -83,7 +78,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             )
             for name in sorted(digests)
         ]
-        sets, records = zip(*_tables(context, info), strict=True)
+        sets, records = zip(*_tables(context, root), strict=True)
         return mlc.Metadata(
             ctx=context,
             conforms_to=[_STANDARD, _RAI_STANDARD],
@@ -107,29 +102,20 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         ).to_json()
 
 
-def _tables(
-    context: mlcroissant.Context, info: ReleaseInfo
-) -> Iterator[tuple[mlcroissant.FileSet, mlcroissant.RecordSet]]:
+def _tables(context: mlcroissant.Context, root: Path) -> Iterator[tuple[mlcroissant.FileSet, mlcroissant.RecordSet]]:
     """Yield file and record sets of the Parquet index and, if there are any, of the Parquet episodes."""
     import mlcroissant as mlc
+    import pyarrow.parquet as pq
 
-    texts = card_texts("index") | episode_texts()
-    columns = [
-        (name, card_texts("index")[name], _TYPES[hint], "3" if hint == _SHAPE else None)
-        for name, hint in ENTRY_HINTS.items()
-    ]
-    said = "One record per learning history: what it is, and where its arrays are stored."
-    tables = [(PARQUET_INDEX, "histories", said, ["history_id"], columns)]
-    if info.kind in KINDS:
-        lengths = {"steps": info.environment.kept_steps, "width": record_width(list(map(get_layout, info.layouts)))}
-        types = {"s": "TEXT", "i": "INTEGER", "u": "INTEGER", "f": "FLOAT"}
-        columns = [
-            (name, texts[name], types[dtype[0]], ",".join(str(lengths[axis]) for axis in shape) or None)
-            for name, (dtype, shape) in EPISODE_COLUMNS.items()
-        ]
-        said = "One record per episode: its history's names, returns, actions, rewards, labels, state records."
-        tables.append((PARQUET_EPISODES, "episodes", said, ["history_id", "episode"], columns))
-    for folder, name, said, key, columns in tables:
+    of_history = "One record per learning history: what it is, and where its arrays are stored."
+    of_episode = "One record per episode: its history's names, returns, actions, rewards, labels, state records."
+    for folder, name, said, key, texts in (
+        (PARQUET_INDEX, "histories", of_history, ["history_id"], card_texts("index")),
+        (PARQUET_EPISODES, "episodes", of_episode, ["history_id", "episode"], episode_texts()),
+    ):
+        path = next((root / folder).glob("*/*.parquet"), None)
+        if path is None:
+            continue
         files = mlc.FileSet(
             ctx=context,
             id=f"{folder}-files",
@@ -143,13 +129,22 @@ def _tables(
                 ctx=context,
                 id=f"{name}/{column}",
                 name=column,
-                description=text,
+                description=texts[column],
                 data_types=[getattr(mlc.DataType, kind)],
                 is_array=True if shape else None,
                 array_shape=shape,
                 source=mlc.Source(ctx=context, file_set=files.id, extract=mlc.Extract(ctx=context, column=column)),
             )
-            for column, text, kind, shape in columns
+            for column, kind, shape in map(_column, pq.read_schema(path))
         ]
         keys = [f"{name}/{column}" for column in key]
         yield files, mlc.RecordSet(ctx=context, id=name, name=name, description=said, key=keys, fields=fields)
+
+
+def _column(field: Any) -> tuple[str, str, str | None]:
+    """Return name, data type and, if it has lists, their lengths such as "100,36" of an Arrow field."""
+    kind, lengths = field.type, []
+    while hasattr(kind, "list_size"):
+        lengths.append(str(kind.list_size))
+        kind = kind.value_type
+    return field.name, _TYPES.get(str(kind), "INTEGER"), ",".join(lengths) or None

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -60,19 +60,6 @@ class ReadRequest(NamedTuple):
     histories: np.ndarray
     rows: np.ndarray
     out: np.ndarray
-
-
-class HistorySource(Protocol):
-    """Interface of sources, which read rows of a selection's histories, given by their positions in it."""
-
-    def read(self, requests: Sequence[ReadRequest]) -> None:
-        """Carry out requests in parallel, after downloading the shards they need from a remote release.
-
-        Raises:
-            ShardCorruptError: names the chunk whose checksum is wrong.
-            RemoteError: if a shard cannot be downloaded.
-        """
-        ...
 
 
 def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
@@ -194,6 +181,7 @@ class FlatSource:
         self._arrays.append(arrays)
 
     def read(self, requests: Sequence[ReadRequest]) -> None:
+        """Carry out requests in parallel."""
         _on_threads(self._read, requests, self._threads)
 
     def _read(self, request: ReadRequest) -> None:
@@ -257,6 +245,12 @@ class StreamedSource:
         self._entries, self._shards, self._threads = entries, shards, threads
 
     def read(self, requests: Sequence[ReadRequest]) -> None:
+        """Carry out requests in parallel, after downloading the shards they need from a remote release.
+
+        Raises:
+            ShardCorruptError: names the chunk whose checksum is wrong.
+            RemoteError: if a shard cannot be downloaded.
+        """
         positions = {position for request in requests for position in request.histories.tolist()}
         names = sorted({self._entries[position].shard for position in positions})
         self._shards.fetch(names)
@@ -283,6 +277,10 @@ class StreamedSource:
                 out[...] = 0
             if low < high:
                 shard.read_into(history_id, field, low, out[low - begin : high - begin])
+
+
+HistorySource = FlatSource | StreamedSource
+"""Source of the rows of a selection's histories, given by their positions in it."""
 
 
 def _on_threads(read: Callable[[ReadRequest], None], requests: Sequence[ReadRequest], threads: int) -> None:

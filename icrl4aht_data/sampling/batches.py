@@ -7,29 +7,16 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.install_hints import import_optional
 from icrl4aht_data.utils.options import check_int
 
+if TYPE_CHECKING:
+    from icrl4aht_data.sampling.base import Sampler
+
 B = TypeVar("B")
-
-
-class BatchSource(Protocol[B]):
-    """The methods of a sampler that `Batches` calls."""
-
-    def batch(self, i: int, out: B | None = None) -> B:
-        """Return batch i, written into `out` if given."""
-        ...
-
-    def empty(self) -> B:
-        """Return a batch of uninitialised arrays for `out`."""
-        ...
-
-    def options(self) -> dict[str, Any]:
-        """Return the options that determine the batches, as JSON."""
-        ...
 
 
 class Batches(Iterator[B], Generic[B]):
@@ -63,7 +50,7 @@ class Batches(Iterator[B], Generic[B]):
 
     def __init__(
         self,
-        sampler: BatchSource[B],
+        sampler: Sampler[Any, Any, Any],
         start: int = 0,
         stop: int | None = None,
         *,
@@ -203,7 +190,7 @@ class Batches(Iterator[B], Generic[B]):
 
 
 # A function, not a method: a reference from the thread to the iterator would keep an abandoned iterator alive.
-def _make(sampler: BatchSource[B], i: int, buffer: B | None, put: Callable[[B], B] | None) -> B:
+def _make(sampler: Sampler[Any, Any, Any], i: int, buffer: B | None, put: Callable[[B], B] | None) -> B:
     batch = sampler.batch(i, buffer)
     return batch if put is None else put(batch)
 

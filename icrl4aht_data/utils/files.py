@@ -1,4 +1,4 @@
-"""Utilities for files: text and JSON, atomic writes, locks between processes, safe paths, full disks.
+"""Utilities for files: text and JSON, hashes, atomic writes, locks between processes, safe paths, full disks.
 
 Sizes are checked before reading, because a file may be a pipe, which never ends, or a sparse file of a terabyte.
 """
@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -111,9 +111,29 @@ def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
     path.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
 
 
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
+    """Return whether all files of a folder (path -> SHA-256) have the given hashes.
+
+    Raises:
+        OSError: if a file cannot be read.
+    """
+    return all(file_hash(folder / name) == digest for name, digest in files.items())
+
+
+def short_hash(data: bytes, digits: int = 16) -> str:
+    """Return the first hexadecimal digits of a text's SHA-256."""
+    return hashlib.sha256(data).hexdigest()[:digits]
+
+
 def json_hash(content: Any) -> str:
-    """Return a hash of settings: the first 16 hexadecimal digits of the SHA-256 of their JSON with sorted keys."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+    """Return a hash of settings: the `short_hash` of their JSON with sorted keys."""
+    return short_hash(json.dumps(content, sort_keys=True).encode())
 
 
 @contextmanager

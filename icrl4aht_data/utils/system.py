@@ -105,16 +105,13 @@ if hasattr(os, "register_at_fork"):  # threads do not survive a fork
 
 _DEFAULT_LIMIT = 100 * 10**9
 
-CACHE_VARIABLES = ("ICRL4AHT_CACHE_DIR", "XDG_CACHE_HOME")
-"""Environment variables that set the cache folder: the first directly, the second as the parent of `icrl4aht`."""
-
-DATA_VARIABLES = ("ICRL4AHT_DATA_DIR", "XDG_DATA_HOME")
-"""Environment variables that set the data folder: the first directly, the second as the parent of `icrl4aht`."""
+CACHE_VARIABLE, DATA_VARIABLE = "ICRL4AHT_CACHE_DIR", "ICRL4AHT_DATA_DIR"
+"""Environment variables that set the cache folder and the data folder."""
 
 
 def cache_folder() -> Path:
     """Return the folder of cached arrays; ~/.cache/icrl4aht by default on Linux. Reads the environment at each call."""
-    own = os.environ.get(CACHE_VARIABLES[0])
+    own = os.environ.get(CACHE_VARIABLE)
     return Path(own).expanduser() if own else platformdirs.user_cache_path("icrl4aht", appauthor=False)
 
 
@@ -122,7 +119,7 @@ def data_folder() -> Path:
     """Return the folder of fetched releases; ~/.local/share/icrl4aht by default on Linux.
 
     Reads the environment at each call. Unlike in the cache folder, nothing is removed automatically."""
-    own = os.environ.get(DATA_VARIABLES[0])
+    own = os.environ.get(DATA_VARIABLE)
     return Path(own).expanduser() if own else platformdirs.user_data_path("icrl4aht", appauthor=False)
 
 

@@ -53,6 +53,7 @@ from icrl4aht_data.format.schema import (
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import files_below, write_json
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.install_hints import project_url
 from icrl4aht_data.utils.templates import card_file, markdown_table
 from icrl4aht_data.utils.text import counted_noun
@@ -158,18 +159,19 @@ def facts(root: Path) -> dict[str, Any]:
     """
     index, provenance, files = read_index(root), read_provenance(root / PROVENANCE), set(files_below(root))
     info, entries = index.info, list(index.entries)
-    by_id, members = {task.task_id: task for task in read_tasks(root / TASKS)}, defaultdict[str, list[Entry]](list)
-    for entry in entries:
-        members[entry.task_id].append(entry)
+    by_id = {task.task_id: task for task in read_tasks(root / TASKS)}
     tasks = [
-        _TaskFacts(own[0], own, by_id.get(name), provenance.get(name, Provenance())) for name, own in members.items()
+        _TaskFacts(own[0], own, by_id.get(name), provenance.get(name, Provenance()))
+        for name, own in grouped(entries, lambda entry: entry.task_id).items()
     ]
     teammates = _teammates(tasks, list(info.layouts))
     titles = {layout: layout_title(layout) for layout in info.layouts}
-    matters = defaultdict[str, list[bool]](list)
-    for row in (row for row in teammates if row["matters"] is not None):
-        matters[titles[row["layout"]]].append(row["matters"])
-    headroom = {layout: any(found) for layout, found in matters.items()}
+    compared = (row for row in teammates if row["matters"] is not None)
+    matters = {
+        title: [row["matters"] for row in own]
+        for title, own in grouped(compared, lambda row: titles[row["layout"]]).items()
+    }
+    headroom = {title: any(found) for title, found in matters.items()}
     first = min(entries, key=lambda entry: (entry.split != "train", entry.history_id))
     length = min(500, *(entry.T for entry in entries if (entry.split, entry.layout) == (first.split, first.layout)))
     tested, learning = evaluated_on(info.layouts), _learning(tasks, titles)
@@ -243,9 +245,8 @@ def _learning(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[di
     """Return rows on the rise of returns, one for each title of layouts, source and split, in their usual order."""
     names = ("layout", "source", "split")
     order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # other sources by first appearance
-    groups = defaultdict[tuple[str, ...], list[_TaskFacts]](list)
-    for task in sorted(tasks, key=lambda task: [order.index(getattr(task.first, name)) for name in names]):
-        groups[titles[task.first.layout], task.first.source, task.first.split].append(task)
+    ordered = sorted(tasks, key=lambda task: [order.index(getattr(task.first, name)) for name in names])
+    groups = grouped(ordered, lambda task: (titles[task.first.layout], task.first.source, task.first.split))
     rows = []
     for key, own in groups.items():
         entries = [entry for task in own for entry in task.histories]
@@ -272,12 +273,9 @@ def _curves(learning: Iterable[Mapping[str, Any]], sources: Iterable[str]) -> li
 
 def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict[str, Any]]:
     """Return one row per teammate of a release, sorted by layout, split and family."""
-    groups = defaultdict[tuple[str, str, str], list[_TaskFacts]](list)
-    for one in tasks:
-        if one.task is not None:
-            groups[*one.task.teammate_key, one.task.split].append(one)
+    known = (one for one in tasks if one.task is not None)
     rows = []
-    for own in groups.values():
+    for own in grouped(known, lambda one: one.task and (*one.task.teammate_key, one.task.split)).values():
         first, task = own[0].first, own[0].task
         references = next((one.made.references for one in own if one.made.references), None)
         nearest = next((one.made.nearest_test for one in own if one.made.nearest_test), None)
@@ -305,13 +303,13 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
 
 def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the numbers of teammates with known behaviour and of distinct behaviours, by split."""
-    found = defaultdict[str, list[tuple[Any, ...]]](list)
-    for row in teammates:
-        if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None:
-            found[row["split"]].append((row["layout"], row["family"], row["nearest_test"]["behaviour"]))
+    known = [row for row in teammates if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None]
+    found = {
+        split: [(row["layout"], row["family"], row["nearest_test"]["behaviour"]) for row in own]
+        for split, own in grouped(known, lambda row: row["split"]).items()
+    }
     counts = {split: (len(found[split]), len(set(found[split]))) for split in SPLITS if split in found}
-    shared = set(found.get("train", ())) & set(found.get("validation", ()))
-    return {"behaviours": counts, "shared_behaviours": len(shared)}
+    return {"behaviours": counts, "shared_behaviours": len({*found.get("train", ())} & {*found.get("validation", ())})}
 
 
 def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str, Sequence[bool]]) -> list[list[str]]:

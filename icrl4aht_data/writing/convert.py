@@ -11,6 +11,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.checkpoints import checkpoint_files, expert_files, expert_folder
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import KINDS, OBSERVATIONS, TEAMMATES, Kind
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 HistoryProgress = Callable[[int, int], None]
@@ -83,9 +84,6 @@ def to_release(
             f"do not determine; convert to {OBSERVATIONS}, published or parquet"
         )
     tasks, provenance = release_tasks(dataset), dataset.provenance
-    by_task: dict[str, list[int]] = {}
-    for entry in dataset.entries:
-        by_task.setdefault(entry.task_id, []).append(entry.history_id)
     numbers = iter(range(1, len(dataset) + 1))
 
     def done() -> None:
@@ -95,8 +93,14 @@ def to_release(
         target,
         kind,
         [
-            stored_task(dataset.select(ids), tasks[name], provenance.get(name, Provenance()), kind, done)
-            for name, ids in by_task.items()
+            stored_task(
+                dataset.select([entry.history_id for entry in own]),
+                tasks[name],
+                provenance.get(name, Provenance()),
+                kind,
+                done,
+            )
+            for name, own in grouped(dataset.entries, lambda entry: entry.task_id).items()
         ],
         data_version=dataset.info.data_version,
         kept_steps=dataset.info.environment.kept_steps,

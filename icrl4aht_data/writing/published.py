@@ -41,6 +41,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import add_filename, resolve_inside, write_json
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.writing.convert import HistoryProgress
 from icrl4aht_data.writing.published_index import PUBLISHED_FIELDS, read_published_index
@@ -250,9 +251,7 @@ def _stored_names(file: h5py.File, group: str) -> set[str] | None:
 
 def _tasks(histories: list[_PublishedHistory], source: Path, kind: Kind) -> list[tuple[Task, list[_PublishedHistory]]]:
     """Return the tasks of the index with their histories, in the order of the index."""
-    by_task: dict[str, list[_PublishedHistory]] = {}
-    for history in histories:
-        by_task.setdefault(history.line["task_id"], []).append(history)
+    by_task = grouped(histories, lambda history: history.line["task_id"])
     found = resolve_inside(source, "tasks.jsonl")
     if found.is_file():
         known = {task.task_id: task for task in read_tasks(found)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
@@ -44,6 +43,7 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.utils.files import write_json
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.writing.card import write_card
 from icrl4aht_data.writing.release_folder import as_path, atomic_folder
 from icrl4aht_data.writing.shard_writer import EncodedChunk, encode_history, write_shard
@@ -157,11 +157,9 @@ def write_release(
         )
     with atomic_folder(target, overwrite=overwrite, sources=sources) as root:
         writer = _ShardWriter(root, kind, kept_steps, shard_histories, shard_bytes, done)
-        groups: dict[tuple[str, str, str], list[NewTask]] = defaultdict(list)
-        for one in new:
-            groups[one.task.track, one.task.layout.name, one.task.split].append(one)
-        for (track, layout, split), members in groups.items():
-            writer.write(f"data/{track}/{layout}/{split}", members)
+        stems = grouped(new, lambda one: f"data/{one.task.track}/{one.task.layout.name}/{one.task.split}")
+        for stem, members in stems.items():
+            writer.write(stem, members)
         for name, source in chain(files.items(), *(one.files.items() for one in new)):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, root / name)

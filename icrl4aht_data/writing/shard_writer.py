@@ -60,7 +60,6 @@ def write_shard(
     path.parent.mkdir(parents=True, exist_ok=True)
     table_path.parent.mkdir(parents=True, exist_ok=True)
     layout = get_layout(entries[0].layout)
-    checksums: list[tuple[int, np.ndarray]] = []
     # In memory, since libhdf5 may crash when it closes a file on a full disk. A shard is small, see `SHARD_BYTES`.
     with h5py.File(path, "w", libver=("v110", "v110"), driver="core", backing_store=False) as file:
         file.attrs["format_version"] = FORMAT_VERSION
@@ -72,12 +71,10 @@ def write_shard(
             for field, start, data in sorted(chunks, key=lambda chunk: file_order(chunk.field, chunk.start)):
                 position = (start,) if entry.h5_row is None else (entry.h5_row, start)
                 open_dataset(f"{entry.h5_group}/{field.name}").id.write_direct_chunk(position, data)
-            checksums += [_checksums(chunk.data) for chunk in chunks]
-        table = np.zeros(len(checksums), CHUNK_DTYPE)
-        table["crc32"] = [crc32 for crc32, _ in checksums]
-        table["hash"] = [digest for _, digest in checksums]
         locations = [row for entry in entries for row in chunk_locations(file, kind, entry)]
-        table["offset"], table["size"], table["rows"] = np.array(locations, np.uint64).T
+        stored = [chunk.data for chunks in histories for chunk in chunks]
+        rows = [(*row, *_checksums(data)) for row, data in zip(locations, stored, strict=True)]
+        table = np.array(rows, CHUNK_DTYPE)
         file.flush()
         content: bytes = file.id.get_file_image()
     saved = BytesIO()

@@ -11,7 +11,7 @@ from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof
 
 from icrl4aht_data.format.schema import HISTORIES
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash
 from icrl4aht_data.writing import proof
 from icrl4aht_data.writing.card import facts, render_card
 from icrl4aht_data.writing.proof import proof_table, read_proof

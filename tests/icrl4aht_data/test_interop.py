@@ -120,18 +120,11 @@ class TestHuggingFace:
         dataset = load_icrl4aht(lite[0], layout="demo_wide")
         assert hf_index(dataset).to_list() == [entry.to_row() for entry in dataset.entries]
 
-    def test_episodes(self, lite, tmp_path, monkeypatch):
+    def test_episodes_without_oracle_actions(self, lite, tmp_path, monkeypatch):
+        """`test_episode_files.py` compares all columns with the histories."""
         monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path)
-        root, written = lite
-        rows = hf_episodes(load_icrl4aht(root, layout="demo_wide"))
-        assert len(rows) == 36
-        row = rows[8]
+        row = hf_episodes(load_icrl4aht(lite[0], layout="demo_wide"))[8]
         assert (row["history_id"], row["episode"], row["layout"]) == (7, 2, "demo_wide")
-        for name in ("actions", "teammate_actions", "expert_actions", "rewards"):
-            np.testing.assert_array_equal(row[name], written[7][name][40:60])
-        np.testing.assert_array_equal(row["state"], written[7]["state"][40:60])
-        np.testing.assert_array_equal(row["episode_end_state"], written[7]["episode_end_state"][2])
-        assert row["return"] == written[7]["rewards"][40:60].sum()
         assert row["oracle_actions"] is None
 
     def test_windows_and_resuming(self, sampler):

@@ -32,8 +32,7 @@ from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.reading.history import Labels
 from icrl4aht_data.reading.splitting import choose_histories, choose_teammates
-from icrl4aht_data.utils.files import json_hash
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash, json_hash
 
 _CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammate_family"]} | {
     name: FILTERS[name] for name in ("algorithm", "source")

@@ -35,8 +35,16 @@ from icrl4aht_data.format.cached_arrays import new_mapped_array
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
-from icrl4aht_data.utils.files import NO_ROOM, atomic_write, json_hash, parse_json, read_text, write_json
-from icrl4aht_data.utils.hashes import file_hash, hashes_hold
+from icrl4aht_data.utils.files import (
+    NO_ROOM,
+    atomic_write,
+    file_hash,
+    hashes_hold,
+    json_hash,
+    parse_json,
+    read_text,
+    write_json,
+)
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, checkpoint_updates, save_policy
 from icrl4aht_generation.learners.config import PPOConfig
 from icrl4aht_generation.learners.network import ActorCritic

@@ -11,8 +11,7 @@ import pandas as pd
 
 from icrl4aht_data.benchmark.facts import ALGORITHMS, TRACKS, layout_number, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
-from icrl4aht_data.utils.files import atomic_write, lock_path, process_lock
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import atomic_write, file_hash, lock_path, process_lock
 from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS
 from icrl4aht_generation.populations.train import SuiteCheckpoint, suite_checkpoints
 

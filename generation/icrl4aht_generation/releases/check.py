@@ -11,7 +11,7 @@ import numpy as np
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.schema import PROVENANCE
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA
 from icrl4aht_generation.jobs.job import FAILED
 from icrl4aht_generation.learners.resume import TIMING

@@ -14,7 +14,7 @@ from jaxtyping import Array, Key, UInt8
 from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.format.checkpoints import checkpoint_folder
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash
 from icrl4aht_generation.learners.checkpoint import POLICY_WEIGHTS, load_policy
 from icrl4aht_generation.learners.config import Widths
 from icrl4aht_generation.learners.network import ActorCritic

@@ -20,7 +20,7 @@ from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_generation.teammates.instances import published_tasks
 
 from icrl4aht_data.errors import OptionError, UnknownNameError
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash
 from tests.helpers.commands import run_cli
 from tests.helpers.small_models import random_parameters
 from tests.servers.http import http_server

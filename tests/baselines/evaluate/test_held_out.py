@@ -18,7 +18,7 @@ from icrl4aht_generation.learners.network import ActorCritic
 
 from icrl4aht_data.benchmark.tasks import make_task, write_tasks
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash
 from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
 

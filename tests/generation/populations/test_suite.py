@@ -41,7 +41,7 @@ from icrl4aht_data.benchmark.facts import ALGORITHMS, layout_number
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash
 from tests.helpers.damages import flip_bit
 from tests.helpers.tiny import start
 from tests.helpers.xla_flags import add_xla_flag

@@ -32,7 +32,7 @@ from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.damages import flip_bit

@@ -20,7 +20,7 @@ from icrl4aht_data.errors import OptionError, TaskFormatError
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash
 from tests.helpers.states import random_records
 
 LAYOUT = get_layout("cramped_up")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
-from icrl4aht_data.browsing.drawings import ShapeRecorder, layout_drawings
+from icrl4aht_data.browsing.drawings import layout_drawings, shape_to_json
 from icrl4aht_data.browsing.page import (
     NO_ACTION,
     PAGE_START,
@@ -24,7 +24,7 @@ from icrl4aht_data.browsing.page import (
 )
 from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError, UnknownNameError
 from icrl4aht_data.format.layouts_file import layout_title
-from icrl4aht_data.overcooked.drawing import state_parts
+from icrl4aht_data.overcooked.drawing import Canvas, state_parts
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.writing.convert import to_release
@@ -131,9 +131,9 @@ def test_every_state_can_be_drawn_from_the_page(layout):
     for record in records[:5]:
         for part, (name, moves, anchor, columns) in zip(state_parts(layout), drawings["parts"], strict=True):
             values = record[columns].tolist()
-            recorder = ShapeRecorder()
-            part.draw(recorder, 0.0, 0.0, *values)
-            assert drawings["drawings"][name][",".join(map(str, values))] == recorder.shapes
+            canvas = Canvas()
+            part.draw(canvas, 0.0, 0.0, *values)
+            assert drawings["drawings"][name][",".join(map(str, values))] == list(map(shape_to_json, canvas.shapes))
             assert (part.moves, part.anchor) == (moves, anchor)
 
 

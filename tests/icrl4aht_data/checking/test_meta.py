@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from icrl4aht_data import load_icrl4aht
-from icrl4aht_data.errors import IndexFormatError, OptionError, ReleaseError
+from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import read_provenance
 from icrl4aht_data.format.schema import HISTORIES, INFO, PROVENANCE
@@ -92,13 +92,9 @@ def test_a_teammate_in_provenance_is_not_used(learned, tmp_path):
     root = spoiled(learned, tmp_path / "release", PROVENANCE, lambda c: first(c)["teammate"].update(family="brdiv"))
     with pytest.raises(IndexFormatError, match="unknown field `family`"):
         load_icrl4aht(root).recover_teammate(0)
-    with pytest.raises(IndexFormatError, match="unknown field `family`"):
-        read_provenance(root / PROVENANCE)
 
 
-def test_unsafe_versions_are_not_written(learned, tmp_path):
-    with pytest.raises(ReleaseError, match=r"data version '\.\./\.\.'"):
-        load_icrl4aht(spoiled(learned, tmp_path / "bad", INFO, lambda c: c.update(data_version="../..")))
+def test_unsafe_versions_are_not_written(tmp_path):
     with pytest.raises(OptionError, match="data version '1': expected"):
         write_release(tmp_path / "out", "lite", [], data_version="1")
 

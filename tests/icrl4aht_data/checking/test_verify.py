@@ -15,7 +15,6 @@ import pytest
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import make_task
 from icrl4aht_data.dataset import MINI
-from icrl4aht_data.errors import ReleaseError
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance
@@ -82,8 +81,6 @@ def test_quick_checks_the_checksums_of_meta(damaged, name):
     """Flip a bit of meta/ that only the checksum reveals."""
     path = damaged / name
     path.write_text(path.read_text() + " ")
-    with pytest.raises(ReleaseError, match=f"{name}: expected sha256"):
-        load_icrl4aht(damaged)
     assert name in verify_release(damaged, level="quick").files_at_fault
 
 

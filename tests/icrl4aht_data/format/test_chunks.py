@@ -40,16 +40,6 @@ def test_a_chunk_is_compared_with_its_row():
         check_chunk(flipped, row)
 
 
-def test_every_row_has_the_hash_of_its_bytes(lite):
-    root, _ = lite
-    for shard in load_icrl4aht(root).info.shards:
-        table, data = np.load(root / chunk_table_name(shard)), (root / shard).read_bytes()
-        assert table.dtype == CHUNK_DTYPE
-        assert not table["rows"][-1], "the bytes between the chunks come last"
-        for row in table:
-            check_chunk(data[row["offset"] : row["offset"] + row["size"]], row)
-
-
 @pytest.mark.parametrize("cache", CACHES)
 def test_a_changed_chunk_is_refused(damaged, tmp_path, monkeypatch, cache):
     """Only its hash reveals the change, because its CRC-32 and the manifest are changed as well."""

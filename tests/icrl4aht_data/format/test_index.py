@@ -1,9 +1,8 @@
-"""The index as columns: equal to its lines, and read again after changes."""
+"""The index as columns: equal to its lines."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -22,14 +21,7 @@ def long(tmp_path_factory) -> tuple[Path, list[Entry]]:
     return root, long_index(root)
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch) -> Path:
-    """An empty cache folder."""
-    monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
-def test_entries_are_the_lines(long, folder):
+def test_entries_are_the_lines(long):
     root, entries = long
     index = read_index(root)
     assert [index.entries[i] for i in range(len(entries))] == entries
@@ -82,7 +74,7 @@ def test_each_line_has_exactly_one_object(rewritten, change, number):
         rewritten(lambda lines: "".join(f"{line}\n" for line in change(lines)))
 
 
-def test_queries_find_what_a_scan_finds(long, folder):
+def test_queries_find_what_a_scan_finds(long):
     root, entries = long
     index = read_index(root)
     for wanted in (
@@ -110,19 +102,6 @@ def test_queries_find_what_a_scan_finds(long, folder):
         index.query(split="test")
     with pytest.raises(UnknownNameError, match="unknown task_id"):
         index.query(task_id=entries[0].task_id[:-1] + "x" * 99)
-
-
-def test_a_changed_index_is_parsed_again(tmp_path, folder):
-    root = tmp_path / "release"
-    entries = long_index(root)
-    path = root / "meta" / "histories.jsonl"
-    assert read_index(root).entry(9) == entries[9]
-    before = path.stat()
-    text = path.read_text()
-    changed = text.replace(f'"env_idx": {entries[9].env_idx},', f'"env_idx": {(entries[9].env_idx + 1) % 9},')
-    path.write_text(changed)
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # even if the modification time is unchanged
-    assert read_index(root).entry(9).env_idx != entries[9].env_idx
 
 
 @pytest.mark.parametrize("where", [0, 1500, 2999])

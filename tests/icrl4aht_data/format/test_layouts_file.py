@@ -17,7 +17,7 @@ from icrl4aht_data.benchmark.tasks import make_task, parse_task, read_tasks, tas
 from icrl4aht_data.checking.verify import verify_release
 from icrl4aht_data.commands.options import LAYOUT
 from icrl4aht_data.errors import IndexFormatError, OptionError, TaskFormatError, UnknownNameError
-from icrl4aht_data.format.layouts_file import LAYOUTS_NAME, read_tasks_and_layouts, write_layouts_file
+from icrl4aht_data.format.layouts_file import read_tasks_and_layouts
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.schema import FORMAT_VERSION, LAYOUTS_FILE, TASKS
 from icrl4aht_data.overcooked import layouts as known_layouts
@@ -58,15 +58,6 @@ def test_tasks_of_a_release_are_read_with_its_layouts(root):
     (root / LAYOUTS_FILE).write_text("{}\n")
     with pytest.raises(IndexFormatError, match=r"layouts\.jsonl, line 1"):
         read_tasks_and_layouts(root / TASKS)
-
-
-def test_layouts_of_a_file_of_tasks(tmp_path, monkeypatch):
-    add_layouts([MINE])
-    write_layouts_file(tmp_path / LAYOUTS_NAME, [MINE, get_layout("coord_simple")])
-    monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
-    write_tasks(tmp_path / "tasks.jsonl", [])
-    assert read_tasks_and_layouts(tmp_path / "tasks.jsonl") == []
-    assert get_layout("mine-3-5").rows == MINE.rows
 
 
 def rewritten(root: Path, lines: list[Any]) -> Path:

@@ -217,10 +217,3 @@ def test_a_left_out_task_has_no_histories(lite_mixed, tmp_path):
     task_id = load_icrl4aht(lite_mixed).entries[0].task_id
     root = left_out(shutil.copytree(lite_mixed, tmp_path / "r"), replace(LEFT_OUT, task_id=task_id))
     assert f"left_out: task '{task_id}' has histories in the index" in "\n".join(problems(root))
-
-
-def test_a_task_of_another_source_is_not_combined(tmp_path):
-    for name in SOURCES[:2]:
-        random_release(tmp_path / name, layouts=("demo_wide",), teammates=1, streams=1, sources=(name,))
-    with pytest.raises(OptionError, match=r"task .* is also in .*noise; .*another seed"):
-        combine_releases(tmp_path / "out", [tmp_path / "noise", tmp_path / "ppo"])

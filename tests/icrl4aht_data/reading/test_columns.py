@@ -145,8 +145,3 @@ class TestWeakLabels:
             warnings.simplefilter("always")
             dataset.dpt(batch_size=2, context=5)
         assert [one.category for one in caught] == [WeakLabelsWarning] * weak  # labels earn 9.5
-
-    def test_no_warning_without_measured_returns(self, lite):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            load_icrl4aht(lite[0], layout="demo_wide").dpt(batch_size=2, context=5)

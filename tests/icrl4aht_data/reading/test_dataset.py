@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from icrl4aht_data import get_layout, load_icrl4aht
-from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, LabelsMissingError, OptionError, UnknownNameError
+from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, OptionError, UnknownNameError
 from icrl4aht_data.overcooked.observe import observe
 from tests.helpers.batches import assert_equal
-from tests.helpers.random_releases import random_release
 
 
 @pytest.mark.parametrize(
@@ -149,16 +148,6 @@ def test_returns_are_the_learning_curve(lite):
     root, written = lite
     expected = written[3]["rewards"].reshape(6, 20).sum(axis=1)
     np.testing.assert_allclose(load_icrl4aht(root)[3].returns(), expected, rtol=0, atol=1e-9)
-
-
-def test_missing_labels_are_an_error(tmp_path):
-    random_release(tmp_path / "r", labels=False, layouts=("cramped_up",))
-    history = load_icrl4aht(tmp_path / "r")[0]
-    assert not history.entry.has_expert_actions
-    with pytest.raises(LabelsMissingError, match="has_expert_actions = false"):
-        history.expert_actions  # noqa: B018
-    with pytest.raises(LabelsMissingError, match="6 of 6 histories"):
-        load_icrl4aht(tmp_path / "r").dpt(batch_size=1, context=5)
 
 
 def test_ids_that_are_no_integers(lite):

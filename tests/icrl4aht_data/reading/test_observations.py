@@ -224,8 +224,7 @@ class TestWithoutStates:
             mixed = load_icrl4aht(converted_release, layout="demo_wide", cache=cache)
             assert mixed.ad(batch_size=9, length=5)[0].prev_teammate_actions is None
 
-    def test_a_large_index_counts_teammate_actions(self, tmp_path, monkeypatch):
-        monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
+    def test_a_large_index_counts_teammate_actions(self, tmp_path):
         long_index(tmp_path / "r")
         info, index = tmp_path / "r" / "meta" / "info.json", tmp_path / "r" / "meta" / "histories.jsonl"
         lines = [json.loads(line) for line in index.read_text().splitlines()]

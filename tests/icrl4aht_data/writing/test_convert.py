@@ -86,14 +86,6 @@ def test_a_release_is_not_written_over_its_source(lite, write):
             write(dataset, target, overwrite=True)
 
 
-def test_parquet_index(lite, tmp_path):
-    import pyarrow.parquet as pq
-
-    dataset = load_icrl4aht(lite[0], layout="demo_wide")
-    rows = pq.read_table(to_parquet(dataset, tmp_path / "index.parquet")).to_pylist()
-    assert rows == [entry.to_row() for entry in dataset.entries]
-
-
 def wrong(value: Any) -> Any:
     return value
 

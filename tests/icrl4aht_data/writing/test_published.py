@@ -56,13 +56,6 @@ def test_names_of_the_published_code(published_folder, tmp_path, family, kind, e
     assert verify_release(tmp_path / "out", level="deep").ok
 
 
-def test_other_names_are_refused(published_folder, tmp_path):
-    names = {"teammate_family": "my_pbt", "teammate_kind": "rl"}
-    files = relabel(published_folder[0], tmp_path / "files", {2: names})
-    with pytest.raises(PublishedFormatError, match="line 3: unknown teammate_family 'my_pbt'; valid: rl, H1, "):
-        from_published(files, tmp_path / "out", kept_steps=KEPT)
-
-
 @pytest.fixture(scope="module")
 def short_views(tmp_path_factory) -> tuple[Path, dict[int, dict[str, np.ndarray]], np.ndarray]:
     """Return files with 4 x 5 views of cramped_up, the history, and the complete views (read-only)."""
@@ -136,6 +129,9 @@ def test_duplicates_and_contradictions_are_refused(published_folder, tmp_path):
         "line 2: group '0' is already that of line 1": {1: {"h5_group": "0"}},
         "line 2: stream 10 of task 'task_a' is already that of line 1": {1: {"env_idx": 10}},
         r"line 2: Expected `int` >= 0 - at `\$\.env_idx`": {1: {"env_idx": -1}},
+        "line 3: unknown teammate_family 'my_pbt'; valid: rl, H1, ": {
+            2: {"teammate_family": "my_pbt", "teammate_kind": "rl"}
+        },
         "line 3: teammate_kind 'heuristic', but teammate_family 'ippo'": {
             2: {"teammate_family": "ippo", "teammate_kind": "heuristic"}
         },

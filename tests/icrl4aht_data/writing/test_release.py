@@ -22,7 +22,7 @@ from icrl4aht_data.errors import OptionError, RootNotFoundError
 from icrl4aht_data.format.chunks import decode_chunk, encode_chunk
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.damages import contents
 from tests.helpers.paths import ROOT

@@ -19,7 +19,6 @@ from icrl4aht_data.writing.card import facts, render_card
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
-from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import random_release
 
 
@@ -103,12 +102,6 @@ def test_a_malformed_teammate_is_refused():
         Provenance.from_json({"swaps": {"every": 2, "teammates": [teammate, teammate]}})
     with pytest.raises(IndexFormatError, match="length >= 2"):
         Provenance.from_json({"swaps": {"every": 2, "teammates": [teammate]}})
-
-
-def test_show(swapped):
-    output = run_cli("show", swapped, "--history", "1", "--json")
-    entry = load_icrl4aht(swapped)[1].entry
-    assert json.loads(output)["teammate_of_episode"] == [list(pair) for pair in entry.teammate_of_episode or ()]
 
 
 def test_the_oracle_is_wanted_where_it_earns_what_the_end_earns():

@@ -21,8 +21,7 @@ from icrl4aht_data.errors import Icrl4ahtError
 from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import FIELDS, TEAMMATES
-from icrl4aht_data.utils.files import files_below
-from icrl4aht_data.utils.hashes import file_hash
+from icrl4aht_data.utils.files import file_hash, files_below
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
