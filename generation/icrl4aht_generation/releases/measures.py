@@ -27,6 +27,7 @@ from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, read_text
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
@@ -58,8 +59,7 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceE
         task id -> returns.
     """
     found = {}
-    for layout in dict.fromkeys(task.layout for task in tasks):
-        own = [task for task in tasks if task.layout == layout]
+    for layout, own in grouped(tasks, lambda task: task.layout).items():
         folders = [checkpoint_folder(suite, task.teammate) for task in own]
         mates = [build_learned(layout, folder) for folder in folders]
         partners = [build_learned(layout, _partner(folder), "sampled") for folder in folders]
@@ -127,9 +127,7 @@ def teammate_facts(
         task id -> facts.
     """
     headroom, recorded = headroom or {}, recorded_provenance(suite)
-    groups: dict[tuple[str, str], list[Task]] = {}
-    for task in tasks:
-        groups.setdefault(task.teammate_key, []).append(task)
+    groups = grouped(tasks, lambda task: task.teammate_key)
     found: dict[tuple[str, str], TeammateFacts] = {}
     for key, members in groups.items():
         draw, made = find_measured(key[0], members[0].teammate), recorded.get(members[0].task_id)
@@ -139,9 +137,8 @@ def teammate_facts(
             found[key] = TeammateFacts(egos, NearestTest(name, distance, draw.behaviour))
         elif made is not None and made.references is not None:
             found[key] = TeammateFacts(made.references, made.nearest_test)
-    unknown = [key for key in groups if key not in found]
-    for layout in dict.fromkeys(layout for layout, _ in unknown):
-        keys = [key for key in unknown if key[0] == layout]
+    unknown = (key for key in groups if key not in found)
+    for layout, keys in grouped(unknown, lambda key: key[0]).items():
         chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
         kept = artefacts / f".{layout}.teammates.json"
         settings = software_versions() | {

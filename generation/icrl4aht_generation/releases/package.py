@@ -22,6 +22,7 @@ from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceE
 from icrl4aht_data.format.schema import Kind, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves, save_figure
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.writing.card import CURVES_FIGURE, teammate_name
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
@@ -153,9 +154,7 @@ def package_release(
         OptionError: if something else is at `target`, see `check_release_folder`, or no task has histories to keep.
     """
     check_release_folder(target, profile)
-    tasks: dict[str, list[Work]] = {}
-    for work in units:
-        tasks.setdefault(work.task.task_id, []).append(work)
+    tasks = grouped(units, lambda work: work.task.task_id)
     headroom = {members[0].task.layout.name for task_id, members in tasks.items() if facts[task_id].matters}
     recorded, new, omitted, curves = recorded_provenance(suite), [], list(left_out), SourceCurves()
     for task_id, members in tasks.items():

@@ -12,7 +12,6 @@ farther from every test instance.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
@@ -26,6 +25,7 @@ from icrl4aht_data.benchmark.tasks import Task, make_task
 from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import atomic_write, read_lines
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
 
 DRAWS_TABLE = Path(__file__).with_name("draws.jsonl")
@@ -291,11 +291,8 @@ def _hosted_text(layout: str, base_seed: int) -> str:
 
 
 @lru_cache(maxsize=1)
-def _bundled_draws() -> dict[tuple[str, str, int], tuple[Draw, ...]]:
-    draws: dict[tuple[str, str, int], list[Draw]] = defaultdict(list)
-    for draw in read_measured(DRAWS_TABLE, Draw):
-        draws[draw.layout, draw.family, draw.base_seed].append(draw)
-    return {key: tuple(found) for key, found in draws.items()}
+def _bundled_draws() -> dict[tuple[str, str, int], list[Draw]]:
+    return grouped(read_measured(DRAWS_TABLE, Draw), lambda draw: (draw.layout, draw.family, draw.base_seed))
 
 
 AnyRow = TypeVar("AnyRow", bound=Struct)

@@ -6,7 +6,6 @@ have parameters of their own on cramped_down; H3 and H4 have the same on every l
 
 from __future__ import annotations
 
-from collections import defaultdict
 from functools import cache
 from typing import Any
 
@@ -14,6 +13,7 @@ from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task, manifest_path, read_tasks
 from icrl4aht_data.errors import check_choice
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.groups import grouped
 
 TESTED_FAMILIES = tuple(HEURISTIC_KINDS)
 """Families with test instances: those of the paper."""
@@ -28,12 +28,10 @@ def published_tasks(track: str) -> list[Task]:
 
 
 @cache
-def _test_teammates() -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """Return layout and family -> teammate entries of t0..t4."""
-    found = defaultdict[tuple[str, str], list[dict[str, Any]]](list)
-    for task in (task for track in TRACKS for task in published_tasks(track)):
-        found[task.layout.name, task.teammate_kind].append(task.teammate)
-    return dict(found)
+def _test_tasks() -> dict[tuple[str, str], list[Task]]:
+    """Return layout and family -> tasks with t0..t4."""
+    tasks = (task for track in TRACKS for task in published_tasks(track))
+    return grouped(tasks, lambda task: (task.layout.name, task.teammate_kind))
 
 
 def published_teammates(layout: str, family: str) -> list[dict[str, Any]]:
@@ -41,8 +39,8 @@ def published_teammates(layout: str, family: str) -> list[dict[str, Any]]:
 
     Layouts without test tasks have the parameters that all layouts but cramped_down share.
     """
-    found = _test_teammates()
-    return found.get((layout, family), found["demo_wide", family])
+    found = _test_tasks()
+    return [task.teammate for task in found.get((layout, family), found["demo_wide", family])]
 
 
 def published_task(layout: str, teammate: str) -> Task:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from typing import Any
@@ -17,6 +16,7 @@ from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.tables import Tables
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
 from icrl4aht_generation.experts.padded import own_layout, padded_layout
@@ -110,8 +110,6 @@ REFERENCE_EGOS = {
 
 def stacked_families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
     """Yield policies that share their functions: their numbers, and one policy with stacked parameters."""
-    groups: dict[tuple[Callable, Callable, str], list[int]] = defaultdict(list)
-    for number, policy in enumerate(policies):
-        groups[policy.init, policy.act, policy.sees].append(number)
+    groups = grouped(range(len(policies)), lambda number: policies[number]._replace(params=()))
     for numbers in groups.values():
         yield numbers, policies[numbers[0]]._replace(params=stacked(policies[n].params for n in numbers))
