@@ -94,13 +94,6 @@ def test_paper_profile_has_the_papers_numbers():
     assert set(profile.layouts) == {layout for splits in TRACKS.values() for layout in splits["train"]}
 
 
-def test_paper_profile_keeps_146_episodes():
-    """T = 146 x 100 = 14,600 (paper, App. D.1), though 228 complete updates are 58,368 steps: the 146th
-    episode has its first 100, and the state after them."""
-    assert load_profile("paper").ego.updates == 228
-    assert load_profile("paper").ego.episodes == 146
-
-
 def test_settings_of_an_artefact_are_the_task_the_learner_and_its_ego(changed):
     def settings(profile: Profile, learner: int = 0) -> dict:
         return artefact_settings(profile.units()[-1]._replace(learner=learner), profile)

@@ -240,7 +240,7 @@ class Profile:
             for layout in self.layouts_of(source):
                 own = [task for task in learned if task.layout.name == layout and source != "search"]
                 tasks = [*self._heuristic_tasks(layout, source), *(_of_source(task, source) for task in own)]
-                units += [Work(task, source, learner) for task in tasks for learner in range(self._learners(source))]
+                units += self._works(tasks, source)
         return units
 
     def units_of(self, tasks: Sequence[Task], sources: Mapping[str, str]) -> list[Work]:
@@ -261,11 +261,12 @@ class Profile:
                     f"task {task.task_id}: its source is {source}, those of profile {self.name} are "
                     f"{', '.join(self.sources)}: choose a profile with both, or leave the task out"
                 )
-            units += [Work(task, source, learner) for learner in range(self._learners(source))]
+            units += self._works([task], source)
         return units
 
-    def _learners(self, source: str) -> int:
-        return self.learners if source == "ppo" else 1
+    def _works(self, tasks: Sequence[Task], source: str) -> list[Work]:
+        learners = self.learners if source == "ppo" else 1
+        return [Work(task, source, learner) for task in tasks for learner in range(learners)]
 
     def tasks_on(self, layout: str, source: str) -> int:
         """Return the number of tasks of a source on a layout, if every population has enough good teammates."""

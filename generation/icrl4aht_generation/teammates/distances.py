@@ -351,13 +351,12 @@ def _measured(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[st
     }
 
 
-def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: int = MOST_CHOSEN) -> LayoutSpread:
+def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]]) -> LayoutSpread:
     """Choose teammates of a training layout that differ widely.
 
     Args:
         layout: the layout.
         candidates: entries of heuristic teammates.
-        most: most teammates to choose.
     """
     # Together with the test instances, so that there is one compilation for each family.
     tested, records = instance_entries(layout), common_records(layout, _SPREAD_EPISODES)
@@ -369,7 +368,7 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: i
     headroom = unlike & (np.ptp(returns, axis=1) >= LEAST_HEADROOM)
     usable = np.flatnonzero(headroom if headroom.any() else unlike)
     distances = hamming_distances(actions[usable].reshape(len(usable), -1))
-    order, separations = choose_spread(distances, DIVERSE_DISTANCE, most)
+    order, separations = choose_spread(distances, DIVERSE_DISTANCE, MOST_CHOSEN)
     chosen = [
         SpreadTeammate(
             split="validation" if number % VALIDATES == VALIDATES - 1 else "train",

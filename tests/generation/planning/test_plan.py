@@ -22,7 +22,11 @@ def measured(monkeypatch) -> None:
 
 
 def test_the_papers_numbers(measured):
-    """8 layouts x 80 teammates; populations of 10 members, each with 256 environments."""
+    """8 layouts x 80 teammates; populations of 10 members, each with 256 environments.
+
+    T = 146 x 100 = 14,600 (paper, App. D.1), though 228 complete updates are 58,368 steps: the 146th episode has its
+    first 100, and the state after them.
+    """
     found = plan.estimate_cost(load_profile("paper"), devices=16)
     steps = 228 * 262_144
     assert (found["tasks"], found["environment_steps"]) == (640, 640 * steps)
