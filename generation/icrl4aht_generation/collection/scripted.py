@@ -61,7 +61,7 @@ def scripted_bytes(layout: Layout, config: NoiseConfig) -> int:
 def play_histories(
     work: Work, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
 ) -> None:
-    """Play the histories of a task into a partial artefact, see `collection.job.run_task`."""
+    """Play the histories of a task into a partial artefact, see `collection.job.CollectionJob`."""
     task, config = work.task, profile.scripted_on(work.task.layout.name, work.source)
     layout = None if task.teammate["kind"] == "heuristic" else task.layout
     teammate = build_teammate(layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)

@@ -47,7 +47,7 @@ def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Lea
 def learn_histories(
     work: Work, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
 ) -> None:
-    """Train the ego of a task and record its histories into a partial artefact, see `collection.job.run_task`."""
+    """Train the ego of a task and record its histories into a partial artefact, see `collection.job.CollectionJob`."""
     task, saved = work.task, StateFile(partial / LEARNER, artefact_settings(work, profile) | software_versions())
     learner = make_learner(task, profile, suite)
     first, init, key = saved_progress(saved), jax.jit(learner.init), learner_key(work)
