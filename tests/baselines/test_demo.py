@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 from icrl4aht_baselines import demo
-from icrl4aht_baselines.evaluate.protocols import get_protocol
+from icrl4aht_baselines.evaluate.protocols import controlled_name, get_protocol
 from icrl4aht_baselines.evaluate.results import Result, write_result
-from icrl4aht_baselines.evaluate.segments import controlled_name
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.report import results
 from icrl4aht_baselines.training.options import TrainOptions

@@ -13,15 +13,7 @@ from icrl4aht_baselines.agents import bundled
 from icrl4aht_baselines.agents.bundled import MODELS, bundled_models
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method
-from icrl4aht_baselines.reference import (
-    RECIPES,
-    RL2_HISTORIES,
-    TRACK_VIEWS,
-    ReferenceOutcome,
-    check_taught,
-    make_reference,
-    write_bundled_card,
-)
+from icrl4aht_baselines.reference import RECIPES, RL2_HISTORIES, ReferenceOutcome
 from icrl4aht_baselines.report.results import EvaluationRun
 from icrl4aht_baselines.training.histories import read_trained
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
@@ -46,7 +38,7 @@ def test_recipes_make_the_bundled_models():
         get_method(recipe.method)
         ModelOptions(**recipe.model)
         TrainOptions(**recipe.train)
-        for track, view in TRACK_VIEWS.items():
+        for track, view in reference.TRACK_VIEWS.items():
             HistoryOptions(TRACKS[track]["train"], **recipe.histories, **view)
         config = read_config(MODELS / name / "layout")
         rate = {"learning_rate": reference.OWN_SHARE * recipe.train["learning_rate"]} if recipe.own_round else {}
@@ -64,7 +56,7 @@ def test_unknown_names(tmp_path):
     with pytest.raises(
         OptionError, match=r"rl2-reference learns from no histories.*ad-reference, dpt-reference, ad-rising"
     ):
-        check_taught("rl2-reference")
+        reference.check_taught("rl2-reference")
     command = ["research", "reference", "--name", "rl2-reference", "--out", str(tmp_path / "out"), "--teacher"]
     assert "unknown agent" in run_cli(*command, "rl2-referenc", code=2) and not (tmp_path / "out").exists()
 
@@ -104,7 +96,7 @@ def test_cards_show_returns_and_the_training(tmp_path, monkeypatch):
         ReferenceOutcome("ad-reference", track, tmp_path, {kind: Path(track) / kind for kind in kinds})
         for track in TRACKS
     ]
-    card = write_bundled_card("ad-x", outcomes, tmp_path).read_text(encoding="utf-8")
+    card = reference.write_bundled_card("ad-x", outcomes, tmp_path).read_text(encoding="utf-8")
     assert "| made by | `icrl4aht-data research reference --name ad-reference --bundle-as ad-x` |" in card
     shown = re.findall(r"!\[\w+\]\((.+)\)", card.split("## Curves")[1].split("## Limits")[0])
     assert shown == ["layout/curves.png"]
@@ -135,7 +127,7 @@ def small(monkeypatch, tmp_path) -> Path:
 
 @pytest.mark.slow
 def test_a_model_of_rl2_histories_and_its_own(small):
-    found = make_reference("ad-reference", "layout", small, lambda *shown: None, evaluates=False)
+    found = reference.make_reference("ad-reference", "layout", small, lambda *shown: None, evaluates=False)
     assert found.run == small / "ad-reference-layout" and found.results == {}
     made = {path.name for path in small.iterdir() if path.is_dir() and not path.name.startswith(".")}
     own_round = {f"ad-reference-layout{end}" for end in ("", "-first", "-own", "-mixed")}
@@ -146,5 +138,5 @@ def test_a_model_of_rl2_histories_and_its_own(small):
     own, mixed = (load_icrl4aht(small / f"ad-reference-layout-{name}") for name in ("own", "mixed"))
     assert len(mixed) == len(own) + len(load_icrl4aht(small / "agent-layout"))
     times = {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")}
-    make_reference("ad-reference", "layout", small, lambda *shown: None, evaluates=False)
+    reference.make_reference("ad-reference", "layout", small, lambda *shown: None, evaluates=False)
     assert {path: path.stat().st_mtime_ns for path in small.rglob("*.safetensors")} == times

@@ -1,22 +1,86 @@
-"""Commands of the positive control, of headroom, and of what a release teaches."""
+"""Commands of experiments: the positive control, headroom, best responses, adaptation, and what a release teaches."""
 
 from __future__ import annotations
 
 import sys
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
-from icrl4aht_generation.jobs.options import queue_options, read_queue_options
+from icrl4aht_generation.jobs.options import QueueOptions, queue_options, read_queue_options
 
 from icrl4aht_baselines.commands import options as shared
+from icrl4aht_baselines.training.options import ResponseOptions
 from icrl4aht_data.benchmark.facts import SOURCES
-from icrl4aht_data.commands.dataclass_options import TopicCommand, topic
+from icrl4aht_data.benchmark.tasks import Task
+from icrl4aht_data.commands.dataclass_options import TopicCommand, dataclass_options, topic
 from icrl4aht_data.commands.options import COUNT, Folder, Names, examples
+from icrl4aht_data.errors import EmptySelectionError
 from icrl4aht_data.utils.files import check_output, parse_json, read_text
+from icrl4aht_data.utils.options import replace_options
 from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.proof import PROOF_FILE, proof_table
+
+_STEPS = 8_000_000  # of the training of an informed or episodic ego
+
+
+def _job_options(out: str, card: str) -> tuple[Callable[[Any], Any], ...]:
+    """Return the options of a command that runs a queue of trainings."""
+    return (
+        topic("Machines", queue_options),
+        click.option("--out", type=Folder(), metavar="FOLDER", default=out, help="Write trainings here."),
+        click.option("--bundle", is_flag=True, help=f"Also update {card} of the package's cards."),
+    )
+
+
+def _ego_options(out: str, card: str, *own: Callable[[Any], Any], **default_text: str) -> Callable[[Any], Any]:
+    """Return a decorator with the options of a command that trains egos; `own` are further options of the training."""
+    training = dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text=default_text)
+    seeds = click.option("--seeds", type=COUNT, default=3, help="Trainings of each ego, with different seeds.")
+    topics = topic("Tasks", *shared.tasks_options), topic("Training", *own, seeds, training)
+    return shared.add_options(*topics, *_job_options(out, card))
+
+
+def _prepare_queue(queue: dict[str, Any]) -> QueueOptions:
+    """Return the options of a queue, and prepare this process for its jobs; call before JAX is first used."""
+    options = read_queue_options(queue)
+    from icrl4aht_generation.learners.resume import limit_xla_threads
+
+    limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
+    return options
+
+
+def _run_queue(
+    jobs: Sequence[Any],
+    options: QueueOptions,
+    out: Path,
+    bundle: bool,
+    write: Callable[[Path], Path],
+    table: Callable[[Path], str],
+) -> None:
+    """Run jobs, even if some fail write what the finished ones measured, and print the table of the folder `out`.
+
+    Args:
+        jobs, options: the jobs, and how to run them.
+        out: folder of the trainings.
+        bundle: whether to write the results into the package's cards, too.
+        write: writes the results into a folder, and returns the path of their file.
+        table: returns the table of the results in a folder.
+    """
+    from icrl4aht_generation.jobs.queue import run_jobs
+    from rich.console import Console
+
+    console = Console(soft_wrap=True)
+    try:
+        run_jobs(jobs, out, console, options)
+    finally:
+        for folder in (out, card_file("headroom.json").parent)[: 1 + bundle]:
+            console.print(f"wrote {write(folder)}")
+        click.echo(table(out))
 
 
 @click.command("control")
@@ -75,6 +139,126 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
         click.echo(f"wrote {path}")
 
 
+def _model_returns() -> dict[str, dict[str, float]]:
+    """Return model -> task id -> mean return, of the stored results of models on test tasks.
+
+    Results of controls do not count, in which an ego's memory is cleared or another teammate plays.
+    """
+    from icrl4aht_baselines.report.comparison import read_stored, results_file
+    from icrl4aht_baselines.report.results import bundled_by_id, task_label
+
+    ids, stored = {task_label(task): task for task in bundled_by_id("test")}, read_stored(results_file())
+    return {
+        agent: {
+            ids[task]: float(values.mean())
+            for of in cells.values()
+            for task, values in zip(of.tasks, of.mean, strict=True)
+        }
+        for agent, cells in stored.with_other_ways(stored.returns()).items()
+    }
+
+
+@click.command(
+    "best-response",
+    cls=TopicCommand,
+    epilog=examples(
+        "icrl4aht-data best-response --layout demo_wide --family H3 --seeds 1 --steps 100000 --out runs/small",
+        "icrl4aht-data best-response --split test --split validation --workers 2 --bundle",
+    ),
+)
+@_ego_options(
+    "runs/best-responses",
+    "best_responses.json",
+    click.option(
+        "--init",
+        "inits",
+        type=Names("start", lambda: ("oracle", "rl2-reference")),
+        multiple=True,
+        default=("oracle",),
+        help="Start from random parameters and imitate the oracle at first (oracle), or from a bundled model as well; "
+        "repeat for both.",
+    ),
+)
+def best_response_command(
+    inits: tuple[str, ...],
+    seeds: int,
+    training: dict[str, Any],
+    queue: dict[str, Any],
+    out: Path,
+    bundle: bool,
+    **choice: Any,
+) -> None:
+    """Train a best response to each teammate.
+
+    An ego with the benchmark's own view learns with one teammate alone, by PPO that imitates the oracle in its first
+    half. Teammates that act alike share one. Tasks in which the oracle earns no more than `stay` are left out. The
+    best training is chosen on other episodes than those reported; a stored model that earns more takes its place.
+    Writes OUT/best_responses.json and prints it; finished trainings are kept, stopped ones resume. Where the return
+    still rises in the last quarter, give more --steps.
+    """
+    options = _prepare_queue(queue)
+    from icrl4aht_baselines.online.responses import (
+        ResponseJob,
+        find_behaviours,
+        responses_table,
+        with_headroom,
+        write_responses,
+    )
+
+    tasks = with_headroom(shared.chosen_tasks(**choice))
+    if not tasks:
+        raise EmptySelectionError("none of these tasks has headroom; choose others")
+    behaviours = find_behaviours(tasks)
+    click.echo(f"{len(tasks)} tasks with headroom, {len(behaviours)} behaviours")
+    settings = [ResponseOptions(**training, init=None if init == "oracle" else init) for init in inits]
+    jobs = [ResponseJob(one, seed, own, out) for seed in range(seeds) for own in settings for one in behaviours]
+
+    def write(folder: Path) -> Path:
+        return write_responses(jobs, folder, _model_returns())
+
+    _run_queue(jobs, options, out, bundle, write, responses_table)
+
+
+@click.command(
+    "adaptation-headroom",
+    cls=TopicCommand,
+    epilog=examples(
+        "icrl4aht-data adaptation-headroom --layout demo_wide --seeds 1 --steps 100000 --out runs/small",
+        "icrl4aht-data adaptation-headroom --track preference --workers 2 --bundle",
+    ),
+)
+@_ego_options(
+    "runs/adaptation",
+    "adaptation.json",
+    click.option("--together", is_flag=True, help="One ego for all layouts instead of one for each."),
+    steps=f"{_STEPS:,}",
+)
+def adaptation_headroom_command(
+    together: bool,
+    seeds: int,
+    training: dict[str, Any],
+    queue: dict[str, Any],
+    out: Path,
+    bundle: bool,
+    **choice: Any,
+) -> None:
+    """Estimate what memory across episodes can earn.
+
+    Trains two egos on the tasks of each layout: one that is told in every step which task it plays, and one that has to
+    find out in each episode. Prints the difference of their returns with an interval over the seeds. Both learn for
+    --steps only, so it is an estimate. Writes OUT/adaptation.json; finished trainings are kept, stopped ones resume.
+    """
+    options = _prepare_queue(queue)
+    from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
+
+    sets: dict[str, list[Task]] = defaultdict(list)
+    for task in shared.chosen_tasks(**choice):
+        where = "all" if together else task.layout.name
+        sets["-".join((task.track, task.split, where, *choice["families"]))].append(task)
+    jobs = headroom_jobs(sets, seeds, replace_options(ResponseOptions(_STEPS), training), out)
+    _run_queue(jobs, options, out, bundle, partial(write_adaptation, jobs), adaptation_table)
+
+
 @click.command(
     "proof",
     cls=TopicCommand,
@@ -97,9 +281,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
     show_default="all three",
 )
 @click.option("--seeds", type=COUNT, default=3, help="Trainings of each, with different seeds.")
-@topic("Machines", queue_options)
-@click.option("--out", type=Folder(), metavar="FOLDER", default="runs/proof", help="Write trainings here.")
-@click.option("--bundle", is_flag=True, help="Also update proof.json of the package's cards.")
+@shared.add_options(*_job_options("runs/proof", PROOF_FILE))
 def proof_command(
     root: Any,
     histories: tuple[str, ...],
@@ -116,21 +298,17 @@ def proof_command(
     rl2-reference. About 35 minutes each on one core. Writes OUT/proof.json, which the release's card shows; finished
     trainings are kept, stopped ones resume.
     """
-    options = read_queue_options(queue)
-    from icrl4aht_generation.jobs.queue import run_jobs
-    from icrl4aht_generation.learners.resume import limit_xla_threads
-    from rich.console import Console
-
+    options = _prepare_queue(queue)
     from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof
 
-    limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
-    chosen, console = ProofOptions(root and str(root)), Console(soft_wrap=True)
+    chosen = ProofOptions(root and str(root))
     models = [(source, name) for source in histories for name in learner or LEARNERS]
     jobs = [ProofJob(source, name, seed, chosen, out) for seed in range(seeds) for source, name in models]
     references = run_references(chosen, out)
-    try:
-        run_jobs(jobs, out, console, options)
-    finally:
-        for folder in (out, card_file("headroom.json").parent)[: 1 + bundle]:
-            console.print(f"wrote {write_proof(jobs, references, folder / PROOF_FILE)}")
-        click.echo(proof_table(parse_json(read_text(out / PROOF_FILE))))
+
+    def write(folder: Path) -> Path:
+        return write_proof(jobs, references, folder / PROOF_FILE)
+
+    _run_queue(
+        jobs, options, out, bundle, write, lambda folder: proof_table(parse_json(read_text(folder / PROOF_FILE)))
+    )

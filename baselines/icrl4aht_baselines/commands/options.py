@@ -150,9 +150,9 @@ def chosen_tasks(
     return chosen
 
 
-def add_options(command: Any, options: Iterable[Callable[[Any], Any]]) -> Any:
-    """Return a command with options, which its help lists in this order."""
-    return functools.reduce(lambda decorated, option: option(decorated), reversed([*options]), command)
+def add_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a decorator that adds options, which a command's help lists in this order."""
+    return lambda command: functools.reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
 manifests_option = click.option(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +53,7 @@ from icrl4aht_data.utils.text import counted_noun
     "all but the last 20 episodes, into OUT/swapped. Prints what memory (M) and the right partner (P) are worth.",
 )
 @shared.protocol_option
-@functools.partial(shared.add_options, options=shared.tasks_options)
+@shared.add_options(*shared.tasks_options)
 @click.option("--tasks", type=COUNT, help="Most tasks of each cell, a layout with a teammate family: 2 are two a cell.")
 @click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
 @shared.suite_option
@@ -85,11 +84,9 @@ def evaluate_command(
     training nor test. Split diverse has validation tasks with more kinds of teammates than the published training
     ranges.
     """
-    from icrl4aht_baselines.evaluate.controls import evaluate_controls
-    from icrl4aht_baselines.evaluate.evaluator import evaluate
-    from icrl4aht_baselines.evaluate.programs import Programs
-    from icrl4aht_baselines.evaluate.protocols import get_protocol, hidden_recipe_note, limit_tasks
-    from icrl4aht_baselines.evaluate.segments import CONTROLS
+    from icrl4aht_baselines.evaluate.evaluator import evaluate, evaluate_controls
+    from icrl4aht_baselines.evaluate.protocols import CONTROLS, get_protocol, hidden_recipe_note, limit_tasks
+    from icrl4aht_baselines.evaluate.rollout import Programs
     from icrl4aht_baselines.report.page import summary_lines
     from icrl4aht_baselines.report.results import note_results, read_run
     from icrl4aht_baselines.report.scores import control_lines

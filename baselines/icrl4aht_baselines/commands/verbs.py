@@ -2,8 +2,8 @@
 
 from icrl4aht_data.commands.verbs import Verb
 
-_CLI, _MODELS, _LAB, _ADAPT = (
-    f"icrl4aht_baselines.commands.{name}_commands" for name in ("train", "model", "experiment", "adaptation")
+_CLI, _MODELS, _LAB, _PLAY = (
+    f"icrl4aht_baselines.commands.{name}_commands" for name in ("train", "model", "experiment", "play")
 )
 _TRAIN, _CHECKS = "Train and evaluate", "Reference models and checks"
 
@@ -16,17 +16,12 @@ VERBS = (
     Verb("submit", f"{_MODELS}:submit_command", _TRAIN, "Make a file of results for the page of `results`."),
     Verb("models", f"{_MODELS}:models_command", _TRAIN, "List the bundled models."),
     Verb("watch", f"{_CLI}:watch_command", _TRAIN, "Play an episode and draw it as a GIF."),
-    Verb(
-        "play",
-        "icrl4aht_baselines.commands.play_commands:play_command",
-        _TRAIN,
-        "Play on a web page with a policy or a person.",
-    ),
+    Verb("play", f"{_PLAY}:play_command", _TRAIN, "Play on a web page with a policy or a person."),
     Verb("collect", f"{_MODELS}:collect_command", _TRAIN, "Record histories of an agent with a release's teammates."),
-    Verb("best-response", f"{_ADAPT}:best_response_command", _TRAIN, "Train a best response to each teammate."),
+    Verb("best-response", f"{_LAB}:best_response_command", _TRAIN, "Train a best response to each teammate."),
     Verb(
         "adaptation-headroom",
-        f"{_ADAPT}:adaptation_headroom_command",
+        f"{_LAB}:adaptation_headroom_command",
         _TRAIN,
         "Estimate what memory across episodes can earn.",
     ),

@@ -3,8 +3,7 @@
 import sys
 
 from icrl4aht_baselines import CallablePackage
-from icrl4aht_baselines.evaluate.controls import ControlledResults, evaluate_controls
-from icrl4aht_baselines.evaluate.evaluator import evaluate
+from icrl4aht_baselines.evaluate.evaluator import ControlledResults, evaluate, evaluate_controls
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, Protocol, get_protocol, test_tasks
 from icrl4aht_baselines.evaluate.results import Result
 

@@ -2,7 +2,8 @@
 
 A task is 100 episodes of 100 steps in sequence. The ego's memory lasts for the task, the teammate's for an episode. An
 episode's key is a function of (seed, task_id, episode) alone, so a task's result does not depend on what else is
-evaluated in the same batch or process.
+evaluated in the same batch or process. The controls of memory and partner show how much an ego earns by remembering its
+earlier episodes with the same teammate.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from threading import Event
@@ -22,20 +24,28 @@ import jax.numpy as jnp
 import numpy as np
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.teammates.registry import build_teammate, check_theta, with_equal_parameters
+from jaxtyping import Float
 
 from icrl4aht_baselines.agents.egos import SCRIPTED
 from icrl4aht_baselines.agents.host import HostPolicy
-from icrl4aht_baselines.evaluate.programs import EpisodeProgram, Programs
-from icrl4aht_baselines.evaluate.protocols import Protocol, get_protocol
-from icrl4aht_baselines.evaluate.results import Result, find_results, write_result
-from icrl4aht_baselines.evaluate.rollout import EpisodeBatch, EvaluationRollout, RolloutState, task_key
-from icrl4aht_baselines.evaluate.segments import (
+from icrl4aht_baselines.evaluate.protocols import (
     CONTROLS,
     Control,
     PlannedTask,
+    Protocol,
     controlled_name,
+    get_protocol,
     plan_tasks,
     segment_lengths,
+)
+from icrl4aht_baselines.evaluate.results import Result, find_results, write_result
+from icrl4aht_baselines.evaluate.rollout import (
+    EpisodeBatch,
+    EpisodeProgram,
+    EvaluationRollout,
+    Programs,
+    RolloutState,
+    task_key,
 )
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, check_choice
@@ -345,3 +355,66 @@ def play_episodes(
             raise OptionError(f"the ego failed on {rollout.layout}: {error}") from error
         yield played
     return state
+
+
+class ControlledResults(NamedTuple):
+    """Results of an ego and of its controls: U tasks with S seeds, equal episodes with equal random keys.
+
+    Attributes:
+        plain: results of the ego.
+        cleared: those with its memory cleared before each episode.
+        swapped: those in which another task's teammate plays all episodes but the last ones.
+        last: number of these last episodes.
+    """
+
+    plain: list[Result]
+    cleared: list[Result]
+    swapped: list[Result]
+    last: int
+
+    @property
+    def memory(self) -> Float[np.ndarray, "U S"]:
+        """M: return minus return with the memory cleared before each episode, mean over all episodes."""
+        return (_returns(self.plain) - _returns(self.cleared)).mean(axis=-1)
+
+    @property
+    def partner(self) -> Float[np.ndarray, "U S"]:
+        """P: return in the last episodes minus return in them after episodes with another teammate."""
+        return (_returns(self.plain) - _returns(self.swapped))[..., -self.last :].mean(axis=-1)
+
+
+def _returns(results: Sequence[Result]) -> Float[np.ndarray, "U S E"]:
+    return np.array([result.returns for result in results], np.float64)
+
+
+def evaluate_controls(
+    agent: str,
+    make_ego: MakeEgo,
+    tasks: Sequence[Task],
+    protocol: Protocol | str = "seeded",
+    *,
+    out: Path | None = None,
+    programs: Programs | None = None,
+    **options: Any,
+) -> ControlledResults:
+    """Evaluate an ego and its controls, see `protocols.CONTROLS`.
+
+    Args:
+        agent, make_ego, tasks, protocol, programs: see `evaluate`.
+        out: folder of the ego's results; those of the controls are in its folders `cleared` and `swapped`.
+        options: `seeds`, `suite` and `details` of `evaluate`.
+
+    Raises:
+        OptionError: as `evaluate`; if a task has no partner, if there are less than 2 episodes, or if the protocol
+            swaps teammates.
+    """
+    rules = protocol if isinstance(protocol, Protocol) else get_protocol(protocol)
+    plan_tasks(tasks, rules, "swapped")  # fails before hours of work
+    # Equal egos share compiled programs, and an adapter makes new functions each time it is called.
+    make = make_ego if make_ego in SCRIPTED else cache(make_ego)
+    options["programs"] = Programs() if programs is None else programs
+    results = {
+        control: evaluate(agent, make, tasks, rules, control=control, out=out and out / (control or ""), **options)
+        for control in (None, *CONTROLS)
+    }
+    return ControlledResults(results[None], results["cleared"], results["swapped"], rules.last_episodes)

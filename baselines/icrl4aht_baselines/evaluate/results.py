@@ -23,7 +23,7 @@ class Result:
         task_id: id of the task.
         settings: agent, seeds, protocol, version and details that the result depends on.
         returns: return of the team in each episode: one list per seed with one number per episode.
-        partners: ids of the tasks that the teammates of each segment come from, see `evaluate.segments`; empty if the
+        partners: ids of the tasks that the teammates of each segment come from, see `evaluate.protocols`; empty if the
             task's own teammate played all episodes.
     """
 

@@ -34,9 +34,8 @@ from jaxtyping import Array, Float, Int, Int8
 
 from icrl4aht_baselines.agents.egos import NamedEgo
 from icrl4aht_baselines.evaluate.evaluator import prepare_rollout
-from icrl4aht_baselines.evaluate.programs import Programs
-from icrl4aht_baselines.evaluate.protocols import get_protocol
-from icrl4aht_baselines.evaluate.segments import segment_lengths
+from icrl4aht_baselines.evaluate.protocols import get_protocol, segment_lengths
+from icrl4aht_baselines.evaluate.rollout import Programs
 from icrl4aht_baselines.online.teammates import check_heuristics
 from icrl4aht_baselines.training.run_folder import check_same_settings
 from icrl4aht_data.benchmark.facts import KEPT_STEPS

@@ -15,8 +15,8 @@ from icrl4aht_generation.teammates.spread import find_measured
 
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
-from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup, chosen_teammates, make_groups
-from icrl4aht_baselines.online.teammates import check_heuristics, mixed_chances, with_behaviours
+from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup, make_group, make_groups
+from icrl4aht_baselines.online.teammates import check_heuristics
 from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cells
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import TASKS_SOURCE
@@ -87,7 +87,9 @@ def prepare_play(
     # Canonical channels, because one network plays all of the layouts.
     method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
     hidden = [get_layout(one).name for one in histories.hide_recipe]
-    groups, played = _groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
+    groups = _groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
+    # With few tasks some teammates play in no group: the record of training data must not name them.
+    played = {task for group in groups for task in group.ids}
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
         "model": asdict(model),
@@ -180,10 +182,8 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
 
 def _groups(
     teammates: _Teammates, shares: Mapping[str, float], hidden: Sequence[str], play: PlayOptions, tasks: int
-) -> tuple[list[TaskGroup], set[str]]:
-    """Return the groups of tasks, and the ids of the tasks whose teammates play in them.
-
-    With few tasks, some teammates play in no group: the record of training data must not name them.
+) -> list[TaskGroup]:
+    """Return the groups of tasks.
 
     Args:
         teammates: the training teammates.
@@ -208,20 +208,15 @@ def _groups(
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
     rearranged = {layout: REARRANGED_SHARE * shares[layout.name] for layout in heuristics if play.rearranged}
     fixed = round(tasks * total / (total + sum(rearranged.values())))
-    policies = {key: [mate.policy for mate in found.values()] for key, found in everywhere.items()}
-    groups = make_groups(policies, fixed, shares, hidden)
-    played: set[str] = set()
-    for group in groups:
-        # The same choice that `make_groups` made of the policies, which do not know their tasks.
-        ids = list(everywhere[group.layouts[0], group.family])
-        played |= {ids[number] for number in chosen_teammates(len(ids), len(group.teammates))}
+    groups = make_groups({key: _policies(mates) for key, mates in everywhere.items()}, fixed, shares, hidden)
     for layout, share in rearranged.items():
         count = round((tasks - fixed) * share / sum(rearranged.values()))
-        kinds = heuristics[layout]
-        for group, ids in _rearranged_groups(layout, kinds, count, play.rearranged, layout.name in hidden):
-            groups.append(group)
-            played |= ids
-    return groups, played
+        groups += _rearranged_groups(layout, heuristics[layout], count, play.rearranged, layout.name in hidden)
+    return groups
+
+
+def _policies(mates: Mapping[str, _Teammate]) -> dict[str, Policy]:
+    return {task: mate.policy for task, mate in mates.items()}
 
 
 def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Teammate]]]:
@@ -252,8 +247,8 @@ def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Team
 
 def _rearranged_groups(
     layout: Layout, kinds: Mapping[str, dict[str, _Teammate]], tasks: int, versions: int, hidden: bool
-) -> Iterator[tuple[TaskGroup, set[str]]]:
-    """Yield a group of each kind of teammates on rearranged versions of a layout, and the tasks of its teammates.
+) -> Iterator[TaskGroup]:
+    """Yield a group of each kind of teammates on rearranged versions of a layout.
 
     The versions are divided equally among the kinds, and the tasks of a kind among its versions, at least one each.
     """
@@ -266,9 +261,7 @@ def _rearranged_groups(
         count = max(len(own), round(tasks * len(own) / versions))
         # In turn, so that the numbers of tasks of two versions differ by one at most.
         where = [own[task % len(own)] for task in range(count)]
-        chosen = [list(mates)[number] for number in chosen_teammates(len(mates), count)]
-        policies = with_behaviours([mates[task_id].policy for task_id in chosen], mixed_chances(count))
-        yield TaskGroup(where, kind, policies, hidden, f"{layout.name} rearranged"), set(chosen)
+        yield make_group(where, kind, _policies(mates), hidden, f"{layout.name} rearranged")
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:

@@ -91,6 +91,7 @@ class TaskGroup:
         hidden: whether the model does not see recipe indicators.
         label: the layouts' name in the log.
         partners: number of each task's teammate, for a model that is told; None for others.
+        ids: ids of the tasks of a release or a manifest whose teammates play, where that is recorded.
     """
 
     layouts: Sequence[Layout]
@@ -99,6 +100,7 @@ class TaskGroup:
     hidden: bool
     label: str
     partners: Sequence[int] | None = None
+    ids: Sequence[str] = ()
 
     @property
     def name(self) -> str:
@@ -107,7 +109,7 @@ class TaskGroup:
 
 
 def make_groups(
-    teammates: Mapping[tuple[Layout, str], Sequence[Policy]],
+    teammates: Mapping[tuple[Layout, str], Mapping[str, Policy]],
     tasks: int,
     shares: Mapping[str, float],
     hidden: Collection[str] = (),
@@ -115,7 +117,7 @@ def make_groups(
     """Divide tasks among layouts by their shares, and equally among the families of each layout.
 
     Args:
-        teammates: layout and family -> training teammates; see `chosen_teammates` for those of each task.
+        teammates: layout and family -> task id -> training teammate; see `chosen_teammates` for those that play.
         tasks: number of all tasks; the result has a few fewer or more, at least one in each group.
         shares: name of each of these layouts -> its share.
         hidden: names of layouts whose recipe indicators the model does not see.
@@ -127,10 +129,23 @@ def make_groups(
     groups = []
     for (layout, family), policies in teammates.items():
         count = max(1, round(tasks * shares[layout.name] / total / families[layout.name]))
-        chosen = [policies[number] for number in chosen_teammates(len(policies), count)]
-        mates = with_behaviours(chosen, mixed_chances(count))
-        groups.append(TaskGroup([layout] * count, family, mates, layout.name in hidden, layout.name))
+        groups.append(make_group([layout] * count, family, policies, layout.name in hidden, layout.name))
     return groups
+
+
+def make_group(
+    layouts: Sequence[Layout], family: str, teammates: Mapping[str, Policy], hidden: bool, label: str
+) -> TaskGroup:
+    """Return tasks on some layouts with chosen teammates, which do not always follow their script.
+
+    Args:
+        layouts, family, hidden, label: see `TaskGroup`.
+        teammates: task id -> training teammate.
+    """
+    names = list(teammates)
+    ids = [names[number] for number in chosen_teammates(len(names), len(layouts))]
+    mates = with_behaviours([teammates[task] for task in ids], mixed_chances(len(layouts)))
+    return TaskGroup(layouts, family, mates, hidden, label, ids=ids)
 
 
 def chosen_teammates(teammates: int, tasks: int) -> np.ndarray:

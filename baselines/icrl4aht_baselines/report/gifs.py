@@ -12,8 +12,7 @@ import numpy as np
 
 from icrl4aht_baselines.agents.egos import AGENTS, PlayMode, find_agent
 from icrl4aht_baselines.evaluate.evaluator import MakeEgo, play_tasks
-from icrl4aht_baselines.evaluate.protocols import Protocol
-from icrl4aht_baselines.evaluate.segments import controlled_name
+from icrl4aht_baselines.evaluate.protocols import Protocol, controlled_name
 from icrl4aht_baselines.report.results import EvaluationRun, ResultCell, ResultSource
 from icrl4aht_baselines.report.scores import known_headroom
 from icrl4aht_baselines.training.seen import describe_overlap

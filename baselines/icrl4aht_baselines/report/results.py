@@ -3,7 +3,7 @@
 A table of results is a data frame with a row for each task, seed and block of episodes:
 
     agent, training     name of the agent; number of its training, for several with different seeds
-    protocol, control   name of the protocol; empty, or one of `segments.CONTROLS`
+    protocol, control   name of the protocol; empty, or one of `protocols.CONTROLS`
     layout, family, kind    the cell of the task, see `ResultCell`
     overlap             overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
     task, seed          key of the task, see `task_label`; seed

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from icrl4aht_baselines.evaluate.controls import ControlledResults
+from icrl4aht_baselines.evaluate.evaluator import ControlledResults
 from icrl4aht_baselines.evaluate.protocols import EVALUATION_SPLITS
 from icrl4aht_baselines.report.results import (
     CELL_COLUMNS,

@@ -18,9 +18,8 @@ from msgspec import Meta
 
 from icrl4aht_baselines.agents.bundled import bundled_models
 from icrl4aht_baselines.agents.egos import AGENTS, OTHER_WAYS
-from icrl4aht_baselines.evaluate.protocols import bundled_tasks, get_protocol
+from icrl4aht_baselines.evaluate.protocols import CONTROLS, bundled_tasks, get_protocol
 from icrl4aht_baselines.evaluate.results import RESULTS, Result
-from icrl4aht_baselines.evaluate.segments import CONTROLS
 from icrl4aht_baselines.report.results import EvaluationRun, as_run, find_seen, read_results
 from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_data.benchmark.best_responses import read_best_responses
@@ -65,7 +64,7 @@ class Evaluation(msgspec.Struct, forbid_unknown_fields=True):
     """Results of a folder that `evaluate` made.
 
     Attributes:
-        control: empty; or the control, see `segments.CONTROLS`, or the way of playing, see `egos.OTHER_WAYS`, of
+        control: empty; or the control, see `protocols.CONTROLS`, or the way of playing, see `egos.OTHER_WAYS`, of
             results that are shown next to the agent's own.
         training: number of the agent's training, for several with different seeds.
         settings: settings of the results, see `evaluate.results.Result`, with `trained_on` among the details.

@@ -13,11 +13,9 @@ from icrl4aht_baselines.agents.egos import NamedEgo, stay
 from icrl4aht_baselines.agents.host import from_host
 from icrl4aht_baselines.evaluate import ControlledResults, evaluate_controls
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_tasks
-from icrl4aht_baselines.evaluate.programs import Programs
-from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
+from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol, plan_tasks, segment_lengths
 from icrl4aht_baselines.evaluate.results import Result
-from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, task_key
-from icrl4aht_baselines.evaluate.segments import plan_tasks, segment_lengths
+from icrl4aht_baselines.evaluate.rollout import EvaluationRollout, Programs, task_key
 from icrl4aht_baselines.report.results import read_run
 from icrl4aht_baselines.report.scores import control_lines
 from icrl4aht_generation.policy import Policy
@@ -264,8 +262,7 @@ def test_controls_command(programs, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "icrl4aht_baselines.commands.train_commands.find_ego", lambda option, name, **mode: NamedEgo(name, ego(PAID))
     )
-    for module in ("controls", "evaluator"):
-        monkeypatch.setattr(f"icrl4aht_baselines.evaluate.{module}.Programs", lambda: programs)
+    monkeypatch.setattr("icrl4aht_baselines.evaluate.evaluator.Programs", lambda: programs)
     write_tasks(tmp_path / "two.jsonl", TASKS)
 
     def run(folder, *options, code=0):

@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 from icrl4aht_baselines.agents.egos import AGENTS, NamedEgo, stay
 from icrl4aht_baselines.online import agent_histories
-from icrl4aht_baselines.online.agent_histories import (
-    Teammates,
-    collect_release,
-    plan_swaps,
-    record_histories,
-    release_teammates,
-    with_noise,
-)
+from icrl4aht_baselines.online.agent_histories import Teammates, collect_release, release_teammates
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
@@ -113,12 +106,12 @@ def test_another_agent_labels(dataset):
 
     tasks = release_teammates(dataset).tasks[:1]
     config = NoiseConfig(1, 10, start=(0.0, 0.0))
-    found = record_histories(idle, tasks, config, make_labeller=counts)
+    found = agent_histories.record_histories(idle, tasks, config, make_labeller=counts)
     assert (found.actions == STAY).all()
     # The first step has no previous action; later ones follow a "stay".
     np.testing.assert_array_equal(found.expert_actions[0], (1 + np.maximum(np.arange(1000) - 1, 0)) % 6)
     with pytest.raises(OptionError, match="the labeller takes state, expected ego_input, as the agent does"):
-        with_noise(idle(None), 10, AGENTS["oracle"](tasks[0].layout))
+        agent_histories.with_noise(idle(None), 10, AGENTS["oracle"](tasks[0].layout))
 
 
 def test_teammates_of_other_tasks_are_played_as_well(dataset):
@@ -151,7 +144,7 @@ def test_a_stopped_collection_resumes(release, teammates, tmp_path, monkeypatch)
         played.append(tasks[0].layout.name)
         return original(make, tasks, *args)
 
-    original, target = record_histories, tmp_path / "release"
+    original, target = agent_histories.record_histories, tmp_path / "release"
     monkeypatch.setattr(agent_histories, "record_histories", record)
     with monkeypatch.context() as patch:
         patch.setattr(agent_histories, "write_release", killed_in_the_end)
@@ -183,7 +176,7 @@ def test_swapped_teammates_play_in_turn(release, teammates, tmp_path):
 
 def test_whom_teammates_take_turns_with(teammates):
     tasks = teammates.tasks
-    swaps = plan_swaps(tasks, 10, 3)
+    swaps = agent_histories.plan_swaps(tasks, 10, 3)
     assert swaps.keys() == {task.task_id for task in tasks}
     split = {teammate_id(task.teammate): task.split for task in tasks}
     for task in tasks:
@@ -191,9 +184,9 @@ def test_whom_teammates_take_turns_with(teammates):
         assert played[0] == teammate_id(task.teammate) and len(set(played)) == len(played) <= 4
         assert {split[one] for one in played} == {task.split}
     with pytest.raises(OptionError, match=r"swap = 10: expected 1 to 9, since a history has 10 episodes"):
-        plan_swaps(tasks, 10, 10)
+        agent_histories.plan_swaps(tasks, 10, 10)
     with pytest.raises(OptionError, match=f"swap = 3: none of the 1 tasks, such as {tasks[0].task_id}, has another"):
-        plan_swaps(tasks[:1], 10, 3)
+        agent_histories.plan_swaps(tasks[:1], 10, 3)
 
 
 @pytest.mark.slow

@@ -9,22 +9,9 @@ import numpy as np
 import pytest
 from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 from icrl4aht_baselines.evaluate.protocols import test_tasks as tasks_of
-from icrl4aht_baselines.online.adaptation import (
-    HeadroomJob,
-    adaptation_table,
-    headroom_jobs,
-    write_adaptation,
-)
-from icrl4aht_baselines.online.responses import (
-    ResponseJob,
-    ResponseOptions,
-    best_of,
-    find_behaviours,
-    responses_table,
-    trained_response,
-    with_headroom,
-    write_responses,
-)
+from icrl4aht_baselines.online import responses
+from icrl4aht_baselines.online.adaptation import HeadroomJob, adaptation_table, headroom_jobs, write_adaptation
+from icrl4aht_baselines.online.responses import ResponseJob, ResponseOptions
 
 from icrl4aht_data.benchmark.best_responses import read_best_responses
 from icrl4aht_data.errors import OptionError
@@ -38,18 +25,18 @@ DEMO = tasks_of("teammate", "demo_wide")
 def test_tasks_with_headroom():
     """Test cells count as measured, validation tasks as their draws were."""
     flat = {task.layout.name for task in tasks_of("teammate")} - {
-        task.layout.name for task in with_headroom(tasks_of("teammate"))
+        task.layout.name for task in responses.with_headroom(tasks_of("teammate"))
     }
     assert flat == {"coord_simple", "test_simple"}
     validation = bundled_tasks("teammate", "validation")
-    assert 0 < len(with_headroom(validation)) < len(validation)
+    assert 0 < len(responses.with_headroom(validation)) < len(validation)
 
 
 @pytest.mark.slow
 def test_teammates_that_act_alike_share_a_best_response():
     """H4's instances are one behaviour on test_wide, H3's are five."""
     tasks = [task for family in ("H3", "H4") for task in tasks_of("teammate", "test_wide", family)]
-    assert [len(alike) for alike in find_behaviours(tasks)] == [1] * 5 + [5]
+    assert [len(alike) for alike in responses.find_behaviours(tasks)] == [1] * 5 + [5]
 
 
 def finished(job, choice: float, earned: float, slope: float = 0.0) -> None:
@@ -66,26 +53,25 @@ def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
     assert not any(job.is_finished() for job in jobs)
     finished(jobs[0], choice=10.0, earned=9.0)
     finished(jobs[1], choice=8.0, earned=20.0)
-    entry = best_of(behaviour, map(trained_response, jobs[:2]))
+    entry = responses.best_of(behaviour, map(responses.trained_response, jobs[:2]))
     assert (entry.best, entry.agent) == (9.0, "best response, seed 0")
     assert [one.acting for one in entry.seeds] == ["greedy"] * 2
-    path = write_responses(jobs[:1], tmp_path)
+    path = responses.write_responses(jobs[:1], tmp_path)
     first = read_best_responses(path)
-    assert first.behaviours == (best_of(behaviour, [trained_response(jobs[0])]),)
-    write_responses(jobs[1:], tmp_path)  # the first training is kept
+    assert first.behaviours == (responses.best_of(behaviour, [responses.trained_response(jobs[0])]),)
+    responses.write_responses(jobs[1:], tmp_path)  # the first training is kept
     second = read_best_responses(path)
     assert second.behaviours == (entry,)
     assert second.version != first.version
     models = {"better": {DEMO[0].task_id: 9.5}, "worse": {DEMO[0].task_id: 8.0}, "elsewhere": {"other": 50.0}}
-    write_responses(jobs, tmp_path, models)
+    responses.write_responses(jobs, tmp_path, models)
     (third,) = read_best_responses(path).behaviours
     assert (third.best, third.agent, third.seeds) == (9.5, "better", entry.seeds)
-    assert "| demo_wide | test | H1 t0 | 9.5 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |" in responses_table(
-        tmp_path
-    )
+    row = "| demo_wide | test | H1 t0 | 9.5 | better | 9.0 to 20.0 | 2 | 400 | 128 | +0.0 |"
+    assert row in responses.responses_table(tmp_path)
     pair = ResponseJob((DEMO[0], DEMO[1]), 0, TINY, tmp_path / "pair")
     finished(pair, choice=1.0, earned=1.0)
-    write_responses([pair], tmp_path)
+    responses.write_responses([pair], tmp_path)
     assert [one.tasks for one in read_best_responses(path).behaviours] == [(DEMO[0].task_id, DEMO[1].task_id)]
     other = ResponseJob(behaviour, 0, replace(TINY, steps=800), tmp_path)
     assert not other.is_finished()  # a result of other settings

@@ -55,8 +55,8 @@ PLAY = PlayOptions(epochs=1, minibatches=2, task_end=0.5, imitation_end=1.0)
 METHOD = get_method("rl2")(MODEL, overcooked_world([LAYOUT], "mlp", canonical=True))
 
 
-def teammates(count: int) -> list[Any]:
-    return [build_teammate(LAYOUT, sample_teammate("assembly_line", k, "train")) for k in range(count)]
+def teammates(count: int) -> dict[str, Policy]:
+    return {f"task {k}": build_teammate(LAYOUT, sample_teammate("assembly_line", k, "train")) for k in range(count)}
 
 
 @pytest.fixture(scope="module")
@@ -242,7 +242,7 @@ class TestGroups:
 
     def test_behaviours(self):
         """The behaviour `stay` never moves; `script` plays like the teammate itself."""
-        (base,) = teammates(1)
+        (base,) = teammates(1).values()
         mates = with_behaviours([base] * len(BEHAVIOURS), np.eye(len(BEHAVIOURS), dtype=np.float32))
         (plain,), taken = played_actions([base]), dict(zip(BEHAVIOURS, played_actions(mates), strict=True))
         assert (taken["stay"] == STAY).all()

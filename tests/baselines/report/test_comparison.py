@@ -10,34 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from icrl4aht_baselines.report import comparison
-from icrl4aht_baselines.report.comparison import (
-    RESULTS_FILES,
-    StoredResults,
-    add_scales,
-    add_submission,
-    agents_table,
-    controls_table,
-    describe_lead,
-    describe_trainings,
-    figure_layouts,
-    layouts_table,
-    mean_best,
-    read_stored,
-    render_comparison,
-    results_file,
-    write_comparison,
-    write_stored,
-)
-from icrl4aht_baselines.report.scores import cell_scales
+from icrl4aht_baselines.report.comparison import StoredResults
+from icrl4aht_baselines.report.scores import add_scales, cell_scales
 from icrl4aht_baselines.report.submission import AgentFacts, make_submission
 
 from icrl4aht_data.benchmark import best_responses
-from icrl4aht_data.benchmark.best_responses import (
-    BestResponse,
-    BestResponseCard,
-    TrainedResponse,
-    write_best_responses,
-)
 from icrl4aht_data.benchmark.reference_returns import read_headroom
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.templates import card_file
@@ -63,7 +40,7 @@ def folders(tmp_path_factory) -> Path:
 def stored(folders) -> StoredResults:
     found = StoredResults()
     for name in ("high", "low"):
-        found = add_submission(found, make_submission([folders / name], FACTS))
+        found = comparison.add_submission(found, make_submission([folders / name], FACTS))
     return found
 
 
@@ -76,22 +53,16 @@ def test_stored_results_have_blocks_and_curves(stored, tmp_path):
     assert len(stored.table) == 4 * 40 * 3 * 6 and len(stored.curves) == 4 * 2 * 100
     curve = stored.curves[(stored.curves["agent"] == "high") & (stored.curves["control"] == "")]
     assert curve["return"].tolist() == [value + 2.0 for value in HIGH] * 2, "mean over t0 to t4"
-    write_stored(tmp_path / "results.json", stored)
-    again = read_stored(tmp_path / "results.json")
+    comparison.write_stored(tmp_path / "results.json", stored)
+    again = comparison.read_stored(tmp_path / "results.json")
     assert again.agents == stored.agents
     pd.testing.assert_frame_equal(again.table, stored.table, check_dtype=False)
     pd.testing.assert_frame_equal(again.curves, stored.curves, check_dtype=False)
 
 
-def test_results_of_an_agent_replace_its_earlier_ones(stored, folders):
-    again = add_submission(stored, make_submission([folders / "low"], FACTS, "high"))
-    assert sorted(again.table["control"].unique()) == [""] and len(again.table) == 2 * 40 * 3 * 6
-    assert list(again.agents) == ["high", "low"]
-
-
 def test_table_1_has_scores_of_complete_tracks(stored, measured):
     scales = cell_scales("seeded")
-    table = agents_table(stored, stored.returns(), scales)
+    table = comparison.agents_table(stored, stored.returns(), scales)
     high, low = row(table, "high"), row(table, "low")
     assert high[1:6] == ["noise", "oracle", "10 updates, 2 core-hours", "–", "–"], "no track teammate"
     # R - S over B - S = 20, with S = 12.0 on asymm_right in the mean and 0.0 on cramped_down
@@ -99,19 +70,19 @@ def test_table_1_has_scores_of_complete_tracks(stored, measured):
                      for name in ("asymm_right", "cramped_down")])  # fmt: skip
     for found, mean in ((high, 21.5), (low, 9.5)):
         assert found[6].startswith(f"{(mean - stays) / 20:z.2f} (")
-    assert describe_lead(stored.returns(), scales) == "No two models have a score on the track `teammate`."
+    assert comparison.describe_lead(stored.returns(), scales) == "No two models have a score on the track `teammate`."
 
 
 def test_the_lead_is_the_difference_of_the_two_highest(tmp_path, measured):
     found = StoredResults()
     for name, value in {"a": 3.0, "b": 9.0, "c": 5.0}.items():
         folder = write_results(tmp_path / name, name, [value] * 100, track="teammate")
-        found = add_submission(found, make_submission([folder], FACTS))
-    assert "`b` minus `c` is +0.20 (+0.20 to +0.20)" in describe_lead(found.returns(), cell_scales("seeded"))
+        found = comparison.add_submission(found, make_submission([folder], FACTS))
+    assert "`b` minus `c` is +0.20 (+0.20 to +0.20)" in comparison.describe_lead(found.returns(), cell_scales("seeded"))
 
 
 def test_table_2_has_the_controls_and_blocks(stored, measured):
-    table = controls_table(stored, stored.returns(), cell_scales("seeded"))
+    table = comparison.controls_table(stored, stored.returns(), cell_scales("seeded"))
     high, low = row(table, "high"), row(table, "low")
     assert high[1].startswith("**+15.5 (") and high[1].endswith(")**"), "19.5 + 2 - (5 + 1)"
     assert high[2] == "+0.0 (+0.0 to +0.0)" and high[3:] == ["12.0", "12.0", "22.0", "22.0"]
@@ -119,12 +90,12 @@ def test_table_2_has_the_controls_and_blocks(stored, measured):
 
 
 def test_table_3_has_reference_egos_and_layouts(stored, measured):
-    table = layouts_table(stored.returns(), cell_scales("seeded"))
+    table = comparison.layouts_table(stored.returns(), cell_scales("seeded"))
     assert row(table, "stay")[1:4] == ["12.8", "13.0", "12.7"] and "| best response | 12.8 | 18.0 |" in table
     low = row(table, "low")
     assert low[1] == "–" and low[8] == "9.5 (0.47)" and float(low[10]) == pytest.approx(26.0 - 9.5, abs=0.1)
     assert low[9].endswith("asymm_right H4"), "stay earns 40 there"
-    none = layouts_table(stored.returns(), {})
+    none = comparison.layouts_table(stored.returns(), {})
     assert row(none, "low")[7:] == ["9.5", "9.5", "–", "–"] and "| best response | – |" in none
 
 
@@ -133,41 +104,19 @@ def test_best_responses_of_a_layout_count_as_stay_in_cells_without_one(measured)
     ring = [cell for cell in scales if cell.layout == "coord_ring"]
     h2 = next(cell for cell in ring if cell.family == "H2")
     others = sum(stay[cell[:2]]["stay"] for cell in ring if cell != h2)
-    assert mean_best("coord_ring", {h2: scales[h2]}) == pytest.approx((scales[h2].best + others) / 4)
-    assert mean_best("coord_ring", {cell: scales[cell] for cell in scales if cell not in ring}) is None
-
-
-def test_the_page_describes_the_trainings_of_best_responses(cards, monkeypatch):
-    by_agent = [("best response, seed 1", [1.0, 3.0]), ("some model", [4.0])]
-    behaviours = [
-        BestResponse(
-            layout="asymm_right",
-            family="H1",
-            split="test",
-            tasks=(f"task_{agent}",),
-            seeds=tuple(TrainedResponse(seed, 100, value) for seed, value in enumerate(returns)),
-            best=max(returns),
-            agent=agent,
-        )
-        for agent, returns in by_agent
-    ]
-    write_best_responses(cards / "two.json", BestResponseCard("0", "seeded", "Two.", tuple(behaviours)))
-    monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "two.json")
-    assert describe_trainings() == (
-        "Behaviours: 2. Trainings with each: 1 to 2, of 100 steps and width 128. With 1 of these behaviours a "
-        "stored model earns more: B is its return."
-    )
+    assert comparison.mean_best("coord_ring", {h2: scales[h2]}) == pytest.approx((scales[h2].best + others) / 4)
+    assert comparison.mean_best("coord_ring", {cell: scales[cell] for cell in scales if cell not in ring}) is None
 
 
 def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monkeypatch):
     old = stored.agents | {"low": AgentFacts("an old one", "noise", "oracle", commit="71f723c")}
     some = dataclasses.replace(stored, agents=old)
-    paths = write_comparison(some, tmp_path / "page")
-    assert [path.name for path in paths] == [*RESULTS_FILES]
+    paths = comparison.write_comparison(some, tmp_path / "page")
+    assert [path.name for path in paths] == [*comparison.RESULTS_FILES]
     text = paths[0].read_text(encoding="utf-8")
     assert "| `high` | noise | oracle | 10 updates, 2 core-hours | – |" in text and "| `low`" not in text
     assert "Models of earlier code are there as well: `low`." in text and "None measured (version" in text
-    assert paths[1].stat().st_size > 10_000 and len(figure_layouts()) == 6
+    assert paths[1].stat().st_size > 10_000 and len(comparison.figure_layouts()) == 6
     assert len(pd.read_parquet(paths[3])) == len(stored.table)
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: cards / "measured.json")
     table = add_scales(stored.table)
@@ -175,31 +124,31 @@ def test_the_page_without_and_with_best_responses(stored, tmp_path, cards, monke
     assert len(table) == len(stored.table) and set((down["best"] - down["stay"]).dropna()) == {20}
     mixed = table[table["control"] == "swapped"]
     assert set(mixed.loc[mixed["best"].notna(), "block"]) == {"last 20"}, "others are of another teammate"
-    assert "20 of 32 cells" in render_comparison(some)
+    assert "20 of 32 cells" in comparison.render_comparison(some)
     with pytest.raises(OptionError, match="no stored results: give files that"):
-        write_comparison(StoredResults(), tmp_path / "empty")
+        comparison.write_comparison(StoredResults(), tmp_path / "empty")
 
 
 @pytest.mark.parametrize("texts", ["{", "[]", '{"a": {}}', "{}"])
 def test_damaged_stored_results(texts, tmp_path):
-    assert len(read_stored(tmp_path / "none.json").table) == 0
+    assert len(comparison.read_stored(tmp_path / "none.json").table) == 0
     (tmp_path / "bad.json").write_text(texts)
     (tmp_path / "bad.csv").write_text("agent,protocol\n")
     with pytest.raises(OptionError, match=r"bad\.json: not stored results: .*restore it, bad\.csv\.gz and bad_curves"):
-        read_stored(tmp_path / "bad.json")
+        comparison.read_stored(tmp_path / "bad.json")
 
 
 def test_bundled_results_are_in_canonical_form(tmp_path):
-    write_stored(tmp_path / "results.json", read_stored(results_file()))
+    comparison.write_stored(tmp_path / "results.json", comparison.read_stored(comparison.results_file()))
     for name in ("results.json", "results.csv.gz", "results_curves.csv.gz"):
         opened = gzip.open if name.endswith(".gz") else open
-        with opened(tmp_path / name) as written, opened(results_file().with_name(name)) as bundled:
+        with opened(tmp_path / name) as written, opened(comparison.results_file().with_name(name)) as bundled:
             assert written.read() == bundled.read()
 
 
 @pytest.mark.slow
 def test_the_committed_page_matches_the_stored_results(monkeypatch):
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: card_file("best_responses.json"))
-    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-    assert page == render_comparison(read_stored(results_file()))
-    assert len(pd.read_parquet(ROOT / "docs" / "results.parquet")) == len(read_stored(comparison.results_file()).table)
+    stored = comparison.read_stored(comparison.results_file())
+    assert (ROOT / "docs" / "results.md").read_text(encoding="utf-8") == comparison.render_comparison(stored)
+    assert len(pd.read_parquet(ROOT / "docs" / "results.parquet")) == len(stored.table)

@@ -9,15 +9,14 @@ from html import unescape
 from html.parser import HTMLParser
 
 import pytest
-from icrl4aht_baselines import report
 from icrl4aht_baselines.agents.bundled import MODELS
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, get_protocol
 from icrl4aht_baselines.headroom import write_headroom_cards
 from icrl4aht_baselines.reference import training_sentence
-from icrl4aht_baselines.report import gifs, merge, write_report
+from icrl4aht_baselines.report import gifs, merge
 from icrl4aht_baselines.report.figures import bar_charts, curve_charts
 from icrl4aht_baselines.report.gifs import EpisodePair, ShownEpisode, restore_ego
-from icrl4aht_baselines.report.page import REPORT_FILES, markdown, write_page, write_page_with_episodes
+from icrl4aht_baselines.report.page import markdown, write_page, write_page_with_episodes
 from icrl4aht_baselines.report.results import TEST_LAYOUTS, EvaluationRun, ResultCell
 
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -229,9 +228,3 @@ def test_commands_with_a_custom_manifest(tmp_path, monkeypatch):
     (tmp_path / "run" / "tasks.jsonl").unlink()
     with pytest.raises(OptionError, match=r"is neither a published test task, .* nor in the results' tasks\.jsonl"):
         run_cli("report", tmp_path / "run")
-
-
-def test_a_report_without_a_page(tmp_path):
-    paths = write_report([evaluated_run("AD")], tmp_path / "report")
-    assert [path.name for path in paths] == [*REPORT_FILES] and all(path.stat().st_size for path in paths)
-    assert callable(report)

@@ -7,32 +7,9 @@ from io import StringIO
 import numpy as np
 import pandas as pd
 import pytest
-from icrl4aht_baselines.report.page import (
-    AVERAGE,
-    csv_text,
-    markdown,
-    published_cells,
-    published_score,
-    returns_tables,
-    table_score,
-)
-from icrl4aht_baselines.report.results import (
-    BLOCKS,
-    CellReturns,
-    ResultCell,
-    task_label,
-)
-from icrl4aht_baselines.report.scores import (
-    CellScale,
-    TaskScale,
-    block_difference,
-    bundled_cells,
-    cell_scales,
-    find_headlines,
-    find_score,
-    open_cells,
-    score_difference,
-)
+from icrl4aht_baselines.report import page, scores
+from icrl4aht_baselines.report.results import BLOCKS, CellReturns, ResultCell, task_label
+from icrl4aht_baselines.report.scores import CellScale, TaskScale
 from msgspec import structs
 
 from icrl4aht_data.benchmark import best_responses
@@ -66,8 +43,8 @@ SCALES = {
 
 def test_a_score_is_a_ratio_of_sums_by_layout():
     cells = {WIDE: returns_of(5.0, 15.0, 0.0, 10.0), RING: returns_of(10.0, 10.0, 7.0), FLAT: returns_of(99.0)}
-    assert open_cells(SCALES) == [RING, WIDE], "FLAT has less than 5 points of headroom"
-    score = find_score(cells, [RING, WIDE], SCALES)
+    assert scores.open_cells(SCALES) == [RING, WIDE], "FLAT has less than 5 points of headroom"
+    score = scores.find_score(cells, [RING, WIDE], SCALES)
     assert score is not None
     wide, ring = (5 + 10 + 0 + 10) / (10 + 20 + 10 + 10), 27 / 81
     assert score.layouts == pytest.approx({"coord_ring": ring, "demo_wide": wide})
@@ -75,19 +52,19 @@ def test_a_score_is_a_ratio_of_sums_by_layout():
     # Behaviours: d and e 0.25, a and b 0.5, c (0 + 10) / 20; f has no headroom of its own.
     assert score.middle.mean == pytest.approx((0.25 + 0.5 + 0.5) / 3) and score.worst == ("coord_ring H2", 0.25)
     assert score.regret == pytest.approx(((50 - 25) + (81 - 27)) / 7)
-    assert find_score(cells, [RING, FLAT], SCALES) is None and find_score(cells, [], SCALES) is None
-    assert find_score({WIDE: returns_of(5.0, 5.0)}, [WIDE], SCALES) is None, "tasks are missing"
+    assert scores.find_score(cells, [RING, FLAT], SCALES) is None and scores.find_score(cells, [], SCALES) is None
+    assert scores.find_score({WIDE: returns_of(5.0, 5.0)}, [WIDE], SCALES) is None, "tasks are missing"
 
 
 def test_differences_are_paired_by_task_and_seed():
     one, other = returns_of(5.0, 15.0, 0.0, 10.0), returns_of(10.0, 0.0, 10.0, 15.0, seeds=1)
     shuffled = other._replace(tasks=("t3", "t2", "t0", "t1"))  # 10.0 is of t3
-    difference = score_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], SCALES)
+    difference = scores.score_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], SCALES)
     assert difference.mean == pytest.approx(((5 - 10) + (15 - 15) + (0 - 0) + (10 - 10)) / 50)
-    returns = block_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], "last 20")
+    returns = scores.block_difference({WIDE: one}, {WIDE: shuffled}, [WIDE], "last 20")
     assert returns is not None and returns.mean == pytest.approx(-5 / 4)
-    assert block_difference({WIDE: one}, {}, [WIDE], "all") is None
-    assert block_difference({WIDE: one}, {WIDE: other}, [WIDE], "1") is None
+    assert scores.block_difference({WIDE: one}, {}, [WIDE], "all") is None
+    assert scores.block_difference({WIDE: one}, {WIDE: other}, [WIDE], "1") is None
 
 
 def test_teammates_that_behave_alike_are_one_unit():
@@ -96,10 +73,10 @@ def test_teammates_that_behave_alike_are_one_unit():
     values = np.broadcast_to([2.0, 4.0, 6.0, 8.0], (1, 5, 4))
     found = CellReturns(tuple(f"t{number}" for number in range(5)), (0, 1, 2, 3), {"all": values})
     one = found._replace(tasks=("t0",), blocks={"all": values[:, :1]})
-    scores = [find_score({WIDE: of}, [WIDE], alike) for of in (found, one)]
-    assert scores[0] and scores[1] is None
-    single = find_score({WIDE: one}, [WIDE], {WIDE: scale_of((0.0, 20.0, "same"))})
-    assert single and single.total == pytest.approx(scores[0].total) and scores[0].total.range()
+    pair = [scores.find_score({WIDE: of}, [WIDE], alike) for of in (found, one)]
+    assert pair[0] and pair[1] is None
+    single = scores.find_score({WIDE: one}, [WIDE], {WIDE: scale_of((0.0, 20.0, "same"))})
+    assert single and single.total == pytest.approx(pair[0].total) and pair[0].total.range()
 
 
 def test_a_layout_counts_once_all_of_its_cells_are_measured(measured, monkeypatch, tmp_path):
@@ -109,16 +86,20 @@ def test_a_layout_counts_once_all_of_its_cells_are_measured(measured, monkeypatc
     kept = tuple(one for one in card.behaviours if one != lacks)
     best_responses.write_best_responses(tmp_path / "less.json", structs.replace(card, behaviours=kept))
     monkeypatch.setattr(best_responses, "best_responses_file", lambda: tmp_path / "less.json")
-    found = open_cells(cell_scales("seeded"))
+    found = scores.open_cells(scores.cell_scales("seeded"))
     assert len(found) == 16 and "demo_wide" not in {cell.layout for cell in found}
 
 
 def test_scales_have_the_tasks_with_a_best_response(measured):
-    scales = cell_scales("seeded")
-    assert len(open_cells(scales)) == 20 and RING in open_cells(scales) and cell_scales("published") == {}
+    scales = scores.cell_scales("seeded")
+    assert (
+        len(scores.open_cells(scales)) == 20
+        and RING in scores.open_cells(scales)
+        and scores.cell_scales("published") == {}
+    )
     assert all(len(scale.tasks) == 5 for scale in scales.values())
     assert len({task.behaviour for task in scales[ResultCell("demo_wide", "H4")].tasks.values()}) == 1
-    assert {*scales[WIDE].tasks} == {task_label(task) for task in bundled_cells()[WIDE]}
+    assert {*scales[WIDE].tasks} == {task_label(task) for task in scores.bundled_cells()[WIDE]}
 
 
 def test_damaged_best_responses(tmp_path):
@@ -136,7 +117,7 @@ def test_damaged_best_responses(tmp_path):
 
 
 def test_the_summary_of_a_run(measured):
-    (found,) = find_headlines(evaluated_run("mine", ("coord_simple", "demo_wide")))
+    (found,) = scores.find_headlines(evaluated_run("mine", ("coord_simple", "demo_wide")))
     assert found.score and found.score.total[:3] == pytest.approx((11.0 / SPAN,) * 3), "equal instances"
     assert found.text == (
         "mine (seeded), 4 test cells with headroom, of 8 played: score 0.55 (0.55 to 0.55), interquartile mean 0.55, "
@@ -146,69 +127,71 @@ def test_the_summary_of_a_run(measured):
 
 
 def test_results_without_a_score_say_why(measured):
-    (short,) = find_headlines(evaluated_run("mine", steps=20))
+    (short,) = scores.find_headlines(evaluated_run("mine", steps=20))
     assert short.score is None and short.why_no_score.startswith("No score: it needs all tasks of a cell with a best")
-    (flat,) = find_headlines(evaluated_run("mine", ("coord_simple",)))
+    (flat,) = scores.find_headlines(evaluated_run("mine", ("coord_simple",)))
     assert flat.why_no_score == "No score: no best response earns 5 more than `stay` in these cells."
-    (published,) = find_headlines(evaluated_run("mine", protocol="published"))
+    (published,) = scores.find_headlines(evaluated_run("mine", protocol="published"))
     assert published.why_no_score == "No score: best responses were measured under protocol seeded."
 
 
 def test_other_episode_lengths_have_no_paper_numbers():
     run = evaluated_run("AD", protocol="published", steps=20)
-    found = table_score(DEMO_WIDE[:1], run, "published", (1.0, 1.0))
+    found = page.table_score(DEMO_WIDE[:1], run, "published", (1.0, 1.0))
     assert found.notes == ["episodes 1: 10.0, 2-5: 10.0, 6-20: 10.0, 21-100: 12.0"]
 
 
 def test_tables_have_our_and_the_papers_numbers():
     runs = [evaluated_run(agent, ("demo_wide", "cramped_down"), protocol="published") for agent in ("AD", "mine")]
-    (table,) = returns_tables(runs, "published")
-    assert list(table.columns) == ["demo_wide", "cramped_down", AVERAGE]
+    (table,) = page.returns_tables(runs, "published")
+    assert list(table.columns) == ["demo_wide", "cramped_down", page.AVERAGE]
     assert list(dict.fromkeys(agent for _, agent in table.rows)) == ["AD", "mine", "DPT", "random"]
     one, mine = table.rows["H1", "AD"][0], table.rows["H1", "mine"][0]
     assert (one.text, one.notes[0]) == ("11.0 ± 0.0", "paper -3.2 ± 2.6")
     assert not any("paper" in note for note in mine.notes)
     dpt = table.rows["H1", "DPT"][0]
     assert (dpt.text, dpt.notes) == ("–", ["paper 1.0 ± 0.7"])
-    assert table.rows[AVERAGE, "AD"][0].notes[0] == "paper {:.1f} ± {:.1f}".format(
-        *published_cells("AD")["demo_wide"][AVERAGE]
+    assert table.rows[page.AVERAGE, "AD"][0].notes[0] == "paper {:.1f} ± {:.1f}".format(
+        *page.published_cells("AD")["demo_wide"][page.AVERAGE]
     )
-    seeded = returns_tables([evaluated_run("AD", families=("H1", "H4"))], "seeded")[0]
-    assert list(seeded.rows) == [("H1", "AD"), ("H4", "AD"), (AVERAGE, "AD")]
-    assert not any("paper" in note for scores in seeded.rows.values() for found in scores for note in found.notes)
+    seeded = page.returns_tables([evaluated_run("AD", families=("H1", "H4"))], "seeded")[0]
+    assert list(seeded.rows) == [("H1", "AD"), ("H4", "AD"), (page.AVERAGE, "AD")]
+    assert not any("paper" in note for of_row in seeded.rows.values() for found in of_row for note in found.notes)
 
 
 def test_published_numbers_of_groups_of_cells():
     track = [ResultCell(layout, family) for layout in TRACKS["layout"]["test"] for family in HEURISTICS]
-    assert published_score("AD", track) == (2.6, 4.1)
-    assert published_score("DPT+TA", DEMO_WIDE) == (9.4, 5.5) and published_score("DPT", DEMO_WIDE[:2]) is None
+    assert page.published_score("AD", track) == (2.6, 4.1)
+    assert (
+        page.published_score("DPT+TA", DEMO_WIDE) == (9.4, 5.5) and page.published_score("DPT", DEMO_WIDE[:2]) is None
+    )
     wide = [cell._replace(layout="test_wide") for cell in DEMO_WIDE]
     contexts = [evaluated_run("AD", ("test_wide",), details={"context": k}) for k in (1000, 500, 250)]
-    found = [published_score(run, wide) for run in contexts]
-    assert found == [(-7.6, None), *2 * [tuple(published_cells("AD")["test_wide"][AVERAGE])]]
+    found = [page.published_score(run, wide) for run in contexts]
+    assert found == [(-7.6, None), *2 * [tuple(page.published_cells("AD")["test_wide"][page.AVERAGE])]]
 
 
 def test_incomplete_and_flat_groups_are_marked(measured):
-    found = table_score(DEMO_WIDE, evaluated_run("AD", families=("H1", "H2")), "seeded")
+    found = page.table_score(DEMO_WIDE, evaluated_run("AD", families=("H1", "H2")), "seeded")
     assert (found.text, found.notes[:2]) == ("11.0 ± 0.0", ["2 of 4 cells", "score 0.55"])
     few = evaluated_run("AD", tasks=[task for task in TEST_TASKS if task.layout.name == "demo_wide"][:2])
-    assert table_score(DEMO_WIDE[:1], few, "seeded").notes[0] == "2 of 5 instances"
-    assert table_score(DEMO_WIDE, few, "seeded").notes[:2] == ["1 of 4 cells", "incomplete cells"]
+    assert page.table_score(DEMO_WIDE[:1], few, "seeded").notes[0] == "2 of 5 instances"
+    assert page.table_score(DEMO_WIDE, few, "seeded").notes[:2] == ["1 of 4 cells", "incomplete cells"]
     flat_cell = ResultCell("coord_simple", "H1")
-    flat = table_score([flat_cell], evaluated_run("AD", ("coord_simple",)), "seeded")
+    flat = page.table_score([flat_cell], evaluated_run("AD", ("coord_simple",)), "seeded")
     assert flat.is_flat and flat.notes[-1] == "no headroom"
-    assert table_score([flat_cell], None, "published").is_flat, "by the oracle"
-    assert not table_score([flat_cell._replace(kind="validation")], None, "seeded").is_flat, "nothing was measured"
+    assert page.table_score([flat_cell], None, "published").is_flat, "by the oracle"
+    assert not page.table_score([flat_cell._replace(kind="validation")], None, "seeded").is_flat, "nothing was measured"
 
 
 def test_csv_and_markdown_have_the_numbers_of_each_cell(measured):
     runs = [evaluated_run("AD", protocol="published", trained_on=None), evaluated_run("AD", note="K250")]
-    found = pd.read_csv(StringIO(csv_text(runs)), keep_default_na=False)
+    found = pd.read_csv(StringIO(page.csv_text(runs)), keep_default_na=False)
     assert set(found["agent"]) == {"AD", "AD [K250]"} and set(found["block"]) == {*BLOCKS}
     first, last = (found[found["agent"] == run.label].iloc[0] for run in runs)
     assert (first["return"], first["overlap"], first["best"]) == (11.0, "unknown", "")
     assert (float(last["stay"]), float(last["best"])) == (0.0, 20.0)
-    text = markdown(runs)
+    text = page.markdown(runs)
     assert "| H1 | AD | 11.0 ± 0.0 ?<br>paper -3.2 ± 2.6<br>episodes 1: 10.0, " in text
     assert text.count("\n## Test tasks, ") == 2 and "| H1 | AD [K250] | 11.0 ± 0.0<br>score 0.55<br>" in text
     assert "* ? unknown training data: nothing says what the agent was trained on" in text

@@ -10,12 +10,7 @@ from typing import Any
 import pytest
 from icrl4aht_baselines.evaluate.results import read_result
 from icrl4aht_baselines.report import comparison
-from icrl4aht_baselines.report.submission import (
-    AgentFacts,
-    make_submission,
-    read_submission,
-    write_submission,
-)
+from icrl4aht_baselines.report.submission import AgentFacts, make_submission, read_submission, write_submission
 
 from icrl4aht_data.errors import OptionError
 from tests.helpers.commands import run_cli

@@ -19,19 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from icrl4aht_baselines.methods.registry import get_method
+from icrl4aht_baselines.training import trainer as training
 from icrl4aht_baselines.training.histories import hold_out, prepare
 from icrl4aht_baselines.training.options import HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions, open_run, read_config
 from icrl4aht_baselines.training.stopping import TrainingStopped, stop_signals
-from icrl4aht_baselines.training.trainer import (
-    Trainer,
-    TrainingData,
-    TrainingTask,
-    TrainState,
-    agree_on_stop,
-    learning_rate_schedule,
-    training_optimizer,
-)
+from icrl4aht_baselines.training.trainer import Trainer, TrainingData, TrainingTask, TrainState
 from icrl4aht_generation.learners.resume import Checkpoints
 from jax.experimental import multihost_utils
 
@@ -184,7 +177,7 @@ class TestStopping:
         def agreed(*every_process: tuple[int, int]) -> tuple[bool, int]:
             monkeypatch.setattr(jax, "process_count", lambda: len(every_process))
             monkeypatch.setattr(multihost_utils, "process_allgather", lambda own: np.array(every_process))
-            return agree_on_stop(bool(every_process[-1][0]), every_process[-1][1])
+            return training.agree_on_stop(bool(every_process[-1][0]), every_process[-1][1])
 
         assert agreed((1, 0), (0, 0)) == (True, 0)  # process 0 decides when to save
         assert agreed((0, 0), (1, 0)) == (False, 0)
@@ -222,7 +215,7 @@ class TestStep:
         params = random_parameters(method)
 
         def log_of(trainer: Trainer) -> dict[str, Any]:
-            state = TrainState(params, None, training_optimizer(OPTIONS).init(params), jnp.int32(0))
+            state = TrainState(params, None, training.training_optimizer(OPTIONS).init(params), jnp.int32(0))
             placed = jax.device_put(jax.tree.map(jnp.copy, state), trainer.everywhere)
             return trainer.step(placed, jax.device_put(batch, trainer.rows))[1]
 
@@ -231,7 +224,7 @@ class TestStep:
             np.testing.assert_allclose(expected[name], found[name], rtol=1e-5, err_msg=name)
 
     def test_the_learning_rate_is_the_papers(self):
-        schedule = learning_rate_schedule(TrainOptions(steps=100, warmup=0.05))
+        schedule = training.learning_rate_schedule(TrainOptions(steps=100, warmup=0.05))
         rates = [np.asarray(schedule(t)) for t in (0, 3, 5, 50, 100)]
         cosine = 1e-3 * (1 + np.cos(np.pi * (50 - 5) / 95)) / 2
         np.testing.assert_allclose(rates, [0.0, 6e-4, 1e-3, cosine, 0.0], rtol=1e-5, atol=1e-9)
