@@ -18,7 +18,6 @@ from icrl4aht_data.errors import NotStoredError, OptionError, UnknownNameError, 
 from icrl4aht_data.fetch import ReleaseLocation, open_root
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.manifest import check_meta
-from icrl4aht_data.format.provenance import Provenance, TeammateSwaps
 from icrl4aht_data.format.schema import ENTRY_HINTS, INFO, TASKS, TEAMMATES, Entry
 from icrl4aht_data.overcooked.channels import Channels
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -267,7 +266,7 @@ class Dataset(Selection):
         """
         teammate = self.recover_teammate(history_id, episode)
         task = self.history_task(history_id)
-        if (swaps := self._swaps(task)) is not None:
+        if (swaps := self.provenance.of(task.task_id).swaps) is not None:
             played = swaps.teammate(episode)
             task = make_task(task.track, task.split, task.layout_name, played, task.seed, task.recipes)
         known: dict[str, Any] = {
@@ -347,11 +346,8 @@ class Dataset(Selection):
             OptionError: for an episode that the history does not have.
         """
         task, episode = self.history_task(history_id), _check_episode(self.index.entry(history_id), episode)
-        provenance, swaps = self.provenance.get(task.task_id, Provenance()), self._swaps(task)
-        return (swaps.teammate(episode) if swaps else task.teammate) | (provenance.teammate or {})
-
-    def _swaps(self, task: Task) -> TeammateSwaps | None:
-        return self.provenance.get(task.task_id, Provenance()).swaps
+        made = self.provenance.of(task.task_id)
+        return (made.swaps.teammate(episode) if made.swaps else task.teammate) | (made.teammate or {})
 
     def history_task(self, history_id: int) -> Task:
         """Return the task of a history.

@@ -49,20 +49,29 @@ def is_address(root: str | Path | None) -> bool:
     return isinstance(root, str) and "://" in root and not root.startswith("file://")
 
 
-@dataclass(frozen=True)
+@dataclass
 class ReleaseLocation:
-    """Folder and remote of an opened release.
+    """An opened release: a local one, or as `Remote` one at an address.
 
     Args:
         folder: its folder on this machine.
-        remote: source of the files that are not in the folder; None for a local release.
     """
 
     folder: Path
-    remote: Remote | None = None
 
     def __str__(self) -> str:
-        return str(self.folder if self.remote is None else self.remote)
+        return str(self.folder)
+
+    def path(self, name: str) -> Path:
+        """Return the path of a file in the folder; it need not exist.
+
+        Raises:
+            UnsafePathError: if it leads out of the release.
+        """
+        return disk.resolve_inside(self.folder, name)
+
+    def fetch(self, names: Iterable[str]) -> None:
+        """Download files that are not in the folder; a local release has all of its files."""
 
     def file(self, name: str) -> Path:
         """Return the path of a file, fetched first if necessary; a local one of meta/ is checked against the manifest.
@@ -72,12 +81,9 @@ class ReleaseLocation:
             RemoteError, OfflineError: if it cannot be fetched.
             IndexFormatError, ChunkTableError: if it is not the one that the manifest lists.
         """
-        path = disk.resolve_inside(self.folder, name)
-        if self.remote is not None:
-            self.remote.fetch([name])
-        elif name.startswith("meta/"):
+        if name.startswith("meta/"):
             check_against_manifest(self.folder, [name])
-        return path
+        return self.path(name)
 
     def below(self, name: str) -> Path:
         """Return the path of a folder, which need not exist, after its files are fetched and checked.
@@ -87,21 +93,20 @@ class ReleaseLocation:
             RemoteError, OfflineError: if a file cannot be fetched.
             IndexFormatError: if a file is not the one that the manifest lists.
         """
-        path = disk.resolve_inside(self.folder, name)
-        if self.remote is not None:
-            self.remote.fetch(known for known in self.remote.manifest if known.startswith(f"{name}/"))
+        path = self.path(name)
+        self.fetch(known for known in read_manifest(self.folder) if known.startswith(f"{name}/"))
         check_folder(self.folder, name)
         return path
 
 
 @dataclass
-class Remote:
+class Remote(ReleaseLocation):
     """A release at an address, pinned to one manifest.
 
     Args:
+        folder: its folder on this machine.
         url: address of the release, with its revision if it has one, without credentials.
         revision: the Hub's commit, or the first 16 hexadecimal digits of the manifest's SHA-256.
-        folder: its folder on this machine.
         manifest: file -> SHA-256, hexadecimal.
         client: fetches files.
         in_hub_cache: whether `folder` belongs to the Hub's cache.
@@ -109,13 +114,16 @@ class Remote:
 
     url: str
     revision: str
-    folder: Path
     manifest: dict[str, str]
     client: HubClient | FsspecClient
     in_hub_cache: bool = False
 
     def __str__(self) -> str:
         return self.url
+
+    def file(self, name: str) -> Path:
+        self.fetch([name])  # which checks its hash
+        return self.path(name)
 
     def fetch(self, names: Iterable[str], advance: Advance | None = None, again: bool = False) -> None:
         """Download files that are not in the folder, several at once; stops at the first one that fails.
@@ -193,10 +201,6 @@ class Remote:
         is_hashable = is_shard or path.stat().st_size <= disk.LARGEST  # a sparse file may have a terabyte
         return is_hashable and disk.file_hash(path) == self.manifest[name]
 
-    def path(self, name: str) -> Path:
-        """Return the path of a file in the folder; it need not exist."""
-        return disk.resolve_inside(self.folder, name)
-
     def sizes(self, names: Iterable[str]) -> dict[str, int]:
         """Return the bytes of files as the remote says; 0 where it does not say.
 
@@ -258,8 +262,7 @@ def open_root(root: str | Path) -> ReleaseLocation:
     """Locate a release, a folder or an address; see `check_root` and `open_remote` for the errors."""
     check_root(root)
     if is_address(root):
-        remote = open_remote(str(root))
-        return ReleaseLocation(remote.folder, remote)
+        return open_remote(str(root))
     return ReleaseLocation(Path(root.removeprefix("file://") if isinstance(root, str) else root).expanduser())
 
 
@@ -295,7 +298,7 @@ def _open_hub(url: str, to: Path | None) -> Remote:
     if to is not None:
         _prepare_folder(to, text, url)
     client, manifest = HubClient(match["repo"], commit), _parse_manifest(text, url)
-    return Remote(url, commit, to or path.parent, manifest, client, in_hub_cache=to is None)
+    return Remote(to or path.parent, url, commit, manifest, client, in_hub_cache=to is None)
 
 
 def _open_address(address: str, to: Path | None) -> Remote:
@@ -317,7 +320,7 @@ def _open_address(address: str, to: Path | None) -> Remote:
                 partial.write_text(disk.short_hash(text))
     folder = to or base / disk.short_hash(text)
     _prepare_folder(folder, text, url, is_ours=to is None)
-    return Remote(url, disk.short_hash(text), folder, _parse_manifest(text, url), client)
+    return Remote(folder, url, disk.short_hash(text), _parse_manifest(text, url), client)
 
 
 def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | None) -> tuple[Path, bytes]:
@@ -416,7 +419,7 @@ def plan_download(
         EmptySelectionError, UnknownNameError: if no history matches the filters, or a filter has no such value.
     """
     remote = open_remote(url, to)
-    index, names = read_index(remote.folder), sorted(chosen_files(ReleaseLocation(remote.folder, remote), **wanted))
+    index, names = read_index(remote.folder), sorted(chosen_files(remote, **wanted))
     present = {name: remote.path(name).stat().st_size for name in names if remote.path(name).exists()}
     sizes = {name: index.info.shards[name] for name in names if name in index.info.shards}
     sizes = present | sizes | remote.sizes(name for name in names if name not in sizes and name not in present)
@@ -448,9 +451,8 @@ def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) ->
         wanted: filters as in `load_icrl4aht`. Without filters, all files.
     """
     index = read_index(root.folder)
-    listed = root.remote.manifest if root.remote is not None else read_manifest(root.folder)
     all_shards = index.values("shard")
-    chosen = {*listed, *all_shards}
+    chosen = {*read_manifest(root.folder), *all_shards}
     if any(wanted.values()):
         rows = index.query(**{name: value or None for name, value in wanted.items()})  # type: ignore[arg-type]
         codes = np.unique(index.entries.column("shard")[rows]).tolist()

@@ -18,6 +18,7 @@ import numpy as np
 from icrl4aht_data.browsing.drawings import hex_colour, layout_drawings
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import NotStoredError, OptionError, ReleaseError
+from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.layouts_file import layout_title
 from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS, Entry, episode_returns
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, TEAMMATE
@@ -250,7 +251,7 @@ def _teammate(dataset: Dataset, history_id: int) -> str:
 
 def _release_name(dataset: Dataset) -> str:
     """Return the address of a remote release, or the name of a local folder without its path."""
-    return str(dataset.origin) if dataset.origin.remote else dataset.root.resolve().name
+    return str(dataset.origin) if isinstance(dataset.origin, Remote) else dataset.root.resolve().name
 
 
 def page_style() -> str:

@@ -13,7 +13,7 @@ from icrl4aht_data.fetch import ReleaseLocation, Remote
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.provenance import ProvenanceByTask
 from icrl4aht_data.format.schema import EXPERTS, INFO, MANIFEST, PROVENANCE, TEAMMATES
 from icrl4aht_data.utils.files import LARGEST, file_hash, files_below, plain_size, resolve_inside
 
@@ -39,7 +39,7 @@ def check_files(
     """
     root, quick = origin.folder, report.level == "quick"
     expected, present = listed.keys() & chosen, set(files_below(root))
-    if not quick or origin.remote is None:  # a quick check does not download files
+    if not quick or not isinstance(origin, Remote):  # a quick check does not download files
         for name in sorted(expected - present):
             report.add(name, "listed in the manifest, but missing")
     for name in sorted(present - listed.keys() - {MANIFEST}):
@@ -79,8 +79,8 @@ def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
 def check_references(
     listed: Mapping[str, str],
     index: Index,
-    tasks: Iterable[Task],
-    provenance: Mapping[str, Provenance] | None,
+    played: Iterable[Task],
+    provenance: ProvenanceByTask | None,
     report: Report,
 ) -> None:
     """Check that each shard, chunk table and checkpoint in the manifest belongs to a history or a task.
@@ -90,17 +90,15 @@ def check_references(
     Args:
         listed: the manifest, file -> SHA-256.
         index: the release's index.
-        tasks: its tasks.
+        played: its tasks, each with every teammate that plays in it.
         provenance: task id -> how its histories were made; None if unknown.
         report: receives the problems.
     """
     shards = index.values("shard")
     known = {*shards, *map(chunk_table_name, shards)}
-    made = provenance or {}
-    played = [one for task in tasks for one in made.get(task.task_id, Provenance()).played(task)]
     learned = [(task.task_id, task.teammate["theta"]["sha256"]) for task in played if task.teammate["kind"] == "rl"]
     policies = {sha256 for _, sha256 in learned}
-    labellers = {of_task.expert.policy_sha256 for of_task in made.values() if of_task.expert}
+    labellers = {of_task.expert.policy_sha256 for of_task in (provenance or {}).values() if of_task.expert}
     for name in sorted(listed):
         top, folder, *_ = *name.split("/"), ""
         if (top == "data" or name.startswith("meta/chunks/")) and name not in known:

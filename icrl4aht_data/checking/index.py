@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from itertools import islice
@@ -18,7 +18,7 @@ from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import ReleaseInfo, describe, layout_statistics
-from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text, resolve_inside
 from icrl4aht_data.utils.groups import grouped
@@ -34,18 +34,19 @@ _OF_A_TASK = (
 _described = attrgetter("track", "split", "teammate_kind", "teammate_family", "seed")
 
 
-def check_index(index: Index, tasks: list[Task], provenance: Mapping[str, Provenance] | None, report: Report) -> None:
+def check_index(
+    index: Index, tasks: list[Task], played: Iterable[Task], provenance: ProvenanceByTask | None, report: Report
+) -> None:
     """Check that index, tasks, totals and shard names agree.
 
     Args:
         index: the release's index.
         tasks: its tasks.
+        played: the tasks, each with every teammate that plays in it.
         provenance: task id -> how its histories were made; None if they cannot be read, which `report` says already.
         report: receives the problems.
     """
     _check_tasks(index, tasks, report)
-    made = provenance or {}
-    played = [one for task in tasks for one in made.get(task.task_id, Provenance()).played(task)]
     _check_disjoint_teammates(played, report)
     if not index.entries:
         report.add(HISTORIES, "no histories")
@@ -92,7 +93,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
         report.add(TASKS, f"task {task_id!r} has no history")
 
 
-def _check_disjoint_teammates(tasks: list[Task], report: Report) -> None:
+def _check_disjoint_teammates(tasks: Iterable[Task], report: Report) -> None:
     """Check that training and test tasks of a track have no common teammates."""
     seen: dict[tuple[str, str, str], str] = {}
     for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # train before test
@@ -103,16 +104,16 @@ def _check_disjoint_teammates(tasks: list[Task], report: Report) -> None:
             report.add(TASKS, f"task {task.task_id!r} ({task.split}) has the teammate of {seen[key]!r} (train)")
 
 
-def _check_info(index: Index, tasks: list[Task], provenance: Mapping[str, Provenance] | None, report: Report) -> None:
+def _check_info(index: Index, tasks: list[Task], provenance: ProvenanceByTask | None, report: Report) -> None:
     """Check the totals and statistics in meta/info.json against the index."""
     root, info, shards = index.root, index.info, index.values("shard")
-    kept_steps = info.environment.kept_steps
-    described = describe(info.kind, info.data_version, kept_steps, list(index.entries), info.format_version)
+    entries = list(index.entries)
+    described = describe(info.kind, info.data_version, info.environment.kept_steps, entries, info.format_version)
     described = replace(described, left_out=info.left_out)
     if info.shards.keys() != set(shards):
         report.add(INFO, f"shards: expected {sorted(shards)}, found {sorted(info.shards)}")
     elif report.ok and provenance is not None:
-        statistics = layout_statistics(index.entries, tasks, provenance, kept_steps, info.shards)
+        statistics = layout_statistics(described, entries, tasks, provenance, info.shards)
         described = replace(described, shards=info.shards, statistics=statistics)
     found = parse_json(read_text(resolve_inside(root, INFO)))  # may have fields that `ReleaseInfo` does not have
     for name in sorted(found.keys() - {field.name for field in fields(ReleaseInfo)}):

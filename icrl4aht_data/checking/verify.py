@@ -19,10 +19,10 @@ from icrl4aht_data.checking.shards import check_chunks, check_history, check_str
 from icrl4aht_data.clients import check_credentials, without_credentials
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.errors import EmptySelectionError, Icrl4ahtError, UnknownNameError, check_choice
-from icrl4aht_data.fetch import ReleaseLocation, check_root, chosen_files, open_root
+from icrl4aht_data.fetch import ReleaseLocation, Remote, check_root, chosen_files, open_root
 from icrl4aht_data.format.index import Index, read_index
 from icrl4aht_data.format.manifest import read_manifest
-from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask, read_provenance
 from icrl4aht_data.format.schema import KINDS, MANIFEST, PROVENANCE, TASKS
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import History
@@ -102,8 +102,8 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         raise
     except Icrl4ahtError as error:  # reported after problems of files, which may be the cause
         unreadable = error
-    if origin.remote is not None and report.level != "quick":
-        origin.remote.fetch(sorted(chosen))
+    if report.level != "quick":
+        origin.fetch(sorted(chosen))
     check_files(origin, listed, chosen, report, advance)
     if unreadable is not None:
         report.add("meta", str(unreadable))
@@ -118,20 +118,22 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
     except Icrl4ahtError as error:
         if PROVENANCE not in report.files_at_fault:
             report.add(PROVENANCE, str(error))
-    check_references(listed, index, tasks, provenance, report)
+    made = provenance or ProvenanceByTask()
+    played = [one for task in tasks for one in made.of(task.task_id).played(task)]
+    check_references(listed, index, played, provenance, report)
     if report.level == "deep":
-        report.notes += _unchecked_values(index, provenance or {})
+        report.notes += _unchecked_values(index, made)
     if provenance is not None:
         check_provenance(index, tasks, provenance, report)
-    check_index(index, tasks, provenance, report)
+    check_index(index, tasks, played, provenance, report)
     shards = [name for name in index.values("shard") if name in chosen]
     skipped = len(index.values("shard")) - len(shards)
     if skipped:
         report.notes.append(f"{skipped} of {skipped + len(shards)} shards were not selected")
     if report.level != "quick":
         _check_shards(index, {task.task_id: task.layout for task in tasks}, shards, report, advance)
-    elif origin.remote is not None:
-        check_remote_sizes(origin.remote, index, shards, report)
+    elif isinstance(origin, Remote):
+        check_remote_sizes(origin, index, shards, report)
 
 
 def _unchecked_values(index: Index, provenance: Mapping[str, Provenance]) -> Iterator[str]:
@@ -147,7 +149,7 @@ def _check_shards(
     index: Index, layouts: Mapping[str, Layout], shards: list[str], report: Report, advance: NamedProgress
 ) -> None:
     """Check shards and their histories; `layouts` are those of the tasks by id, with the tasks' recipes."""
-    local = ReleaseLocation(index.root)  # no remote, since files that could not be fetched are already reported
+    local = ReleaseLocation(index.root)  # fetches nothing, since files that could not be fetched are already reported
     members = grouped(index.entries, lambda entry: entry.shard)
     total = sum(len(members[name]) for name in shards)
     for name in shards:

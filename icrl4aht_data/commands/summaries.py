@@ -11,6 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from icrl4aht_data.dataset import Dataset
+from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.info import describe
 from icrl4aht_data.format.schema import FIELDS, Entry
 from icrl4aht_data.reading.history import LABELS
@@ -90,19 +91,17 @@ def layout_table(dataset: Dataset) -> Table:
     table = Table(box=None, pad_edge=False, show_footer=True)
     columns = [dataset.column(name) for name in ("return_start", "return_end", "T", "episodes")]
     numbers, tasks = dataset.layout_numbers, dataset.column_codes("task_id")
-    rows = []
-    for name, members in [
-        *((layout.name, numbers == number) for number, layout in enumerate(dataset.layouts)),
-        ("total", np.ones(len(dataset), bool)),
-    ]:
+
+    def row(name: str, members: np.ndarray) -> list[str]:
         start, end, steps, episodes = (column[members] for column in columns)
         counts = [len(np.unique(tasks[members])), int(members.sum()), int(episodes.sum()), int(steps.sum())]
-        rows.append([name, *(f"{count:,}" for count in counts), f"{start.mean():.1f}", f"{end.mean():.1f}"])
+        return [name, *(f"{count:,}" for count in counts), f"{start.mean():.1f}", f"{end.mean():.1f}"]
+
     headings = ("layout", "tasks", "histories", "episodes", "steps", "return at start", "at end")
-    for heading, total in zip(headings, rows[-1], strict=True):
+    for heading, total in zip(headings, row("total", np.ones(len(dataset), bool)), strict=True):
         table.add_column(heading, footer=total, justify="left" if heading == "layout" else "right", overflow="fold")
-    for row in rows[:-1]:
-        table.add_row(*row)
+    for number, layout in enumerate(dataset.layouts):
+        table.add_row(*row(layout.name, numbers == number))
     return table
 
 
@@ -129,14 +128,14 @@ def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
 
 def summarize_selection(dataset: Dataset) -> dict[str, Any]:
     """Return a JSON object with the location, kind, versions and counts of a selection."""
-    info, remote = dataset.info, dataset.origin.remote
+    info, origin = dataset.info, dataset.origin
     content = describe(
         info.kind, info.data_version, info.environment.kept_steps, dataset.entries, info.format_version
     ).to_json()
     return {
         "summary": repr(dataset),
-        "root": str(dataset.origin),
-        **({"revision": remote.revision, "folder": str(dataset.root)} if remote else {}),
+        "root": str(origin),
+        **({"revision": origin.revision, "folder": str(origin.folder)} if isinstance(origin, Remote) else {}),
         **content,
         "splits": dataset.counts("split"),
         "sources": dataset.counts("source"),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from itertools import count, islice
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -60,8 +60,8 @@ _ABSENT |= {name: "" for name in _STRINGS if ENTRY_HINTS[name] is not str}
 _names = attrgetter(*_STRINGS)
 
 
-class Columns(Sequence[Entry]):
-    """Index of a release as columns with one row per history; a sequence of `Entry`, each made on access.
+class Columns:
+    """Index of a release as columns with one row per history; iteration and positions give `Entry`s, made on access.
 
     A string column has int32 codes of its distinct values. None is stored as -1 in integer columns, as NaN in float
     columns and as "" in string columns. Fields in `schema.ENCODED` are string columns of JSON text.
@@ -89,15 +89,10 @@ class Columns(Sequence[Entry]):
         """Return bool (H,), True for histories with one of the wanted values in a string column."""
         return np.isin(self._arrays[name], [code for code, value in enumerate(self.values(name)) if value in wanted])
 
-    @overload
-    def __getitem__(self, row: int) -> Entry: ...
+    def __iter__(self) -> Iterator[Entry]:
+        return map(self.__getitem__, range(len(self)))
 
-    @overload
-    def __getitem__(self, row: slice) -> list[Entry]: ...
-
-    def __getitem__(self, row: int | slice) -> Entry | list[Entry]:
-        if isinstance(row, slice):
-            return [self[i] for i in range(len(self))[row]]
+    def __getitem__(self, row: int) -> Entry:
         row = range(len(self))[row]
         values: dict[str, Any] = {name: self._arrays[name][row].item() for name in _NUMBERS}
         values |= {name: self._values[name][self._arrays[name][row]] for name in _STRINGS}

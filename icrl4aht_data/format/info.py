@@ -25,7 +25,7 @@ from icrl4aht_data.errors import (
     RootNotFoundError,
 )
 from icrl4aht_data.format.layouts_file import read_layouts
-from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.provenance import ProvenanceByTask
 from icrl4aht_data.format.schema import (
     FORMAT_VERSION,
     INFO,
@@ -283,39 +283,39 @@ def describe(
 
 
 def layout_statistics(
+    described: ReleaseInfo,
     entries: Sequence[Entry],
     tasks: Sequence[Task],
-    provenance: Mapping[str, Provenance],
-    kept_steps: int,
+    provenance: ProvenanceByTask,
     sizes: Mapping[str, int],
 ) -> dict[str, LayoutStatistics]:
     """Return the statistics of every layout, in order of first appearance.
 
     Args:
+        described: the result of `describe` for these entries.
         entries: the index.
         tasks: the release's tasks.
         provenance: task id -> how its histories were made.
-        kept_steps: steps of every episode.
         sizes: shard -> size in bytes.
     """
     statistics = {}
     for layout, members in grouped(entries, lambda entry: entry.layout).items():
+        summary = described.layouts[layout]
         lengths = {entry.task_id: entry.T for entry in members}
-        recorded = [provenance.get(task_id, Provenance()).streams_recorded for task_id in lengths]
+        recorded = [provenance.of(task_id).streams_recorded for task_id in lengths]
         streams = [number for number in recorded if number is not None]
         original = sum(map(mul, streams, lengths.values())) if len(streams) == len(recorded) else None
         own = [task for task in tasks if task.task_id in lengths]
         teammates = {json.dumps(task.teammate, sort_keys=True) for task in own}
-        steps = [entry.T for entry in members]
         statistics[layout] = LayoutStatistics(
             original_transitions=original,
-            filtered_transitions=sum(steps),
-            history_length=(min(steps), max(steps)),
+            filtered_transitions=summary.transitions,
+            history_length=(min(entry.T for entry in members), max(entry.T for entry in members)),
             teammates=len(teammates) or None,
-            steps_per_episode=kept_steps,
-            obs_shape=members[0].obs_shape,
+            steps_per_episode=described.environment.kept_steps,
+            obs_shape=summary.obs_shape,
             actions=len(ACTIONS),
-            mean_final_return=round(float(np.mean([entry.return_end for entry in members])), 3),
+            mean_final_return=summary.mean_final_return,
             independent_teammates=len(set(map(_policy, own))) or None,
             disk_bytes=sum(sizes[shard] for shard in {entry.shard for entry in members}),
         )

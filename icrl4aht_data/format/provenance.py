@@ -318,6 +318,10 @@ class _TeammateSetting(Struct, forbid_unknown_fields=True):
 class ProvenanceByTask(dict[str, Provenance]):
     """Mapping of task ids to their `Provenance`, with a short repr."""
 
+    def of(self, task_id: str) -> Provenance:
+        """Return the provenance of a task; one without any fields if it is not recorded."""
+        return self.get(task_id, Provenance())
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}({counted_noun(len(self), 'task')})"
 

@@ -7,7 +7,7 @@ bytes for a state record. Shorter records are padded with zeros, so one table ca
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -23,30 +23,21 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-class EpisodeColumn(NamedTuple):
-    """One column of the table of episodes.
-
-    Args:
-        dtype: name of the elements' NumPy dtype, or "str".
-        shape: lengths of the nested lists of a row, from the outermost; () for a single value.
-    """
-
-    dtype: str
-    shape: tuple[Literal["steps", "width"], ...] = ()
-
+EpisodeColumn = tuple[str, *tuple[Literal["steps", "width"], ...]]
+"""NumPy dtype of the elements, or "str", and the lengths of the nested lists of a row, from the outermost."""
 
 _NAMES = ("task_id", "track", "split", "layout", "teammate_family", "teammate_kind", "source")
 
 EPISODE_COLUMNS: dict[str, EpisodeColumn] = {
-    "history_id": EpisodeColumn("int64"),
-    "episode": EpisodeColumn("int32"),
-    **dict.fromkeys(_NAMES, EpisodeColumn("str")),
-    "learner": EpisodeColumn("int32"),
-    "return": EpisodeColumn("float32"),
-    "rewards": EpisodeColumn("float32", ("steps",)),
-    **{name: EpisodeColumn("int8", ("steps",)) for name in ACTION_FIELDS},
-    "state": EpisodeColumn("uint8", ("steps", "width")),
-    "episode_end_state": EpisodeColumn("uint8", ("width",)),
+    "history_id": ("int64",),
+    "episode": ("int32",),
+    **dict.fromkeys(_NAMES, ("str",)),
+    "learner": ("int32",),
+    "return": ("float32",),
+    "rewards": ("float32", "steps"),
+    **dict.fromkeys(ACTION_FIELDS, ("int8", "steps")),
+    "state": ("uint8", "steps", "width"),
+    "episode_end_state": ("uint8", "width"),
 }
 """Columns of the table of episodes, in order. Columns named like fields of `Entry` hold the history's values."""
 
@@ -78,9 +69,9 @@ def episode_schema(dataset: Selection) -> pa.Schema:
     arrow = import_pyarrow()
     lengths = {"steps": dataset.info.environment.kept_steps, "width": record_width(dataset.layouts)}
     fields = []
-    for name, column in EPISODE_COLUMNS.items():
-        kind = arrow.string() if column.dtype == "str" else arrow.from_numpy_dtype(np.dtype(column.dtype))
-        for axis in reversed(column.shape):
+    for name, (dtype, *axes) in EPISODE_COLUMNS.items():
+        kind = arrow.string() if dtype == "str" else arrow.from_numpy_dtype(np.dtype(dtype))
+        for axis in reversed(axes):
             kind = arrow.list_(kind, lengths[axis])
         fields.append(arrow.field(name, kind))
     return arrow.schema(fields)

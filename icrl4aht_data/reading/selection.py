@@ -93,7 +93,7 @@ class Selection:
         ids: int (H,), ids of the histories in the release, in the order of the selection.
         index: the release's index.
         info: the release's versions, kind, environment and totals, as in meta/info.json.
-        origin: the release: its folder on this machine, and its remote if it has one.
+        origin: the release, a `fetch.Remote` if it is at an address.
         root: the release's folder on this machine; for a remote release the folder of downloaded files.
         options: form and channels of observations, cache mode, threads.
         obs: form of observations: "float32", "uint8" or "state"; see `history.OBS`.

@@ -33,7 +33,6 @@ from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import FIELDS, Entry, Field, Kind
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import resolve_inside
 from icrl4aht_data.utils.system import new_array
 
 _CACHE_BYTES = 256 * 2**20
@@ -110,7 +109,7 @@ class Shard:
         entries: Sequence[Entry],
         cache: ChunkCache | None = None,
     ) -> None:
-        self.path, self.name = resolve_inside(location.folder, name), name
+        self.path, self.name = location.path(name), name
         self.kind: Kind = info.kind
         self.format_version = info.format_version
         self.layout = get_layout(entries[0].layout)
@@ -118,8 +117,7 @@ class Shard:
         self._cache = cache or ChunkCache()
         self._elements = {field.name: field.element(self.layout, self.kind) for field in FIELDS.values()}
         self._first: dict[tuple[int, str], int] = {}  # (history id, field) -> row of its first chunk in the table
-        if location.remote is not None:
-            location.remote.fetch([chunk_table_name(name), name])
+        location.fetch([chunk_table_name(name), name])
         self.table = read_table(location.file(chunk_table_name(name)))
         self._check_table()
         self.table = np.array(self.table)  # after the check, since the file could be too large for memory
@@ -310,5 +308,4 @@ class Shards:
     def fetch(self, names: Iterable[str]) -> None:
         """Fetch shards of a remote release and their chunk tables in parallel."""
         closed = [name for name in dict.fromkeys(names) if name not in self._open]
-        if self._location.remote is not None and closed:
-            self._location.remote.fetch([*map(chunk_table_name, closed), *closed])
+        self._location.fetch([*map(chunk_table_name, closed), *closed])

@@ -12,7 +12,6 @@ from typing import Any, Generic, SupportsIndex, TypedDict, TypeVar, overload
 import numpy as np
 
 from icrl4aht_data.errors import LabelsMissingError, MixedSplitsWarning, OptionError, WeakLabelsWarning, check_choice
-from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import are_labels_weak
 from icrl4aht_data.reading.history import LABELS, Labels
 from icrl4aht_data.reading.selection import Selection
@@ -247,7 +246,7 @@ def warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
         earned = dataset.column("expert_return")[first]
         advice = "leave these tasks out by min_expert_return, or select by ds.column('expert_return')"
     else:
-        references = [(dataset.provenance.get(name) or Provenance()).references for name in names]
+        references = [dataset.provenance.of(name).references for name in names]
         earned = np.array([np.nan if one is None else one.oracle for one in references])
         advice = "leave these tasks out, or take expert as labels"
     weak = np.flatnonzero(are_labels_weak(earned, ends))

@@ -161,7 +161,7 @@ def facts(root: Path) -> dict[str, Any]:
     info, entries = index.info, list(index.entries)
     by_id = {task.task_id: task for task in read_tasks(root / TASKS)}
     tasks = [
-        _TaskFacts(own[0], own, by_id.get(name), provenance.get(name, Provenance()))
+        _TaskFacts(own[0], own, by_id.get(name), provenance.of(name))
         for name, own in grouped(entries, lambda entry: entry.task_id).items()
     ]
     teammates = _teammates(tasks, list(info.layouts))

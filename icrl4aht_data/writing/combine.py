@@ -85,7 +85,7 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
                     f"{dataset.origin}: task {task.task_id} is also in {owner.origin}; leave one of them out, or "
                     f"generate it with another seed"
                 )
-            made = dataset.provenance.get(task.task_id, Provenance())
+            made = dataset.provenance.of(task.task_id)
             partial = is_part and len(histories) < len(dataset.index.query(task_id=task.task_id))
             if partial and made.streams_kept is not None:
                 made = _of_part(made, histories)

@@ -93,13 +93,7 @@ def to_release(
         target,
         kind,
         [
-            stored_task(
-                dataset.select([entry.history_id for entry in own]),
-                tasks[name],
-                provenance.get(name, Provenance()),
-                kind,
-                done,
-            )
+            stored_task(dataset.select([one.history_id for one in own]), tasks[name], provenance.of(name), kind, done)
             for name, own in grouped(dataset.entries, lambda entry: entry.task_id).items()
         ],
         data_version=dataset.info.data_version,

@@ -25,7 +25,6 @@ import numpy as np
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.environments import environment_spec
 from icrl4aht_data.errors import NotStoredError, OptionError
-from icrl4aht_data.format.provenance import Provenance
 from icrl4aht_data.format.schema import ACTION_FIELDS, FIELDS
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.channels import observation_shape
@@ -118,7 +117,7 @@ def _describe(dataset: Dataset) -> dict[str, Any]:
         "data_version": dataset.info.data_version,
         "kept_steps": dataset.info.environment.kept_steps,
         "tasks": [asdict(dataset.history_task(entry.history_id)) for entry in first.values()],
-        "provenance": {name: dataset.provenance.get(name, Provenance()).to_json() for name in first},
+        "provenance": {name: dataset.provenance.of(name).to_json() for name in first},
         "histories": [{name: getattr(entry, name) for name in names} for entry in dataset.entries],
     }
 

@@ -27,7 +27,7 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks, write_tasks
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError
-from icrl4aht_data.format.provenance import Provenance, read_provenance
+from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask, read_provenance
 from icrl4aht_data.format.safe_hdf5 import find, read_dataset
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
@@ -186,14 +186,14 @@ def from_published(
     kept_steps, source = check_int("kept_steps", kept_steps, 1), as_path(source)
     lines = read_published_index(resolve_inside(source, HISTORIES_INDEX))
     provenance_path = resolve_inside(source, "provenance.json")
-    provenance = read_provenance(provenance_path) if provenance_path.is_file() else {}
+    provenance = read_provenance(provenance_path) if provenance_path.is_file() else ProvenanceByTask()
     numbers = iter(range(1, len(lines) + 1))
     path = resolve_inside(source, HISTORIES_H5)
     with _wrap_errors(f"{path}: cannot be opened as HDF5"):
         file = h5py.File(path, "r")
 
     def load(task: Task, groups: list[_PublishedHistory]) -> Iterator[NewHistory]:
-        made = provenance.get(task.task_id, Provenance())
+        made = provenance.of(task.task_id)
         for group in groups:
             learner, stream = 0, group.line["env_idx"]
             if (made.learners or 1) > 1:
@@ -210,7 +210,7 @@ def from_published(
         new = [
             NewTask(
                 task,
-                _with_notes(provenance.get(task.task_id, Provenance()), members[0]),
+                _with_notes(provenance.of(task.task_id), members[0]),
                 len(members),
                 lambda task=task, members=members: load(task, members),
             )

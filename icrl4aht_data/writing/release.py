@@ -19,7 +19,7 @@ from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.format.info import LeftOutTask, check_version, describe, layout_statistics
 from icrl4aht_data.format.layouts_file import write_layouts_file
 from icrl4aht_data.format.manifest import write_manifest
-from icrl4aht_data.format.provenance import Provenance
+from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask
 from icrl4aht_data.format.schema import (
     ALL_KINDS,
     HISTORIES,
@@ -169,12 +169,12 @@ def write_release(
         write_layouts_file(root / LAYOUTS_FILE, map(get_layout, named_layouts))  # not with the recipes of a task
         known = [] if named else [one.task for one in new]
         write_tasks(root / TASKS, known)
-        provenance = {one.task.task_id: one.provenance for one in new}
+        provenance = ProvenanceByTask((one.task.task_id, one.provenance) for one in new)
         content = {task_id: of_task.to_json() for task_id, of_task in provenance.items()}
         write_json(root / PROVENANCE, content, indent=None)  # a kilobyte for each task even so
         sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in writer.entries)}
-        statistics = layout_statistics(writer.entries, known, provenance, kept_steps, sizes)
         info = describe(kind, data_version, kept_steps, writer.entries)
+        statistics = layout_statistics(info, writer.entries, known, provenance, sizes)
         info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
         write_json(root / INFO, info.to_json())
         if card is None:

@@ -20,13 +20,22 @@ def problems(root: Path, level: Level = "full") -> list[str]:
     return [f"{finding.file}: {finding.problem}" for finding in verify_release(root, level=level).findings]
 
 
-def spoil(root: Path, name: str, change: Change) -> None:
-    """Change the content of a JSON or JSONL file of a release, and write a matching manifest."""
-    path, is_lines = root / name, name.endswith("jsonl")
-    text = path.read_text()
-    content = [json.loads(line) for line in text.splitlines()] if is_lines else json.loads(text)
+def read_lines(path: Path) -> list[Any]:
+    """Return the content of a JSONL file."""
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def change_file(path: Path, change: Change) -> None:
+    """Change the content of a JSON or JSONL file in place."""
+    is_lines = path.suffix == ".jsonl"
+    content = read_lines(path) if is_lines else json.loads(path.read_text())
     change(content)
     path.write_text("".join(json.dumps(line) + "\n" for line in content) if is_lines else json.dumps(content))
+
+
+def spoil(root: Path, name: str, change: Change) -> None:
+    """Change the content of a JSON or JSONL file of a release, and write a matching manifest."""
+    change_file(root / name, change)
     write_manifest(root)
 
 

@@ -19,6 +19,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
+from icrl4aht_baselines.headroom import published_table
 from icrl4aht_baselines.methods.registry import METHODS
 
 from icrl4aht_data import load_icrl4aht
@@ -26,9 +27,10 @@ from icrl4aht_data.commands.cli import all_verbs, cli
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.schema import FIELDS, Field, Kind
 from icrl4aht_data.overcooked import state
-from icrl4aht_data.overcooked.channels import CANONICAL_CHANNELS, canonical_positions
+from icrl4aht_data.overcooked.channels import canonical_positions
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from icrl4aht_data.overcooked.observe import observe
+from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.commands import run_cli, run_python
 from tests.helpers.damages import flip_bit
@@ -153,12 +155,6 @@ def reader() -> dict[str, Any]:
     return runpy.run_path(str(DOCS / "read_release.py"))
 
 
-def _numbers(ranges: str) -> list[int]:
-    """Return the integers of a text such as "0 to 8, 44"."""
-    bounds = [list(map(int, part.split(" to "))) for part in ranges.split(", ")]
-    return [number for first, *last in bounds for number in range(first, (last or [first])[0] + 1)]
-
-
 class TestFormat:
     def test_reading_gives_the_arrays_of_the_package(self, reader, lite, full, tmp_path):
         to_release(load_icrl4aht(full[0]), tmp_path / "observations", "observations")
@@ -197,11 +193,6 @@ class TestFormat:
                 np.testing.assert_array_equal(reader["observe"](parsed, record, agent), observe(layout, record, agent))
 
     def test_canonical_channels(self, reader):
-        listed = [(_numbers(cells[0]), cells[1]) for cells in rows("format", "positions")]
-        assert [place for places, _ in listed for place in places] == list(range(len(CANONICAL_CHANNELS)))
-        for places, text in listed:
-            for beginning in re.findall(r"\b[a-z]+_[a-z_0-9]*", text):
-                assert any(CANONICAL_CHANNELS[place].startswith(beginning) for place in places), beginning
         for layout in LAYOUTS.values():
             parsed = reader["parse_layout"]({"map": layout.rows, "obs_shape": layout.obs_shape})
             assert reader["canonical_positions"](parsed) == canonical_positions(layout).tolist()
@@ -272,3 +263,8 @@ def test_listed_variables_are_those_that_the_code_reads():
     listed = {name for cells in rows("scale", "variable") for name in cells[0].split(", ")}
     assert used <= listed
     assert {name for name in listed if name.startswith("ICRL4AHT")} <= used
+
+
+def test_published_returns_are_those_of_headroom_json():
+    table = published_table(json.loads(card_file("headroom.json").read_text())["published"])
+    assert table in PAGES["evaluating"] and table in card_file("headroom.md").read_text()

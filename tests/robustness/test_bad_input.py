@@ -20,7 +20,9 @@ from icrl4aht_data.errors import (
 )
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.manifest import write_manifest
+from icrl4aht_data.format.schema import HISTORIES
 from tests.helpers.random_releases import SHARD
+from tests.helpers.spoiled import spoil
 
 
 def load(root, **options):
@@ -59,7 +61,7 @@ def test_malformed_info(damaged, content):
         load(damaged)
 
 
-def spoil(**changes):
+def put(**changes):
     return lambda line: json.dumps(json.loads(line) | changes)
 
 
@@ -72,13 +74,13 @@ def drop(name):
     [
         (lambda line: line[:40], "Input data was truncated"),
         (drop("layout"), "missing required field `layout`"),
-        (spoil(colour="red"), "unknown field `colour`"),
-        (spoil(T="many"), r"Expected `int`, got `str` - at `\$\.T`"),
-        (spoil(T=-5), r"Expected `int` >= 1 - at `\$\.T`"),
-        (spoil(history_id=0), "history_id 0: ids count up from 0, expected 2"),
-        (spoil(layout="cave"), "unknown layout of the train split of track teammate 'cave'"),
-        (spoil(obs_shape=[5, 5, 41]), r"obs_shape \[5, 5, 41\], expected \[5, 5, 40\]"),
-        (spoil(shard="../../etc/passwd"), "expected data/teammate/coord_simple/train-NNNNN"),
+        (put(colour="red"), "unknown field `colour`"),
+        (put(T="many"), r"Expected `int`, got `str` - at `\$\.T`"),
+        (put(T=-5), r"Expected `int` >= 1 - at `\$\.T`"),
+        (put(history_id=0), "history_id 0: ids count up from 0, expected 2"),
+        (put(layout="cave"), "unknown layout of the train split of track teammate 'cave'"),
+        (put(obs_shape=[5, 5, 41]), r"obs_shape \[5, 5, 41\], expected \[5, 5, 40\]"),
+        (put(shard="../../etc/passwd"), "expected data/teammate/coord_simple/train-NNNNN"),
     ],
 )
 def test_malformed_index_lines_are_named(damaged, change, message):
@@ -113,13 +115,12 @@ def test_truncated_shard(damaged, share):
 
 
 def test_index_and_shard_disagree(damaged):
-    path = damaged / "meta" / "histories.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    right = (damaged / HISTORIES).read_text()
     for change in ({"T": 119}, {"episodes": 7}, {"has_expert_actions": False}):
-        changed = [lines[0] | change, *lines[1:]]
-        path.write_text("".join(json.dumps(line) + "\n" for line in changed))
+        spoil(damaged, HISTORIES, lambda lines, change=change: lines[0].update(change))
         with pytest.raises(ShardMismatchError, match=r"the index (says|implies)"):
             read_all(damaged)
+        (damaged / HISTORIES).write_text(right)
 
 
 def test_chunk_table_faults(damaged):

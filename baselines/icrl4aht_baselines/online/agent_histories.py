@@ -42,6 +42,7 @@ from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import Task, make_task, read_tasks, teammate_id
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
+from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.checkpoints import checkpoint_files
 from icrl4aht_data.format.provenance import ExpertLabels, LabelView, Provenance, ReferenceEgos, TeammateSwaps
 from icrl4aht_data.format.schema import TASKS, TEAMMATES, curve_ends, episode_ends
@@ -277,7 +278,7 @@ def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] =
         if made is not None and made.references is not None:
             references[played.task_id] = made.references
     suite = dataset.origin.below(TEAMMATES)
-    root = str(dataset.origin) if dataset.origin.remote else dataset.root
+    root = str(dataset.origin) if isinstance(dataset.origin, Remote) else dataset.root
     return Teammates(list(found.values()), references, suite, root)
 
 

@@ -26,6 +26,7 @@ from icrl4aht_baselines.training.seen import TRAINED_ON
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
 from icrl4aht_data.dataset import Dataset, load_icrl4aht, teammate_ids, teammate_names
 from icrl4aht_data.errors import EmptySelectionError, OptionError
+from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.overcooked.channels import Channels, observation_shape
 from icrl4aht_data.overcooked.layouts import get_layout
@@ -102,7 +103,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
 def history_settings(dataset: Dataset) -> dict[str, Any]:
     """Return what a run's settings say of the release: root, hash of its manifest, data version, and layouts."""
     return {
-        "root": str(dataset.origin if dataset.origin.remote else dataset.root.resolve()),
+        "root": str(dataset.origin if isinstance(dataset.origin, Remote) else dataset.root.resolve()),
         "manifest_sha256": file_hash(dataset.root / MANIFEST),
         "data_version": dataset.info.data_version,
         "layouts": [layout.name for layout in dataset.layouts],

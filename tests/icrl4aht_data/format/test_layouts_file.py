@@ -26,6 +26,7 @@ from icrl4aht_data.overcooked.state import columns
 from icrl4aht_data.utils.text import listed_names
 from tests.helpers.commands import run_cli
 from tests.helpers.random_releases import make_tasks, random_release
+from tests.helpers.spoiled import read_lines
 
 ROWS = ("WPWWW", "0A A1", "W   W", "WBWXW")
 OTHER = {"family": "other", "seed": None, "number": None}
@@ -67,7 +68,7 @@ def rewritten(root: Path, lines: list[Any]) -> Path:
 
 
 def stored(root: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (root / LAYOUTS_FILE).read_text().splitlines()]
+    return read_lines(root / LAYOUTS_FILE)
 
 
 def test_long_lists_are_cut():

@@ -22,8 +22,9 @@ from icrl4aht_data.reading.shard import Shards
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
+from icrl4aht_data.writing.release_folder import HISTORIES_INDEX
 from tests.helpers.random_releases import SHARD, one_history_release, random_release
-from tests.helpers.spoiled import problems, spoiled
+from tests.helpers.spoiled import problems, read_lines, spoiled
 
 SCRIPT = ExpertLabels(None, "the oracle's", return_greedy=40.0, episodes=200)
 SOURCES = ("noise", "ppo", "ppo", "noise")
@@ -98,8 +99,7 @@ def test_published_files_omit_the_additions(lite_mixed, tmp_path):
     to_published(before, tmp_path / "files")
     with h5py.File(tmp_path / "files" / "histories.h5") as file:
         assert all("oracle_actions" not in group and "expert_actions" in group for group in file.values())
-    lines = [json.loads(line) for line in (tmp_path / "files" / "histories_index.jsonl").read_text().splitlines()]
-    assert [line["env_idx"] for line in lines] == [0, 1, 0, 1, 2, 3]
+    assert [line["env_idx"] for line in read_lines(tmp_path / "files" / HISTORIES_INDEX)] == [0, 1, 0, 1, 2, 3]
     from_published(tmp_path / "files", tmp_path / "back", data_version="0.0.1", kept_steps=20)
     assert verify_release(tmp_path / "back", level="deep").ok
     after = load_icrl4aht(tmp_path / "back")

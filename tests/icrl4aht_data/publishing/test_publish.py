@@ -26,6 +26,7 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from tests.helpers.commands import run_cli
 from tests.helpers.paths import ROOT
 from tests.helpers.random_releases import random_history, random_release
+from tests.helpers.spoiled import read_lines
 
 DAY = datetime.date(2026, 1, 2)
 
@@ -147,7 +148,7 @@ def test_croissant_is_valid_and_its_records_equal_the_index(published):
         records = list(described.records("histories"))
         episodes = list(described.records("episodes"))
     assert (described.metadata.ctx.issues.errors, described.metadata.ctx.issues.warnings) == (set(), set())
-    lines = [json.loads(line) for line in (published / "meta/histories.jsonl").read_text().splitlines()]
+    lines = read_lines(published / "meta/histories.jsonl")
     assert len(records) == len(lines)
     for record in records:
         found = {name.removeprefix("histories/"): value for name, value in record.items()}

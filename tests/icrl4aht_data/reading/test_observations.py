@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from typing import Any
 
@@ -13,16 +12,17 @@ import pytest
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import write_tasks
 from icrl4aht_data.errors import IndexFormatError, LabelsMissingError, NotStoredError, OptionError, PublishedFormatError
-from icrl4aht_data.format.manifest import write_manifest
-from icrl4aht_data.format.schema import KINDS
+from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS
 from icrl4aht_data.interop import hf_episodes
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import PUBLISHED_FIELDS, from_published, to_published
+from icrl4aht_data.writing.release_folder import HISTORIES_INDEX
 from tests.helpers.batches import CACHES
 from tests.helpers.published_files import KEPT, SHARD
 from tests.helpers.random_releases import long_index, make_tasks, one_history_release, random_release
+from tests.helpers.spoiled import change_file, read_lines, spoil
 
 
 class TestConversion:
@@ -30,7 +30,7 @@ class TestConversion:
         folder, written = published_folder
         dataset = load_icrl4aht(converted_release, obs="uint8")
         assert dataset.info.kind == "observations"
-        lines = [json.loads(line) for line in (folder / "histories_index.jsonl").read_text().splitlines()]
+        lines = read_lines(folder / HISTORIES_INDEX)
         by_stream = {history.entry.env_idx: history for history in dataset}
         for line, arrays in zip(lines, written, strict=True):
             history = by_stream[line["env_idx"]]
@@ -143,11 +143,8 @@ class TestFaults:
     )
     def test_files_with_faults(self, published_folder, tmp_path, spoil, message):
         files = shutil.copytree(published_folder[0], tmp_path / "files")
-        path = files / "histories_index.jsonl"
-        lines = [json.loads(line) for line in path.read_text().splitlines()]
         with h5py.File(files / "histories.h5", "r+") as file:
-            spoil(file, lines)
-        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+            change_file(files / HISTORIES_INDEX, lambda lines: spoil(file, lines))
         if message is None:
             from_published(files, tmp_path / "out", kept_steps=KEPT)
             assert verify_release(tmp_path / "out").ok
@@ -226,20 +223,15 @@ class TestWithoutStates:
 
     def test_a_large_index_counts_teammate_actions(self, tmp_path):
         long_index(tmp_path / "r")
-        info, index = tmp_path / "r" / "meta" / "info.json", tmp_path / "r" / "meta" / "histories.jsonl"
-        lines = [json.loads(line) for line in index.read_text().splitlines()]
-        for number, line in enumerate(lines):
-            line["has_teammate_actions"] = number % 3 > 0
-        index.write_text("".join(json.dumps(line) + "\n" for line in lines))
-        write_manifest(tmp_path / "r")
+        has = [number % 3 > 0 for number in range(3000)]
+        change = {number: {"has_teammate_actions": value} for number, value in enumerate(has)}
+        spoil(tmp_path / "r", HISTORIES, lambda lines: [lines[number].update(change[number]) for number in change])
         with pytest.raises(
             IndexFormatError, match=r"histories\.jsonl, line 1: expected has_teammate_actions true in a lite"
         ):
             load_icrl4aht(tmp_path / "r")
-        info.write_text(json.dumps(json.loads(info.read_text()) | {"kind": "observations"}))
-        write_manifest(tmp_path / "r")
-        dataset = load_icrl4aht(tmp_path / "r")
-        assert dataset.column("has_teammate_actions").tolist() == [n % 3 > 0 for n in range(3000)]
+        spoil(tmp_path / "r", INFO, lambda info: info.update(kind="observations"))
+        assert load_icrl4aht(tmp_path / "r").column("has_teammate_actions").tolist() == has
 
 
 class TestBatches:

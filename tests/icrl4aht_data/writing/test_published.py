@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -18,19 +17,17 @@ from icrl4aht_data.format.schema import PROVENANCE
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.overcooked.observe import fixed_channels
 from icrl4aht_data.writing.published import from_published, to_published
+from icrl4aht_data.writing.release_folder import HISTORIES_INDEX
 from tests.helpers.damages import contents
 from tests.helpers.published_files import KEPT
 from tests.helpers.random_releases import random_release
+from tests.helpers.spoiled import change_file
 
 
 def relabel(source: Path, target: Path, changes: dict[int, dict[str, Any]]) -> Path:
     """Copy published files with changed index lines."""
     shutil.copytree(source, target)
-    path = target / "histories_index.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    for number, change in changes.items():
-        lines[number].update(change)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    change_file(target / HISTORIES_INDEX, lambda lines: [lines[number].update(changes[number]) for number in changes])
     return target
 
 

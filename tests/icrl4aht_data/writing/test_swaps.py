@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.tasks import teammate_id
 from icrl4aht_data.dataset import teammate_ids, teammate_names
 from icrl4aht_data.errors import IndexFormatError, OptionError
-from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import HISTORIES
 from icrl4aht_data.writing.card import facts, render_card
@@ -20,6 +18,7 @@ from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
 from tests.helpers.random_releases import random_release
+from tests.helpers.spoiled import problems, read_lines, spoil
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +77,8 @@ def test_combinations_keep_the_changes(swapped, lite, tmp_path):
     entries, before = load_icrl4aht(tmp_path / "both").entries, load_icrl4aht(swapped).entries
     spans = [entry.teammate_of_episode for entry in entries]
     assert spans == [*(entry.teammate_of_episode for entry in before), None, None]
-    lines = (tmp_path / "both" / HISTORIES).read_text().splitlines()
-    assert ["teammate_of_episode" in json.loads(line) for line in lines] == [True] * 4 + [False] * 2
+    lines = read_lines(tmp_path / "both" / HISTORIES)
+    assert ["teammate_of_episode" in line for line in lines] == [True] * 4 + [False] * 2
 
 
 @pytest.mark.parametrize(
@@ -88,12 +87,10 @@ def test_combinations_keep_the_changes(swapped, lite, tmp_path):
 def test_verification_of_the_episodes(swapped, tmp_path, spans):
     copy = tmp_path / "copy"
     to_release(load_icrl4aht(swapped).select([0]), copy, "lite")
-    line = json.loads((copy / HISTORIES).read_text())
-    (copy / HISTORIES).write_text(json.dumps(line | {"teammate_of_episode": spans}) + "\n")
-    write_manifest(copy)
-    problems = [one.problem for one in verify_release(copy).findings]
-    assert any("expected ascending episodes from 0 to 5 at most" in problem for problem in problems)
-    assert any("teammate_of_episode" in problem and "provenance" in problem for problem in problems)
+    spoil(copy, HISTORIES, lambda lines: lines[0].update(teammate_of_episode=spans))
+    found = problems(copy)
+    assert any("expected ascending episodes from 0 to 5 at most" in problem for problem in found)
+    assert any("teammate_of_episode" in problem and "provenance" in problem for problem in found)
 
 
 def test_a_malformed_teammate_is_refused():
