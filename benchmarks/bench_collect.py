@@ -26,7 +26,7 @@ from typing import Any
 import click
 import h5py
 import jax
-from icrl4aht_generation.collection.job import run_task
+from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.task import make_learner
 from icrl4aht_generation.collection.task_folder import last_timing
 from icrl4aht_generation.learners.config import Widths
@@ -66,15 +66,15 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
     """Return the timing of a collection of the profile's last heuristic task, stopped after `updates` updates."""
     work = _first_heuristic(profile)
 
-    def report(update: int, metrics: dict[str, float]) -> None:
-        if update + 1 == updates:
+    def report(done: int, speed: float) -> None:
+        if done == updates:
             raise _EnoughError
 
     with tempfile.TemporaryDirectory() as folder:
-        artefact = Path(folder) / work.name
+        job = CollectionJob(work, profile, Path(folder))
         with suppress(_EnoughError):
-            run_task(work, profile, artefact, report, save_seconds=save_seconds)
-        return last_timing(artefact) or {}
+            job.run(report, save_seconds=save_seconds)
+        return last_timing(job.folder) or {}
 
 
 def _first_heuristic(profile: Profile) -> Work:
@@ -101,10 +101,7 @@ def noise_speed(layout: str) -> dict[str, Any]:
     mate = heuristic_teammate("utility_greedy", "default", 0)
     tasks = [make_task(track_of(layout), "train", layout, mate, seed) for seed in range(2)]
     with tempfile.TemporaryDirectory() as folder:
-        first, second = (
-            elapsed(lambda task=task: run_task(Work(task, "noise"), profile, Path(folder) / task.task_id))
-            for task in tasks
-        )
+        first, second = (elapsed(CollectionJob(Work(task, "noise"), profile, Path(folder)).run) for task in tasks)
     transitions = _NOISE.histories * _NOISE.episodes * KEPT_STEPS
     return {
         "layout": layout,

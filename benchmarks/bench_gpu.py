@@ -55,7 +55,7 @@ from jax.extend.backend import get_backend
 from jaxlib import version as jaxlib_version
 
 from benchmarks.bench_learn import heuristic_learner, size_options
-from benchmarks.harness import compile_measured, print_line, run_isolated
+from benchmarks.harness import compile_measured, elapsed, print_line, run_isolated
 from icrl4aht_data import load_icrl4aht
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
@@ -133,9 +133,7 @@ def seconds_of_calls(call: Callable[[], Any], seconds: float, least: int = 3) ->
     jax.block_until_ready(call())
     found: list[float] = []
     while len(found) < least or sum(found) < seconds:
-        started = time.perf_counter()
-        jax.block_until_ready(call())
-        found.append(time.perf_counter() - started)
+        found.append(elapsed(lambda: jax.block_until_ready(call())))
     return found
 
 

@@ -195,21 +195,18 @@ def layouts(
 
         with progress_bars(unit="layouts") as show:
             delivered = layouts_delivered(found, counted(show, "check", count)).tolist()
-    rows = [
-        {
+    rows, lines = [], []
+    for layout, one in zip(found, delivered, strict=True):
+        row = {
             "name": layout.name,
             "split": split_of(layout),
             "rows": layout.rows,
             "recipes": layout.recipes,
             "indicates_delivery": layout.indicates_delivery,
         }
-        | ({"delivered": one} if check else {})
-        for layout, one in zip(found, delivered, strict=True)
-    ]
-    lines = []
-    for layout, one in zip(found, delivered, strict=True):
+        rows.append(row | ({"delivered": one} if check else {}))
         size, fault = f"{layout.width}x{layout.height}", "  no soup delivered" if one is False else ""
-        lines.append(f"{layout.name:<20} {split_of(layout):<10} {size:<5} {len(layout.recipes):>2} recipes{fault}")
+        lines.append(f"{layout.name:<20} {row['split']:<10} {size:<5} {len(layout.recipes):>2} recipes{fault}")
     print_result(rows, "\n".join(lines), as_json)
     if out:
         click.echo(f"wrote {out}", err=as_json)
@@ -225,10 +222,10 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
 
     Prints tasks, environment steps, disk space, and hours at the speed that is measured here. Writes nothing.
     """
-    from icrl4aht_generation.planning.plan import estimate_cost
+    from icrl4aht_generation.planning.plan import cost_rows, estimate_cost
 
     cost = estimate_cost(_profile_with_threads(profile_name, None), devices)
-    print_result(asdict(cost), "\n".join(f"{name:<28} {value}" for name, value in cost.rows()), as_json)
+    print_result(cost, "\n".join(f"{name:<28} {value}" for name, value in cost_rows(cost)), as_json)
 
 
 @click.command(epilog=examples("icrl4aht-data check build/smoke build/again"))

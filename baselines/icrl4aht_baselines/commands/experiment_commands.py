@@ -122,12 +122,7 @@ def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None
     seeds 0, 1 and 2. Writes their results into OUT, and OUT/headroom.json, OUT/headroom.md and OUT/stay.json from them,
     and OUT/behaviours.json: which test teammates act alike.
     """
-    from icrl4aht_baselines.headroom import (
-        HEADROOM_FILES,
-        find_alike_tasks,
-        measure_headroom,
-        write_headroom_cards,
-    )
+    from icrl4aht_baselines.headroom import HEADROOM_FILES, find_alike_tasks, measure_headroom, write_headroom_cards
 
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:

@@ -13,15 +13,7 @@ from icrl4aht_baselines.commands.options import find_ego
 from icrl4aht_baselines.training.options import FILTERS, HistoryOptions
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.commands.dataclass_options import OptionValue, dataclass_options
-from icrl4aht_data.commands.options import (
-    COUNT,
-    TRACK,
-    Folder,
-    Names,
-    NewFile,
-    examples,
-    overwrite_option,
-)
+from icrl4aht_data.commands.options import COUNT, TRACK, Folder, Names, NewFile, examples, overwrite_option
 from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.layouts_file import read_tasks_and_layouts

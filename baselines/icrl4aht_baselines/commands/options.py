@@ -13,12 +13,7 @@ import click
 from click.core import ParameterSource
 
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, SIZES, UNUSED_BY_RL2, ModelOptions
-from icrl4aht_baselines.training.options import (
-    ALL_LAYOUTS,
-    HistoryOptions,
-    PlayOptions,
-    TrainOptions,
-)
+from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_data.benchmark.facts import TRACKS
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.commands.dataclass_options import dataclass_options, topic

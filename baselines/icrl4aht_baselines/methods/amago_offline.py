@@ -20,14 +20,7 @@ from icrl4aht_generation.learners.encoder import encoding_log
 from jaxtyping import Array, Float
 
 from icrl4aht_baselines.methods.ad import StepOutput, auxiliary_losses, make_step_model, step_method
-from icrl4aht_baselines.methods.method import (
-    Method,
-    World,
-    cross_entropy,
-    make_transformer,
-    mean_of_rows,
-    run_model,
-)
+from icrl4aht_baselines.methods.method import Method, World, cross_entropy, make_transformer, mean_of_rows, run_model
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.tokens import batch_steps
 from icrl4aht_data.sampling.ad import ADBatch

@@ -44,14 +44,14 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
         UnknownNameError: if there is no such method; lists the valid names and the nearest.
         PluginError: if a registered method cannot be used; also raised by the returned function.
     """
-    if name not in METHODS and name not in METHOD_PLUGINS.names:
+    if name in METHODS:
+        return METHODS[name]
+    if name not in METHOD_PLUGINS.names:
         raise unknown("method", name, all_methods())
-    make = METHODS.get(name) or METHOD_PLUGINS.load(name, Callable)
+    make = METHOD_PLUGINS.load(name, Callable)
 
     def make_checked(options: ModelOptions, world: World) -> Method:
         method = make(options, world)
-        if name in METHODS:
-            return method
         if not isinstance(method, Method):
             raise METHOD_PLUGINS.error(name, f"expected a function that returns a Method, it returned {method!r:.100}")
         if method.name != name or method.data not in ("ad", "dpt"):

@@ -1,5 +1,7 @@
 """Changes of what an ego sees, the same in all steps of a task: mirrored windows, and hidden recipe indicators.
 
+Batches state the mirroring of their rows with the numbers of their layouts, see `changed_view`.
+
 The game has no preferred direction, so a mirrored task is another task of the same kind, played on the mirrored layout.
 Models that are tested on other layouts than they are trained on learn from mirrored tasks, too. A hidden recipe
 indicator looks like a counter, as on layouts without an indicator.
@@ -122,3 +124,52 @@ def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> Bat
         return ViewChange(*(flag.reshape(-1, *within) for flag in change)).observations(obs)
 
     return view
+
+
+class NumberedBatches:
+    """A sampler's batches of state records, with other numbers of the layouts, perhaps mirrored at random.
+
+    Args:
+        sampler: of histories on some of the layouts.
+        numbers: int32, new number of each layout of `sampler.layouts`.
+        layouts: number of all layouts, to mirror each row at random, see `changed_view`; 0 mirrors none.
+    """
+
+    def __init__(self, sampler: Any, numbers: np.ndarray, layouts: int = 0) -> None:
+        self._sampler, self._numbers, self._layouts = sampler, numbers, layouts
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sampler, name)
+
+    def __getitem__(self, i: int) -> Any:
+        return self.batch(i)
+
+    def batch(self, i: int, out: Any = None) -> Any:
+        """Return batch i, written into `out` if it is given."""
+        batch = self._sampler.batch(i, out)
+        rows = len(batch.obs if hasattr(batch, "obs") else batch.query_obs)
+        # A sampler of one layout does not number it.
+        numbers = self._numbers[np.zeros(rows, np.int32) if batch.layouts is None else batch.layouts]
+        if not self._layouts:
+            return batch._replace(layouts=numbers)
+        # The mirroring is a function of the batch's number and process, as the batch itself is.
+        drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
+        mirroring = drawn.integers(4, size=rows, dtype=np.int32)
+        actions = {
+            name: mirrored_action(values, mirroring)
+            for name, values in batch._asdict().items()
+            if values is not None and (name.endswith("actions") or name == "query_target")
+        }
+        if hasattr(batch, "is_first"):  # no step precedes: the fillers stay 0, as they are when a model acts
+            filler = batch.is_first | ~batch.attention_mask
+            actions |= {name: np.where(filler, 0, actions[name]) for name in actions if name.startswith("prev_")}
+        return batch._replace(**actions, layouts=numbers + self._layouts * mirroring)
+
+
+def number_layouts(sampler: Any, layouts: Sequence[Layout], mirror: bool = False) -> Any:
+    """Return the sampler with its layouts numbered as in `layouts`; its histories may be on some of these only."""
+    numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
+    if mirror:
+        return NumberedBatches(sampler, numbers, len(layouts))
+    agree = sampler.dataset.obs != "state" or numbers.tolist() == list(range(len(layouts)))
+    return sampler if agree else NumberedBatches(sampler, numbers)

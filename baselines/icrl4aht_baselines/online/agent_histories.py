@@ -44,13 +44,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.fetch import Remote
 from icrl4aht_data.format.checkpoints import checkpoint_files
-from icrl4aht_data.format.provenance import (
-    ExpertLabels,
-    LabelView,
-    Provenance,
-    ReferenceEgos,
-    TeammateSwaps,
-)
+from icrl4aht_data.format.provenance import ExpertLabels, LabelView, Provenance, ReferenceEgos, TeammateSwaps
 from icrl4aht_data.format.schema import TASKS, TEAMMATES, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from icrl4aht_generation.layouts.rearranged import rearranged_layouts, with_four_recipes
@@ -17,7 +17,7 @@ from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.online.rl2 import PlayTrainer, TaskGroup, make_group, make_groups
 from icrl4aht_baselines.online.teammates import check_heuristics
-from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cells
+from icrl4aht_baselines.training.histories import filter_histories, history_settings, training_cell, training_cells
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, HistoryOptions, PlayOptions, TrainOptions
 from icrl4aht_baselines.training.seen import TASKS_SOURCE
 from icrl4aht_baselines.training.trainer import TrainingData, TrainingTask
@@ -28,7 +28,6 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
-from icrl4aht_data.utils.files import json_hash
 
 FLAT_SHARE = 0.3
 """Number of tasks on a layout on which no ego earns more than `stay` does, as a share of that on other layouts."""
@@ -40,19 +39,7 @@ REARRANGED_SHARE = 1.5
 """Number of tasks on all rearranged versions of a layout, as a share of that on the layout."""
 
 
-class _Teammate(NamedTuple):
-    """A training teammate on one layout.
-
-    Attributes:
-        entry: its kind, family and parameters, as in a task.
-        policy: how it plays.
-    """
-
-    entry: dict[str, Any]
-    policy: Policy
-
-
-_Teammates = dict[tuple[Layout, str], dict[str, _Teammate]]
+_Teammates = dict[tuple[Layout, str], dict[str, Policy]]
 """(layout, kind of the teammates) -> task id -> teammate. A task with a dish of its own has a layout with that dish."""
 
 
@@ -157,15 +144,15 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
         for task_id, history_id in history_of.items():
             layout, teammate = dataset.history_task(history_id).layout, dataset.recover_teammate(history_id)
             if teammate["kind"] == "rl":
-                mate = _Teammate(teammate, recover_teammate(dataset, history_id))
-                found.setdefault((layout, teammate["family"]), {})[task_id] = mate
+                mates = found.setdefault((layout, teammate["family"]), {})
+                mates[task_id] = recover_teammate(dataset, history_id)
             else:
                 scripted.append((layout, task_id, teammate))
     # Heuristics of one family play in one program, so all need the same parameters.
     entries = with_equal_parameters([teammate for _, _, teammate in scripted])
     for (layout, task_id, teammate), entry in zip(scripted, entries, strict=True):
         mates = found.setdefault((layout, teammate["family"]), {})
-        mates[task_id] = _Teammate(teammate, build_teammate(None, entry))
+        mates[task_id] = build_teammate(None, entry)
     return found
 
 
@@ -208,19 +195,15 @@ def _groups(
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
     rearranged = {layout: REARRANGED_SHARE * shares[layout.name] for layout in heuristics if play.rearranged}
     fixed = round(tasks * total / (total + sum(rearranged.values())))
-    groups = make_groups({key: _policies(mates) for key, mates in everywhere.items()}, fixed, shares, hidden)
+    groups = make_groups(everywhere, fixed, shares, hidden)
     for layout, share in rearranged.items():
         count = round((tasks - fixed) * share / sum(rearranged.values()))
         groups += _rearranged_groups(layout, heuristics[layout], count, play.rearranged, layout.name in hidden)
     return groups
 
 
-def _policies(mates: Mapping[str, _Teammate]) -> dict[str, Policy]:
-    return {task: mate.policy for task, mate in mates.items()}
-
-
-def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Teammate]]]:
-    """Return the heuristic teammates of each layout by kind: they can be built on other layouts as well.
+def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Policy]]]:
+    """Return the heuristic teammates of each layout by kind: they see a `Situation`, and so play every layout.
 
     Raises:
         OptionError: if a layout has learned teammates alone, or tasks with a dish of their own, which other versions of
@@ -232,9 +215,9 @@ def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Team
                 f"{layout.name}: has tasks with a fixed dish, which rearranged layouts and four recipes do not keep; "
                 f"leave out --rearranged and --four-recipes, or these tasks"
             )
-    found: dict[Layout, dict[str, dict[str, _Teammate]]] = {layout: {} for layout, _ in teammates}
+    found: dict[Layout, dict[str, dict[str, Policy]]] = {layout: {} for layout, _ in teammates}
     for (layout, kind), mates in teammates.items():
-        if all(mate.entry["kind"] == "heuristic" for mate in mates.values()):
+        if all(mate.sees == "situation" for mate in mates.values()):
             found[layout][kind] = mates
     for layout, kinds in found.items():
         if not kinds:
@@ -246,7 +229,7 @@ def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, _Team
 
 
 def _rearranged_groups(
-    layout: Layout, kinds: Mapping[str, dict[str, _Teammate]], tasks: int, versions: int, hidden: bool
+    layout: Layout, kinds: Mapping[str, dict[str, Policy]], tasks: int, versions: int, hidden: bool
 ) -> Iterator[TaskGroup]:
     """Yield a group of each kind of teammates on rearranged versions of a layout.
 
@@ -261,7 +244,7 @@ def _rearranged_groups(
         count = max(len(own), round(tasks * len(own) / versions))
         # In turn, so that the numbers of tasks of two versions differ by one at most.
         where = [own[task % len(own)] for task in range(count)]
-        yield make_group(where, kind, _policies(mates), hidden, f"{layout.name} rearranged")
+        yield make_group(where, kind, mates, hidden, f"{layout.name} rearranged")
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
@@ -298,18 +281,7 @@ def _played_cells(
     for task in tasks:
         if task.task_id in played:
             cells[task.layout.name, task.split, task.teammate_family, task.teammate_kind].append(task)
-    return found + [
-        {
-            "layout": layout,
-            "split": split,
-            "family": family,
-            "algorithm": kind,
-            "source": TASKS_SOURCE,
-            "labels": labels,
-            "tasks": len(of_cell),
-            "histories": 0,
-            "tasks_hash": json_hash(sorted(task.task_id for task in of_cell)),
-            "teammates": sorted({teammate_id(task.teammate) for task in of_cell}),
-        }
-        for (layout, split, family, kind), of_cell in cells.items()
-    ]
+    for cell, own in cells.items():
+        ids, mates = [task.task_id for task in own], sorted({teammate_id(task.teammate) for task in own})
+        found.append(training_cell((*cell, TASKS_SOURCE), labels, ids, 0, mates))
+    return found

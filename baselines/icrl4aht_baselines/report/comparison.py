@@ -33,7 +33,6 @@ from icrl4aht_baselines.report.scores import (
     known_headroom,
     open_cells,
     score_difference,
-    track_cells,
 )
 from icrl4aht_baselines.report.statistics import MeanInterval, holm
 from icrl4aht_baselines.report.submission import SUBMITTED_PROTOCOL, AgentFacts, Submission, submitted_runs
@@ -242,7 +241,7 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
             texts = [facts.data, facts.labels, ", ".join(filter(None, (facts.steps, hours))) or "–"]
         row = [f"`{agent}`{overlap_marks(marks)}", *texts]
         for track in TRACKS:
-            score = find_score(cells, track_cells(open_cells(scales), track), scales)
+            score = find_score(cells, open_cells(scales, track), scales)
             row += [_shown(score and score.total), _shown(score and score.middle)]
         body.append(row)
     scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")]
@@ -251,7 +250,7 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
 
 def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
     """Return a sentence on the difference between the two agents with the highest primary endpoint; or why none."""
-    cells = track_cells(open_cells(scales), "teammate")
+    cells = open_cells(scales, "teammate")
     scores = {agent: found.total.mean for agent, of in results.items() if (found := find_score(of, cells, scales))}
     if len(scores) < 2:
         return "No two models have a score on the track `teammate`."
@@ -302,7 +301,7 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
     for agent in agents:
         cells, cleared, texts = results.get(agent, {}), controls.get(agent, {}), []
         for track in TRACKS:
-            score = find_score(cells, track_cells(open_cells(scales), track), scales)
+            score = find_score(cells, open_cells(scales, track), scales)
             texts.append(f"N {_shown(score and score.total)} on track {track}")
         memory = block_difference(cells, cleared, _controlled_cells(cells, scales), "all")
         texts.append(f"M {_shown(memory, 1, '+')}")

@@ -32,7 +32,7 @@ from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.evaluate.protocols import Protocol, bundled_tasks
 from icrl4aht_baselines.evaluate.results import RESULTS, Result, read_result
 from icrl4aht_baselines.training.run_folder import read_config
-from icrl4aht_baselines.training.seen import OVERLAPS, TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on
+from icrl4aht_baselines.training.seen import TRAINED_ON, SeenInTraining, find_overlaps, read_trained_on, sorted_overlaps
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, PREFERENCE, TRACKS, family_order, layout_order, track_of
 from icrl4aht_data.benchmark.tasks import Task, write_tasks
 from icrl4aht_data.errors import OptionError
@@ -142,8 +142,7 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
         values = np.full([len(axis) for axis in axes], np.nan)
         values[codes] = rows["return"]
         blocks = {str(name): values[..., number] for number, name in enumerate(axes[3])}
-        marked = " ".join(rows["overlap"].unique()).split()
-        overlaps = tuple(name for name in OVERLAPS if name in marked)
+        overlaps = sorted_overlaps(" ".join(rows["overlap"].unique()).split())
         cell = ResultCell._make(map(str, key))
         if np.isnan(values).any():
             raise OptionError(f"{cell.title}: results of trainings with unequal tasks, seeds or episodes")
@@ -231,8 +230,7 @@ class EvaluationRun:
 
     def overlaps(self, cells: Iterable[ResultCell]) -> tuple[str, ...]:
         """Return the kinds of overlap between training data and the tasks of some cells, see `seen.OVERLAPS`."""
-        found = {name for cell in cells for name in self.returns[cell].overlaps}
-        return tuple(name for name in OVERLAPS if name in found)
+        return sorted_overlaps(name for cell in cells for name in self.returns[cell].overlaps)
 
     @cached_property
     def returns(self) -> dict[ResultCell, CellReturns]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -149,20 +149,16 @@ def add_scales(table: pd.DataFrame) -> pd.DataFrame:
     return scaled
 
 
-def open_cells(scales: CellScales) -> list[ResultCell]:
-    """Return the test cells with headroom, in the paper's order."""
-    return in_order(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
+def open_cells(scales: CellScales, track: str | None = None) -> list[ResultCell]:
+    """Return the test cells with headroom, all or those of a track, in the paper's order."""
+    cells = in_order(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
+    return [cell for cell in cells if track is None or cell.layout in TRACKS[track]["test"]]
 
 
 def known_headroom(protocol: str) -> dict[ResultCell, bool]:
     """Return whether each measured cell has headroom: by best responses, or by the oracle where there are none."""
     egos = {ResultCell(*cell): has_headroom(of_cell) for cell, of_cell in read_headroom(protocol).items()}
     return egos | {cell: scale.has_headroom for cell, scale in cell_scales(protocol).items()}
-
-
-def track_cells(cells: Iterable[ResultCell], track: str) -> list[ResultCell]:
-    """Return the test cells of a track among some cells."""
-    return [cell for cell in cells if cell.kind == "test" and cell.layout in TRACKS[track]["test"]]
 
 
 class Score(NamedTuple):
@@ -282,17 +278,16 @@ def block_difference(
 
 def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
     """Return the results of two agents in a cell on the tasks, seeds and trainings that both have, in one order."""
-    tasks = tuple(task for task in one.tasks if task in other.tasks)
-    seeds = tuple(seed for seed in one.seeds if seed in other.seeds)
-    trainings = tuple(number for number in one.trainings if number in other.trainings)
+    axes = [(of.trainings, of.tasks, of.seeds) for of in (one, other)]
+    common = [tuple(key for key in first if key in second) for first, second in zip(*axes, strict=True)]
 
-    def chosen(found: CellReturns) -> CellReturns:
-        rows, columns = [found.tasks.index(task) for task in tasks], [found.seeds.index(seed) for seed in seeds]
-        numbers = [found.trainings.index(number) for number in trainings]
-        blocks = {name: values[numbers][:, rows][:, :, columns] for name, values in found.blocks.items()}
+    def chosen(found: CellReturns, own: tuple[tuple[Any, ...], ...]) -> CellReturns:
+        places = np.ix_(*([axis.index(key) for key in keys] for axis, keys in zip(own, common, strict=True)))
+        blocks = {name: values[places] for name, values in found.blocks.items()}
+        trainings, tasks, seeds = common
         return CellReturns(tasks, seeds, blocks, found.overlaps, trainings)
 
-    return chosen(one), chosen(other)
+    return chosen(one, axes[0]), chosen(other, axes[1])
 
 
 def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellScales) -> list[ResultCell]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -19,8 +19,7 @@ from icrl4aht_baselines.methods.method import Method
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import PLAYING, get_method, overcooked_world
 from icrl4aht_baselines.methods.tokens import BatchView, plain_view
-from icrl4aht_baselines.methods.view_change import changed_view
-from icrl4aht_baselines.training.layout_numbers import number_layouts
+from icrl4aht_baselines.methods.view_change import changed_view, number_layouts
 from icrl4aht_baselines.training.options import ALL_LAYOUTS, FILTERS, HistoryOptions, TrainOptions
 from icrl4aht_baselines.training.run_folder import CHECKPOINTS, read_config
 from icrl4aht_baselines.training.seen import TRAINED_ON
@@ -193,11 +192,23 @@ def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[
     cells = []
     for cell, own in table.groupby([*_CELL_FIELDS]):
         history_of = dict(zip(own["task"], own["history"].tolist(), strict=True))
-        sizes = {"labels": labels, "tasks": len(history_of), "histories": len(own)}
-        tasks_hash, teammates = json_hash(sorted(history_of)), teammate_ids(dataset, [*history_of.values()])
-        named = dict(zip(_CELL_FIELDS, cell, strict=True))
-        cells.append(named | sizes | {"tasks_hash": tasks_hash, "teammates": teammates})
+        teammates = teammate_ids(dataset, [*history_of.values()])
+        cells.append(training_cell(map(str, cell), labels, history_of, len(own), teammates))
     return cells
+
+
+def training_cell(
+    cell: Iterable[str], labels: Labels | None, tasks: Collection[str], histories: int, teammates: list[str] | None
+) -> dict[str, Any]:
+    """Return an entry of the record of training data, see `training_cells`.
+
+    Args:
+        cell: layout, split, teammate family, algorithm and source.
+        labels, histories, teammates: see `training_cells`.
+        tasks: ids of the tasks.
+    """
+    sizes = {"labels": labels, "tasks": len(tasks), "histories": histories, "tasks_hash": json_hash(sorted(tasks))}
+    return dict(zip(_CELL_FIELDS, cell, strict=True)) | sizes | {"teammates": teammates}
 
 
 def _sampler(

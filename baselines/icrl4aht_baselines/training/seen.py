@@ -91,6 +91,12 @@ OVERLAPS = {
 """Way in which training data and the tasks of an evaluation overlap -> its mark behind a score, and what it means."""
 
 
+def sorted_overlaps(names: Iterable[str]) -> tuple[str, ...]:
+    """Return kinds of overlap in the order of `OVERLAPS`, each once."""
+    found = set(names)
+    return tuple(name for name in OVERLAPS if name in found)
+
+
 def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[str, ...]:
     """Return the names of the kinds of overlap between tasks and training data, in the order of `OVERLAPS`.
 
@@ -108,28 +114,23 @@ def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[s
         # Other tasks than the tests of the layout track are on training layouts by design.
         if (task.track, task.split) == ("layout", "test") and task.layout.name in seen.layouts:
             found.add("layout")
-    return tuple(name for name in OVERLAPS if name in found)
-
-
-def _overlap_kinds(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return marks and meanings in the order of `OVERLAPS`."""
-    return [OVERLAPS[name] for name in sorted(set(names), key=[*OVERLAPS].index)]
+    return sorted_overlaps(found)
 
 
 def overlap_marks(overlaps: Iterable[str]) -> str:
     """Return the marks of kinds of overlap, such as " †§"; empty if there is none."""
-    marks = "".join(mark for mark, _ in _overlap_kinds(overlaps))
+    marks = "".join(OVERLAPS[name][0] for name in sorted_overlaps(overlaps))
     return f" {marks}" if marks else ""
 
 
 def overlap_legend(overlaps: Iterable[str]) -> list[str]:
     """Return an explanation of each mark, such as "† ...", in the order of `OVERLAPS`."""
-    return [f"{mark} {meaning}" for mark, meaning in _overlap_kinds(overlaps)]
+    return [" ".join(OVERLAPS[name]) for name in sorted_overlaps(overlaps)]
 
 
 def describe_overlap(overlaps: Iterable[str]) -> str:
     """Return a sentence on kinds of overlap."""
-    texts = "; ".join(meaning for _, meaning in _overlap_kinds(overlaps))
+    texts = "; ".join(OVERLAPS[name][1] for name in sorted_overlaps(overlaps))
     return f"Overlap with the training data: {texts}." if texts else "No overlap with the training data."
 
 

@@ -84,10 +84,9 @@ class JaxMARLEnv(MultiAgentEnv):
         self.possible_recipes = jnp.array(self.layout.recipes, jnp.int32)
         self._recipe_items = jnp.array(self.layout.recipe_items)
         self._recipe_codes = jax.vmap(DynamicObject.get_recipe_encoding)(self.possible_recipes)
-        self._observed = spaces.Box(0, 255, observation_shape(self.layout, self._canonical), jnp.uint8)
-        self._played = spaces.Discrete(len(ACTIONS))
-        self.observation_spaces = dict.fromkeys(self.agents, self._observed)
-        self.action_spaces = dict.fromkeys(self.agents, self._played)
+        observed = spaces.Box(0, 255, observation_shape(self.layout, self._canonical), jnp.uint8)
+        self.observation_spaces = dict.fromkeys(self.agents, observed)
+        self.action_spaces = dict.fromkeys(self.agents, spaces.Discrete(len(ACTIONS)))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.layout.name}, episodes of {counted_noun(self.max_steps, 'step')})"
@@ -148,11 +147,11 @@ class JaxMARLEnv(MultiAgentEnv):
 
     def observation_space(self, agent: str = "") -> spaces.Box:
         """Return the space of observations, the same for both agents; JaxMARL's learners ask without an agent."""
-        return self._observed
+        return self.observation_spaces[self.agents[0]]
 
     def action_space(self, agent: str = "") -> spaces.Discrete:
         """Return the space of actions, the same for both agents."""
-        return self._played
+        return self.action_spaces[self.agents[0]]
 
     @property
     def name(self) -> str:

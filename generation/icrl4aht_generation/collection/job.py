@@ -8,7 +8,7 @@ from pathlib import Path
 from icrl4aht_data.overcooked.layouts import Layout, add_layouts
 from icrl4aht_generation.collection.scripted import play_histories
 from icrl4aht_generation.collection.scripted_rollout import scripted_pieces
-from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, UpdateCallback, learn_histories
+from icrl4aht_generation.collection.task import TASK_SAVE_SECONDS, learn_histories
 from icrl4aht_generation.collection.task_folder import is_task_finished, last_timing, partial_folder, publish_artefact
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.resume import run_lock
@@ -16,44 +16,6 @@ from icrl4aht_generation.profiles import Profile, Work
 
 _MAKERS = {"ppo": learn_histories, "noise": play_histories, "search": play_histories}
 """Source -> function that makes an artefact in its partial folder, or resumes it there."""
-
-
-def run_task(
-    work: Work,
-    profile: Profile,
-    folder: Path,
-    on_update: UpdateCallback = lambda update, metrics: None,
-    *,
-    suite: Path | None = None,
-    wait: bool = False,
-    save_seconds: float = TASK_SAVE_SECONDS,
-) -> bool:
-    """Make an artefact, resuming from its last save, unless it is finished.
-
-    Args:
-        work: the unit of work.
-        profile: hyper-parameters, sizes and schedules.
-        folder: the artefact.
-        on_update: called after each update, or each piece that a script plays.
-        suite: folder of the learned teammates, if the task's is one.
-        wait: whether to wait for another process that works on it.
-        save_seconds: least time between two saves.
-
-    Returns:
-        False if the artefact was already finished, otherwise True.
-
-    Raises:
-        BusyError: if another process works on it.
-        DiskFullError: if the disk has no room.
-    """
-    with run_lock(folder, wait=wait):
-        if is_task_finished(folder, work, profile):
-            return False
-        partial = partial_folder(folder)
-        if not is_task_finished(partial, work, profile):  # otherwise a run was killed just before the renaming
-            _MAKERS[work.source](work, profile, partial, on_update, suite, save_seconds)
-        publish_artefact(partial, folder)
-        return True
 
 
 @dataclass(frozen=True)
@@ -95,9 +57,9 @@ class CollectionJob:
     @property
     def updates(self) -> int:
         """Updates of the ego, or pieces that a script plays."""
-        if self.work.source == "ppo":
-            return self.profile.ego_on(self.work.task.layout.name).updates
         layout, source = self.work.task.layout.name, self.work.source
+        if source == "ppo":
+            return self.profile.ego_on(layout).updates
         return len(scripted_pieces(source, self.profile.scripted_on(layout, source)))
 
     @property
@@ -119,14 +81,32 @@ class CollectionJob:
         timing = last_timing(self.folder)
         return (int(timing["update"]) + 1, timing["steps_per_second"]) if timing else None
 
-    def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
-        """Make the artefact, see `jobs.job.Job`."""
+    def run(
+        self,
+        on_update: OnUpdate = lambda updates, speed: None,
+        wait: bool = False,
+        save_seconds: float = TASK_SAVE_SECONDS,
+    ) -> None:
+        """Make the artefact, resuming from its last save, unless it is finished.
+
+        Args:
+            on_update: called after each update, or each piece that a script plays.
+            wait: whether to wait for another process that works on it.
+            save_seconds: least time between two saves.
+
+        Raises:
+            BusyError: if another process works on it.
+            DiskFullError: if the disk has no room.
+        """
         add_layouts(self.layouts)
-
-        def on_metrics(update: int, metrics: dict[str, float]) -> None:
-            on_update(update + 1, metrics["steps_per_second"])
-
-        run_task(self.work, self.profile, self.folder, on_metrics, suite=self.suite, wait=wait)
+        with run_lock(self.folder, wait=wait):
+            if self.is_finished():
+                return
+            partial = partial_folder(self.folder)
+            # A run that was killed just before the renaming has left a finished one.
+            if not is_task_finished(partial, self.work, self.profile):
+                _MAKERS[self.work.source](self.work, self.profile, partial, on_update, self.suite, save_seconds)
+            publish_artefact(partial, self.folder)
 
     def finished_text(self) -> str:
         """Return the text on the finished artefact."""

@@ -12,11 +12,10 @@ The artefact has the arrays of `task_folder`, and
 from __future__ import annotations
 
 import shutil
-import time
+from contextlib import closing
 from pathlib import Path
 
 import jax
-import numpy as np
 
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.format.schema import curve_ends
@@ -24,13 +23,11 @@ from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_generation.collection.curate import stream_returns
 from icrl4aht_generation.collection.scripted_rollout import (
-    Piece,
-    ScriptedEpisodes,
     noise_schedules,
     play_scripted_histories,
     scripted_pieces,
 )
-from icrl4aht_generation.collection.task import TEAMMATE_NOISE, UpdateCallback
+from icrl4aht_generation.collection.task import TEAMMATE_NOISE
 from icrl4aht_generation.collection.task_folder import (
     SCRIPT_ARRAYS,
     ArrayWriter,
@@ -39,6 +36,7 @@ from icrl4aht_generation.collection.task_folder import (
     finish_artefact,
     reserve_disk,
 )
+from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.teammates.registry import build_teammate
@@ -61,9 +59,9 @@ def scripted_bytes(layout: Layout, config: NoiseConfig) -> int:
 
 
 def play_histories(
-    work: Work, profile: Profile, partial: Path, on_update: UpdateCallback, suite: Path | None, save_seconds: float
+    work: Work, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
 ) -> None:
-    """Play the histories of a task into a partial artefact, see `collection.job.run_task`."""
+    """Play the histories of a task into a partial artefact, see `collection.job.CollectionJob`."""
     task, config = work.task, profile.scripted_on(work.task.layout.name, work.source)
     layout = None if task.teammate["kind"] == "heuristic" else task.layout
     teammate = build_teammate(layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
@@ -72,39 +70,20 @@ def play_histories(
     shutil.rmtree(partial, ignore_errors=True)  # left by a killed run
     partial.mkdir(parents=True)
     with reserve_disk(partial, needed):
-        writer = _PieceWriter(partial, task.layout, config, schedules)
-        try:
+        with closing(ArrayWriter(partial, _array_shapes(task.layout, config))) as writer:
+            writer.arrays["noise"][:] = schedules
             played = play_scripted_histories(task.layout, teammate, task.seed, work.source, pieces, schedules)
             for number, (piece, episodes) in enumerate(played):
-                on_update(number, writer.write(number, piece, episodes))
-            writer.write_metrics()
-        finally:
-            writer.close()
+                jax.block_until_ready(episodes)
+                with writer.recording():
+                    for name, values in episodes._asdict().items():
+                        writer.arrays[name].reshape(*schedules.shape, *values.shape[1:])[piece] = values
+                timing = writer.timing(len(piece[0]) * KEPT_STEPS)
+                writer.log.write(timing={"update": number} | timing)
+                on_update(number + 1, timing["steps_per_second"])
+            ends = zip(*curve_ends(stream_returns(writer.arrays["rewards"])), strict=True)
+            for history, (start, end) in enumerate(ends):
+                line = {"return_start": round(float(start), 3), "return_end": round(float(end), 3)}
+                writer.log.write({"update": history} | line)
+            writer.sync()
         finish_artefact(partial, work, profile)
-
-
-class _PieceWriter(ArrayWriter):
-    """Fills the arrays of an artefact and its log, a piece of episodes at a time."""
-
-    def __init__(self, partial: Path, layout: Layout, config: NoiseConfig, schedules: np.ndarray) -> None:
-        super().__init__(partial, _array_shapes(layout, config), True, 0)
-        self._shape = schedules.shape
-        self._arrays["noise"][:] = schedules
-
-    def write(self, number: int, piece: Piece, episodes: ScriptedEpisodes) -> dict[str, float]:
-        """Record a piece; returns its number and timing."""
-        jax.block_until_ready(episodes)
-        began = time.perf_counter()
-        for name, values in episodes._asdict().items():
-            self._arrays[name].reshape(*self._shape, *values.shape[1:])[piece] = values
-        line = {"update": number} | self._timing(len(piece[0]) * KEPT_STEPS, began)
-        self._log.write(timing=line)
-        return line
-
-    def write_metrics(self) -> None:
-        """Write a line for each history, and force everything to the disk."""
-        ends = zip(*curve_ends(stream_returns(self._arrays["rewards"])), strict=True)
-        for history, (start, end) in enumerate(ends):
-            line = {"return_start": round(float(start), 3), "return_end": round(float(end), 3)}
-            self._log.write({"update": history} | line)
-        self.sync()

@@ -7,7 +7,7 @@ and since an update is a pure function of the state, the artefact has the bits o
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from icrl4aht_generation.collection.task_folder import (
     reserve_disk,
 )
 from icrl4aht_generation.env import Environment
+from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.ego import Learner, compiled_update
 from icrl4aht_generation.learners.resume import OtherSettingsError, SaveInterval, StateFile, software_versions
 from icrl4aht_generation.policy import Noise
@@ -36,9 +37,6 @@ TEAMMATE_NOISE: Noise = "seeded"
 TASK_SAVE_SECONDS = 30.0
 """Interval of saves: the work that a kill can cost."""
 
-UpdateCallback = Callable[[int, dict[str, float]], None]
-"""Called after each update with its number and metrics."""
-
 
 def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Learner:
     """Return the untrained ego of a task. `suite` is the folder of learned teammates."""
@@ -47,9 +45,9 @@ def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Lea
 
 
 def learn_histories(
-    work: Work, profile: Profile, partial: Path, on_update: UpdateCallback, suite: Path | None, save_seconds: float
+    work: Work, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
 ) -> None:
-    """Train the ego of a task and record its histories into a partial artefact, see `collection.job.run_task`."""
+    """Train the ego of a task and record its histories into a partial artefact, see `collection.job.CollectionJob`."""
     task, saved = work.task, StateFile(partial / LEARNER, artefact_settings(work, profile) | software_versions())
     learner = make_learner(task, profile, suite)
     first, init, key = saved_progress(saved), jax.jit(learner.init), learner_key(work)
@@ -57,22 +55,19 @@ def learn_histories(
     needed, update = needed_bytes(task, learner.config, state), compiled_update(learner)
 
     with reserve_disk(partial, needed):
-        writer = ArtefactWriter(partial, task, learner.config, first)
         interval = SaveInterval(learner.config.updates, seconds=save_seconds)
         unwritten: Any = None  # written while the device plays the next update
-        try:
+        with closing(ArtefactWriter(partial, task, learner.config, first)) as writer:
             for number in range(first, learner.config.updates):
                 state, rollout, metrics = update(state)
                 writer.write_checkpoint(number + 1, learner.network, state.params)
                 if unwritten is not None:
-                    on_update(number - 1, writer.write(number - 1, *unwritten))
+                    on_update(number, writer.write(number - 1, *unwritten))
                 unwritten = rollout, metrics
                 if interval.due(number + 1):
-                    on_update(number, writer.write(number, *unwritten))
+                    on_update(number + 1, writer.write(number, *unwritten))
                     writer.save(saved, state, number + 1)
                     unwritten = None
-        finally:
-            writer.close()
         finish_artefact(partial, work, profile)
 
 

@@ -246,32 +246,43 @@ class ArrayWriter:
         is_new: whether to create the files.
         kept: lines of the log with an `update` from this number on are cut off.
 
+    Attributes:
+        arrays: name -> memory map.
+        log: the log of metrics and timing.
+
     Raises:
         OSError: if the disk is full.
     """
 
     def __init__(
-        self, partial: Path, shapes: Mapping[str, tuple[tuple[int, ...], str]], is_new: bool, kept: int
+        self, partial: Path, shapes: Mapping[str, tuple[tuple[int, ...], str]], is_new: bool = True, kept: int = 0
     ) -> None:
         self._partial, self._names = partial, tuple(shapes)
         self._started, self._steps, self._recording, self._has_written = time.perf_counter(), 0, 0.0, False
         if is_new:
             for name, (shape, dtype) in shapes.items():
                 new_mapped_array(partial / f"{name}.npy", shape, np.dtype(dtype))
-        self._log = RunLog(partial, keep=lambda line: line["update"] < kept)
-        self._arrays = self._mapped()
+        self.log = RunLog(partial, keep=lambda line: line["update"] < kept)
+        self.arrays = self._mapped()
 
     def _mapped(self) -> dict[str, Any]:
         return {name: np.lib.format.open_memmap(self._partial / f"{name}.npy", "r+") for name in self._names}
 
-    def _timing(self, steps: int, began: float) -> dict[str, float]:
-        """Return the timing after a piece of some steps that has been recorded since `began`.
+    @contextmanager
+    def recording(self) -> Iterator[None]:
+        """Count the time that is spent within this context as time of recording."""
+        began = time.perf_counter()
+        yield
+        self._recording += time.perf_counter() - began
+
+    def timing(self, steps: int) -> dict[str, float]:
+        """Return the timing after a recorded piece of some steps.
 
         Timing counts from the end of the first piece, which includes compiling: `steps_per_second`, `seconds`, and how
         many of these were spent on `recording`.
         """
         now = time.perf_counter()
-        self._steps, self._recording, seconds = self._steps + steps, self._recording + now - began, now - self._started
+        self._steps, seconds = self._steps + steps, now - self._started
         timing = {
             "steps_per_second": round(self._steps / seconds, 1),
             "seconds": round(seconds, 6),
@@ -284,17 +295,16 @@ class ArrayWriter:
 
     def sync(self) -> None:
         """Force everything written so far to the disk, and out of memory."""
-        began = time.perf_counter()
-        for array in self._arrays.values():
-            array.flush()
-        self._arrays = self._mapped()
-        self._log.sync()
-        self._recording += time.perf_counter() - began
+        with self.recording():
+            for array in self.arrays.values():
+                array.flush()
+            self.arrays = self._mapped()
+            self.log.sync()
 
     def close(self) -> None:
         """Close the log and unmap the arrays."""
-        self._log.close()
-        self._arrays.clear()
+        self.log.close()
+        self.arrays.clear()
 
 
 class ArtefactWriter(ArrayWriter):
@@ -314,25 +324,24 @@ class ArtefactWriter(ArrayWriter):
         super().__init__(partial, array_shapes(task.layout, config.environments, config.episodes), not first, first)
         self._task, self._config = task, config
 
-    def write(self, number: int, rollout: Any, metrics: dict[str, Any]) -> dict[str, float]:
-        """Record one update; returns its metrics and timing."""
+    def write(self, number: int, rollout: Any, metrics: dict[str, Any]) -> float:
+        """Record one update; returns the steps per second."""
         jax.block_until_ready((rollout, metrics))
-        began = time.perf_counter()
-        record_rollout(HistoryArrays(**self._arrays), number, rollout)
+        with self.recording():
+            record_rollout(HistoryArrays(**self.arrays), number, rollout)
         line = {"update": number, "step": (number + 1) * self._config.steps_per_update}
         line |= {name: float(value) for name, value in metrics.items()}
         if not line.get("episodes", 1):
             line.pop("return", None)  # no episode ended, so there is no mean return
-        timing = self._timing(self._config.steps_per_update, began)
-        self._log.write(line, timing={"update": number} | timing)
-        return line | timing
+        timing = self.timing(self._config.steps_per_update)
+        self.log.write(line, timing={"update": number} | timing)
+        return timing["steps_per_second"]
 
     def save(self, saved: StateFile, state: Any, updates: int) -> None:
         """Save the learner's state after everything that led to it is on the disk."""
         self.sync()
-        began = time.perf_counter()
-        saved.save(state, updates)
-        self._recording += time.perf_counter() - began
+        with self.recording():
+            saved.save(state, updates)
 
     def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
         """Write and sync a checkpoint of the ego if this number of updates is among `checkpoint_updates`.
@@ -341,10 +350,9 @@ class ArtefactWriter(ArrayWriter):
         """
         moments = checkpoint_updates(self._config)
         if updates in moments:
-            began = time.perf_counter()
             card = {"task_id": self._task.task_id, "steps": updates * self._config.steps_per_update}
-            save_policy(checkpoint_path(self._partial, moments.index(updates)), network, params, card)
-            self._recording += time.perf_counter() - began
+            with self.recording():
+                save_policy(checkpoint_path(self._partial, moments.index(updates)), network, params, card)
 
 
 def last_timing(folder: Path) -> dict[str, Any] | None:

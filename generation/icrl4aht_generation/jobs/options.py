@@ -38,11 +38,6 @@ def request_determinism() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_deterministic_ops=true".strip()
 
 
-def allocate_gpu_memory_on_demand() -> None:
-    """Make JAX allocate GPU memory as needed instead of most of it at once; call before JAX is first used."""
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-
-
 queue_options = dataclass_options(QueueOptions, "queue")
 """Decorator with the options of a queue; the command gets them as `queue`, a dict."""
 
@@ -57,6 +52,6 @@ def read_queue_options(queue: dict[str, Any]) -> QueueOptions:
     if options.executor == "local" and options.address:
         raise click.UsageError("--address needs --executor ray")
     request_determinism()
-    if options.executor == "ray":
-        allocate_gpu_memory_on_demand()
+    if options.executor == "ray":  # by default JAX takes most of a GPU's memory at once, which other processes need
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     return options

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -12,6 +11,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import FOUR_RECIPES, LAYOUT_NAMES, TRACKS
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.layouts.fixtures import LayoutDraw
 from icrl4aht_generation.layouts.grids import agent_rooms, grid_of, neighbours, rows_of
 
@@ -68,9 +68,8 @@ def _arrangements(layout: Layout, seed: int) -> Iterator[Layout]:
     known = {mirrored for name in LAYOUT_NAMES for mirrored in _mirrored(get_layout(name).rows)}
     grid = grid_of(layout)
     reach = [neighbours(room) for room in agent_rooms(layout)]
-    reached_by: dict[tuple[bool, ...], list[int]] = defaultdict(list)
-    for cell in np.flatnonzero((grid != " ") & (grid != "A") & np.any(reach, axis=0)).tolist():
-        reached_by[tuple(bool(one.flat[cell]) for one in reach)].append(cell)
+    fixtures = np.flatnonzero((grid != " ") & (grid != "A") & np.any(reach, axis=0)).tolist()
+    reached_by = grouped(fixtures, lambda cell: tuple(bool(one.flat[cell]) for one in reach))
     found = repeats = 0
     while repeats < MOST_REPEATS:
         new = grid.copy()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
 from functools import lru_cache
 from timeit import repeat
 from typing import Any
@@ -57,14 +56,17 @@ SCRIPTED_SECONDS = 1.0
 _GRADIENT = 3.1  # time of a gradient step in forward passes: measured with the networks of `smoke` and `paper`
 
 
-@dataclass(frozen=True)
-class RebuildCost:
-    """Estimated cost of rebuilding a profile.
+def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
+    """Estimate a rebuild's cost from the profile, the speed of its networks here, and stored figures.
 
     Hours are those of learning, playing and recording: one process trains the populations one after the other, then
     `devices` devices share the tasks, one task at a time each.
 
-    Attributes:
+    Args:
+        profile: the profile.
+        devices: number of devices that share the tasks.
+
+    Returns:
         profile: name of the profile.
         populations: number of populations of learned teammates.
         teammate_steps: environment steps of all populations.
@@ -84,47 +86,6 @@ class RebuildCost:
         hours_on_one: hours of the complete rebuild on one device.
         devices: number of devices.
         hours_on_devices: hours of the complete rebuild on this number of devices.
-    """
-
-    profile: str
-    populations: int
-    teammate_steps: int
-    tasks: int
-    learners: int
-    environment_steps: int
-    scripted_histories: int
-    scripted_transitions: int
-    recorded_transitions: int
-    kept_transitions: int
-    artefact_bytes: int
-    lite_bytes: int
-    full_bytes: int
-    device: str
-    steps_per_second: float | None
-    teammate_hours: float
-    scripted_hours: float
-    hours_on_one: float
-    devices: int
-    hours_on_devices: float
-
-    def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the rows of the printed table, (quantity, value)."""
-        for field in fields(self):
-            value, name = getattr(self, field.name), field.name.replace("_", " ")
-            if field.name.endswith("_bytes"):
-                yield f"disk, {name.removesuffix(' bytes')}", filesize.decimal(value)
-            elif field.name == "hours_on_devices":
-                yield f"hours on {self.devices} devices", f"{value:,.1f}"
-            elif value and field.name != "devices":
-                yield name, value if isinstance(value, str) else f"{value:,}"
-
-
-def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
-    """Estimate a rebuild's cost from the profile, the speed of its networks here, and stored figures.
-
-    Args:
-        profile: the profile.
-        devices: number of devices that share the tasks.
     """
     egos: list[tuple[Layout, PPOConfig]] = []
     scripted: list[tuple[Layout, NoiseConfig]] = []
@@ -152,29 +113,41 @@ def estimate_cost(profile: Profile, devices: int) -> RebuildCost:
     whole = sum(histories[source] * more for source, more in HISTORY_BYTES.items())
     sizes = {kind: round(whole + sum(kept[source] * BYTES[kind, source] for source in kept)) for kind in KINDS}
     device = jax.devices()[0]
-    return RebuildCost(
-        profile=profile.name,
-        populations=len(runs),
-        teammate_steps=sum(run.steps for run in runs),
-        tasks=tasks,
-        learners=len(egos),
-        environment_steps=steps,
-        scripted_histories=sum(config.histories for _, config in scripted),
-        scripted_transitions=sum(transitions),
-        recorded_transitions=sum(ego.environments * ego.episodes * KEPT_STEPS for _, ego in egos) + sum(transitions),
-        kept_transitions=sum(kept.values()),
-        artefact_bytes=artefact_bytes(egos) + sum(scripted_bytes(layout, config) for layout, config in scripted),
-        lite_bytes=sizes["lite"],
-        full_bytes=sizes["full"],
-        device=f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
-        steps_per_second=round(steps / sum(playing), 1) if egos else None,
-        teammate_hours=round(teammate_seconds / 3600, 2),
-        scripted_hours=round(sum(scripted_seconds) / 3600, 2),
-        hours_on_one=round((teammate_seconds + sum(seconds)) / 3600, 2),
-        devices=devices,
+    return {
+        "profile": profile.name,
+        "populations": len(runs),
+        "teammate_steps": sum(run.steps for run in runs),
+        "tasks": tasks,
+        "learners": len(egos),
+        "environment_steps": steps,
+        "scripted_histories": sum(config.histories for _, config in scripted),
+        "scripted_transitions": sum(transitions),
+        "recorded_transitions": sum(ego.environments * ego.episodes * KEPT_STEPS for _, ego in egos) + sum(transitions),
+        "kept_transitions": sum(kept.values()),
+        "artefact_bytes": artefact_bytes(egos) + sum(scripted_bytes(layout, config) for layout, config in scripted),
+        "lite_bytes": sizes["lite"],
+        "full_bytes": sizes["full"],
+        "device": f"{usable_cores()} CPU cores" if device.platform == "cpu" else device.device_kind,
+        "steps_per_second": round(steps / sum(playing), 1) if egos else None,
+        "teammate_hours": round(teammate_seconds / 3600, 2),
+        "scripted_hours": round(sum(scripted_seconds) / 3600, 2),
+        "hours_on_one": round((teammate_seconds + sum(seconds)) / 3600, 2),
+        "devices": devices,
         # Each round of tasks takes as long as its longest.
-        hours_on_devices=round((teammate_seconds + sum(sorted(seconds, reverse=True)[::devices])) / 3600, 2),
-    )
+        "hours_on_devices": round((teammate_seconds + sum(sorted(seconds, reverse=True)[::devices])) / 3600, 2),
+    }
+
+
+def cost_rows(cost: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield the rows of the printed table of a cost, (quantity, value)."""
+    for key, value in cost.items():
+        name = key.replace("_", " ")
+        if key.endswith("_bytes"):
+            yield f"disk, {name.removesuffix(' bytes')}", filesize.decimal(value)
+        elif key == "hours_on_devices":
+            yield f"hours on {cost['devices']} devices", f"{value:,.1f}"
+        elif value and key != "devices":
+            yield name, value if isinstance(value, str) else f"{value:,}"
 
 
 def step_seconds(config: PPOConfig) -> float:
@@ -201,19 +174,14 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
     def forward(params: Any, records: jax.Array) -> Any:
         return network.apply(params, network.initial_hidden(count), view(records), reset)
 
-    return _seconds(forward, params, records) / (steps * count)
+    def call() -> None:
+        jax.block_until_ready(forward(params, records))
+
+    call()  # compiles
+    # The fastest of a few calls, since other programs may slow some down.
+    return min(repeat(call, number=1, repeat=3)) / (steps * count)
 
 
 def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
     """Return the uncompressed size of the histories of egos."""
     return sum(arrays_bytes(array_shapes(layout, ego.environments, ego.episodes)) for layout, ego in egos)
-
-
-def _seconds(function: Any, *arguments: Any) -> float:
-    """Return the time of the fastest of a few calls, after one that compiles; other programs may slow some down."""
-
-    def call() -> None:
-        jax.block_until_ready(function(*arguments))
-
-    call()
-    return min(repeat(call, number=1, repeat=3))

@@ -40,7 +40,7 @@ from icrl4aht_generation.populations.train import (
 )
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.teammates.distances import act_along, hamming_distances
-from icrl4aht_generation.teammates.instances import published_thetas
+from icrl4aht_generation.teammates.instances import published_teammates
 from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_families
 from icrl4aht_generation.teammates.registry import build_teammate
@@ -170,9 +170,9 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], co
         families[algorithm] = range(len(policies), len(policies) + len(points))
         policies += [build_learned(layout, suite / point.path) for point in points]
     for kind, short in HEURISTIC_KINDS.items():
-        thetas = published_thetas(layout.name, kind)
-        families[short] = range(len(policies), len(policies) + len(thetas))
-        policies += [build_teammate(layout, {"family": kind, "theta": theta}) for theta in thetas]
+        entries = published_teammates(layout.name, kind)
+        families[short] = range(len(policies), len(policies) + len(entries))
+        policies += [build_teammate(layout, entry) for entry in entries]
     distances = family_distances(hamming_distances(actions_on_common_states(layout, policies)), families)
     title = f"{layout.name}: mean Hamming distance of families"
     console.print(title, _matrix_text(list(families), distances), sep="\n")

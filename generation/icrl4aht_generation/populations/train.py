@@ -154,47 +154,6 @@ def read_record(folder: Path) -> dict[str, Any]:
     return record if isinstance(record, dict) else {}
 
 
-def is_population_finished(folder: Path, run: PopulationRun) -> bool:
-    """Return whether a folder has this population under these settings, with all its files unchanged."""
-    record = read_record(folder)
-    try:
-        return record["settings_hash"] == json_hash(run.settings) and hashes_hold(folder, record["files"])
-    except (OSError, KeyError, TypeError):
-        return False
-
-
-def train_population(
-    run: PopulationRun,
-    folder: Path,
-    on_update: OnUpdate = lambda updates, speed: None,
-    *,
-    wait: bool = False,
-    save_seconds: float = POPULATION_SAVE_SECONDS,
-) -> bool:
-    """Train a population into `folder`, resuming a stopped run of the same settings.
-
-    Args:
-        run: the population.
-        folder: its folder.
-        on_update: called after each update with the number of updates and steps per second.
-        wait: whether to wait for another process that trains it.
-        save_seconds: least time between two saves.
-
-    Returns:
-        False if the population was already finished, otherwise True.
-
-    Raises:
-        BusyError: if another process trains into this folder.
-        OptionError: if it holds a run of other settings.
-    """
-    with run_lock(folder, wait=wait):
-        folder.mkdir(exist_ok=True)
-        if is_population_finished(folder, run):
-            return False
-        _PopulationTraining(run, folder, on_update, save_seconds).train()
-        return True
-
-
 @dataclass(frozen=True)
 class PopulationJob:
     """The training of a population as a job of a queue, see `jobs.job.Job`.
@@ -225,25 +184,52 @@ class PopulationJob:
         """Updates of all stages."""
         return self.population.updates
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the population."""
+        return self.suite / self.name
+
     def is_finished(self) -> bool:
-        """Return whether the population is complete and unchanged."""
-        return is_population_finished(self.suite / self.name, self.population)
+        """Return whether its folder has the population under these settings, with all files unchanged."""
+        record = read_record(self.folder)
+        try:
+            same = record["settings_hash"] == json_hash(self.population.settings)
+            return same and hashes_hold(self.folder, record["files"])
+        except (OSError, KeyError, TypeError):
+            return False
 
     def progress(self) -> tuple[int, float] | None:
         """Return what the population's timing states."""
-        timing = last_line(self.suite / self.name / TIMING)
+        timing = last_line(self.folder / TIMING)
         if timing is None:
             return None
         return timing["stage"] * self.population.config.updates + timing["update"] + 1, timing["steps_per_second"]
 
-    def run(self, on_update: OnUpdate, wait: bool) -> None:
-        """Train the population."""
-        train_population(self.population, self.suite / self.name, on_update, wait=wait)
+    def run(
+        self,
+        on_update: OnUpdate = lambda updates, speed: None,
+        wait: bool = False,
+        save_seconds: float = POPULATION_SAVE_SECONDS,
+    ) -> None:
+        """Train the population, or resume a stopped run of the same settings; keep a finished one.
+
+        Args:
+            on_update: called after each update with the number of updates and steps per second.
+            wait: whether to wait for another process that trains it.
+            save_seconds: least time between two saves.
+
+        Raises:
+            BusyError: if another process trains into its folder.
+            OptionError: if the folder holds a run of other settings.
+        """
+        with run_lock(self.folder, wait=wait):
+            self.folder.mkdir(exist_ok=True)
+            if not self.is_finished():
+                _PopulationTraining(self.population, self.folder, on_update, save_seconds).train()
 
     def finished_text(self) -> str:
         """Return the text on the finished population: steps, speed and the last return in self-play."""
-        folder = self.suite / self.name
-        metrics, progress = last_line(folder / METRICS) or {}, self.progress()
+        metrics, progress = last_line(self.folder / METRICS) or {}, self.progress()
         speed = f" at {progress[1]:,.0f} steps/s (all environments)" if progress else ""
         return (
             f"{metrics.get('step', 0):,} steps a member{speed}, last self-play return "

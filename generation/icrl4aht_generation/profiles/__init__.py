@@ -24,6 +24,7 @@ from icrl4aht_generation.profiles.profile import Profile, SampledConfig, SpreadC
 FOLDER = Path(__file__).parent
 
 Value = TypeVar("Value")
+Config = TypeVar("Config", PPOConfig, NoiseConfig)
 _Names = tuple[str, ...]
 _Return = Annotated[float, Meta(ge=-1e6, le=1e6)]  # a finite number
 
@@ -168,18 +169,16 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         )
     if "ppo" not in sources:
         release.keep = 0
-    ego = dict(content.ego)
-    of_layouts = _by_layout("ego.layouts", ego.pop("layouts", {}), layouts)
-    egos = replace_options(PPOConfig(), ego, "ego.")
-    noise, noise_layouts = _scripted("noise", content.noise, NoiseConfig(), layouts)
-    search, search_layouts = _scripted("search", content.search, SEARCH, preference)
+    ego, ego_layouts = _section("ego", content.ego, PPOConfig(), layouts)
+    noise, noise_layouts = _section("noise", content.noise, NoiseConfig(), layouts)
+    search, search_layouts = _section("search", content.search, SEARCH, preference)
     algorithms = _by_layout("tasks.algorithms", tasks.algorithms, layouts)
     for key, names in algorithms.items():
         _known("algorithm", "tasks.algorithms", _distinct(f"tasks.algorithms.{key}", names), ALGORITHMS)
     return Profile(
         name=name,
-        ego=egos,
-        ego_layouts={each: replace_options(egos, of, f"ego.layouts.{each}.") for each, of in of_layouts.items()},
+        ego=ego,
+        ego_layouts=ego_layouts,
         teammates=_teammates(content.teammates),
         noise=noise,
         search=search,
@@ -198,14 +197,13 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
     )
 
 
-def _scripted(
-    source: str, values: dict[str, Any], default: NoiseConfig, layouts: tuple[str, ...]
-) -> tuple[NoiseConfig, dict[str, NoiseConfig]]:
-    """Return the histories of a scripted source, and those of layouts with values of their own."""
-    values = dict(values)
-    own = _by_layout(f"{source}.layouts", values.pop("layouts", {}), layouts)
-    config = replace_options(default, values, f"{source}.")
-    return config, {name: replace_options(config, of, f"{source}.layouts.{name}.") for name, of in own.items()}
+def _section(
+    name: str, values: dict[str, Any], default: Config, layouts: tuple[str, ...]
+) -> tuple[Config, dict[str, Config]]:
+    """Return the settings of a section, and those of the layouts with values of their own in its table `layouts`."""
+    common = replace_options(default, {key: value for key, value in values.items() if key != "layouts"}, f"{name}.")
+    own = _by_layout(f"{name}.layouts", values.get("layouts", {}), layouts)
+    return common, {each: replace_options(common, of, f"{name}.layouts.{each}.") for each, of in own.items()}
 
 
 def _sampled(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
@@ -222,7 +220,7 @@ def _sampled(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...
 def _counts(
     section: str, values: _Spread, layouts: tuple[str, ...], sources: tuple[str, ...]
 ) -> dict[str, dict[str, int]]:
-    """Return the numbers of drawn teammates: field of `DrawnConfig` -> layout -> number."""
+    """Return the numbers of drawn teammates: field of `SpreadConfig` -> layout -> number."""
     given = {"per_layout": values.per_layout, "validation": values.validation}
     given["ppo"] = values.per_layout if values.ppo is None else values.ppo
     tables: dict[str, Any] = {key: _by_layout(f"{section}.{key}", value, layouts) for key, value in given.items()}

@@ -88,8 +88,8 @@ class TeammateConfig:
 
 
 @dataclass(frozen=True)
-class DrawnConfig:
-    """Numbers of heuristic teammates that were drawn and measured beforehand; base of two ways to choose them.
+class SpreadConfig:
+    """Numbers of heuristic teammates that differ widely, see `teammates.spread`.
 
     Attributes:
         per_layout: layout -> number of training teammates, which the source "noise" has all of.
@@ -108,20 +108,17 @@ class DrawnConfig:
             OptionError: if fewer were measured that differ from the test instances.
         """
         count = self.ppo[layout] if source == "ppo" else None
-        found = [("train", entry) for entry in self._entries(layout, "train")[:count]]
-        return found + [("validation", entry) for entry in self._entries(layout, "validation") if source == "noise"]
+        found = [("train", entry) for entry in self._entries(layout, "train", self.per_layout[layout])[:count]]
+        validation = self._entries(layout, "validation", self.validation[layout])
+        return found + [("validation", entry) for entry in validation if source == "noise"]
 
-    def _entries(self, layout: str, split: str) -> list[dict[str, Any]]:
-        """Return the entries of all teammates of a split on a layout."""
-        raise NotImplementedError
-
-    def _count(self, layout: str, split: str) -> int:
-        return (self.validation if split == "validation" else self.per_layout)[layout]
+    def _entries(self, layout: str, split: str, count: int) -> list[dict[str, Any]]:
+        return spread_teammates(layout, split, count)
 
 
 @dataclass(frozen=True)
-class SampledConfig(DrawnConfig):
-    """Heuristic teammates drawn from the published train ranges, see `teammates.draws`.
+class SampledConfig(SpreadConfig):
+    """Numbers of heuristic teammates drawn from the published train ranges, see `teammates.draws`.
 
     Attributes:
         families: layout -> families, which take turns.
@@ -129,18 +126,9 @@ class SampledConfig(DrawnConfig):
 
     families: dict[str, tuple[str, ...]]
 
-    def _entries(self, layout: str, split: str) -> list[dict[str, Any]]:
+    def _entries(self, layout: str, split: str, count: int) -> list[dict[str, Any]]:
         seed = VALIDATION_DRAWS if split == "validation" else 0
-        drawn = drawn_teammates(layout, self.families[layout], self._count(layout, split), seed)
-        return [entry for entry, _ in drawn]
-
-
-@dataclass(frozen=True)
-class SpreadConfig(DrawnConfig):
-    """Heuristic teammates that differ widely, see `teammates.spread`."""
-
-    def _entries(self, layout: str, split: str) -> list[dict[str, Any]]:
-        return spread_teammates(layout, split, self._count(layout, split))
+        return [entry for entry, _ in drawn_teammates(layout, self.families[layout], count, seed)]
 
 
 @dataclass(frozen=True)
@@ -252,7 +240,7 @@ class Profile:
             for layout in self.layouts_of(source):
                 own = [task for task in learned if task.layout.name == layout and source != "search"]
                 tasks = [*self._heuristic_tasks(layout, source), *(_of_source(task, source) for task in own)]
-                units += [Work(task, source, learner) for task in tasks for learner in range(self._learners(source))]
+                units += self._works(tasks, source)
         return units
 
     def units_of(self, tasks: Sequence[Task], sources: Mapping[str, str]) -> list[Work]:
@@ -273,11 +261,12 @@ class Profile:
                     f"task {task.task_id}: its source is {source}, those of profile {self.name} are "
                     f"{', '.join(self.sources)}: choose a profile with both, or leave the task out"
                 )
-            units += [Work(task, source, learner) for learner in range(self._learners(source))]
+            units += self._works([task], source)
         return units
 
-    def _learners(self, source: str) -> int:
-        return self.learners if source == "ppo" else 1
+    def _works(self, tasks: Sequence[Task], source: str) -> list[Work]:
+        learners = self.learners if source == "ppo" else 1
+        return [Work(task, source, learner) for task in tasks for learner in range(learners)]
 
     def tasks_on(self, layout: str, source: str) -> int:
         """Return the number of tasks of a source on a layout, if every population has enough good teammates."""

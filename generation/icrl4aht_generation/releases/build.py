@@ -87,18 +87,8 @@ def build_releases(
         facts = teammate_facts(tasks, artefacts, suite, headroom)
         for kind, release in zip(kinds, releases, strict=True):
             with progress_bars(unit="tasks") as show:
-                steps = [counted(show, f"{step} {kind}", len(tasks)) for step in ("choosing labellers for", "packing")]
-                package_release(
-                    artefacts,
-                    release,
-                    units,
-                    profile,
-                    suite,
-                    kind,
-                    lambda step, steps=steps: steps[step](1),
-                    facts=facts,
-                    left_out=left_out,
-                )
+                steps = (counted(show, f"{step} {kind}", len(tasks)) for step in ("choosing labellers for", "packing"))
+                package_release(artefacts, release, units, profile, suite, kind, facts, left_out, *steps)
         for release in releases:
             print_learning(release_facts(release), console)
     return releases

@@ -27,6 +27,7 @@ from icrl4aht_data.format.schema import PROVENANCE, TEAMMATES
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.utils.files import atomic_write, read_text
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
@@ -58,16 +59,14 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceE
         task id -> returns.
     """
     found = {}
-    for layout in dict.fromkeys(task.layout for task in tasks):
-        own = [task for task in tasks if task.layout == layout]
+    for layout, own in grouped(tasks, lambda task: task.layout).items():
         folders = [checkpoint_folder(suite, task.teammate) for task in own]
         mates = [build_learned(layout, folder) for folder in folders]
         partners = [build_learned(layout, _partner(folder), "sampled") for folder in folders]
-        returns = reference_returns(layout, mates)
-        for k, (task, ego, mate) in enumerate(zip(own, partners, mates, strict=True)):
+        for task, ego, mate, returns in zip(own, partners, mates, reference_returns(layout, mates), strict=True):
             play = _self_play_program(layout, ego._replace(params=()), mate._replace(params=()))
             self_play = float(np.asarray(play(ego.params, mate.params)).mean())
-            found[task.task_id] = reference_egos(returns, k, self_play)
+            found[task.task_id] = reference_egos(returns, self_play)
     return found
 
 
@@ -128,9 +127,7 @@ def teammate_facts(
         task id -> facts.
     """
     headroom, recorded = headroom or {}, recorded_provenance(suite)
-    groups: dict[tuple[str, str], list[Task]] = {}
-    for task in tasks:
-        groups.setdefault(task.teammate_key, []).append(task)
+    groups = grouped(tasks, lambda task: task.teammate_key)
     found: dict[tuple[str, str], TeammateFacts] = {}
     for key, members in groups.items():
         draw, made = find_measured(key[0], members[0].teammate), recorded.get(members[0].task_id)
@@ -140,9 +137,8 @@ def teammate_facts(
             found[key] = TeammateFacts(egos, NearestTest(name, distance, draw.behaviour))
         elif made is not None and made.references is not None:
             found[key] = TeammateFacts(made.references, made.nearest_test)
-    unknown = [key for key in groups if key not in found]
-    for layout in dict.fromkeys(layout for layout, _ in unknown):
-        keys = [key for key in unknown if key[0] == layout]
+    unknown = (key for key in groups if key not in found)
+    for layout, keys in grouped(unknown, lambda key: key[0]).items():
         chosen = [next((task for task in groups[key] if task.task_id in headroom), groups[key][0]) for key in keys]
         kept = artefacts / f".{layout}.teammates.json"
         settings = software_versions() | {
@@ -151,8 +147,7 @@ def teammate_facts(
             "teammates": [[task.teammate, task.recipes] for task in chosen],
             "episodes": REFERENCE_EPISODES,
         }
-        measure = partial(_measure, chosen, suite, headroom)
-        measured = measured_once(kept, settings, list[TeammateFacts], measure)
+        measured = measured_once(kept, settings, list[TeammateFacts], partial(_measure, chosen, suite, headroom))
         found |= dict(zip(keys, measured, strict=True))
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
 
@@ -201,18 +196,15 @@ def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, Referenc
     returns = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
     returns |= learned_headroom(missing, suite) if missing else {}
     for task in heuristics:  # one at a time: tasks may want dishes of their own, and all of a family share a program
-        egos = reference_returns(task.layout, [build_teammate(None, task.teammate)])
-        returns[task.task_id] = reference_egos(egos, 0)
+        (egos,) = reference_returns(task.layout, [build_teammate(None, task.teammate)])
+        returns[task.task_id] = reference_egos(egos)
     nearest: dict[str, NearestTest] = {}
     layout = tasks[0].layout
     if learned and layout.name in TESTED_ON:  # other layouts have no test teammates
-        for task, near in zip(learned, nearest_test(layout, [_build(task, suite) for task in learned]), strict=True):
+        mates = [build_teammate(layout, task.teammate, suite=suite) for task in learned]
+        for task, near in zip(learned, nearest_test(layout, mates), strict=True):
             nearest[task.task_id] = NearestTest(near.teammate, round(near.distance, _DIGITS), near.behaviour)
     return [TeammateFacts(returns[task.task_id], nearest.get(task.task_id)) for task in tasks]
-
-
-def _build(task: Task, suite: Path) -> Any:
-    return build_teammate(task.layout, task.teammate, TEAMMATE, suite=suite)
 
 
 def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceE
 from icrl4aht_data.format.schema import Kind, curve_ends, episode_ends
 from icrl4aht_data.overcooked.actions import TEAMMATE
 from icrl4aht_data.plotting import SourceCurves, add_curve, plot_source_curves, save_figure
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.writing.card import CURVES_FIGURE, teammate_name
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import atomic_folder, check_target
@@ -37,7 +38,6 @@ from icrl4aht_generation.releases.measures import (
     TeammateFacts,
     recorded_provenance,
     release_provenance,
-    teammate_facts,
     unhosted_families,
 )
 
@@ -128,10 +128,10 @@ def package_release(
     profile: Profile,
     suite: Path,
     kind: Kind,
-    advance: Callable[[Literal[0, 1]], None] = lambda step: None,
-    *,
-    facts: Mapping[str, TeammateFacts] | None = None,
+    facts: Mapping[str, TeammateFacts],
     left_out: Sequence[LeftOutTask] = (),
+    chosen: Callable[[int], None] = lambda count: None,
+    written: Callable[[int], None] = lambda count: None,
 ) -> Path:
     """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
 
@@ -145,19 +145,16 @@ def package_release(
         profile: their profile.
         suite: folder of the learned teammates.
         kind: kind of the release.
-        advance: called after each task with 0, when its histories are chosen, and with 1, when it is written.
-        facts: task id -> facts about its teammate; by default they are looked up or measured.
+        facts: task id -> facts about its teammate, see `teammate_facts`.
         left_out: tasks that were not collected, for the list in meta/info.json.
+        chosen: called with 1 after the histories of a task are chosen.
+        written: called with 1 after a task is written.
 
     Raises:
         OptionError: if something else is at `target`, see `check_release_folder`, or no task has histories to keep.
     """
     check_release_folder(target, profile)
-    tasks: dict[str, list[Work]] = {}
-    for work in units:
-        tasks.setdefault(work.task.task_id, []).append(work)
-    if facts is None:
-        facts = teammate_facts((members[0].task for members in tasks.values()), artefacts, suite)
+    tasks = grouped(units, lambda work: work.task.task_id)
     headroom = {members[0].task.layout.name for task_id, members in tasks.items() if facts[task_id].matters}
     recorded, new, omitted, curves = recorded_provenance(suite), [], list(left_out), SourceCurves()
     for task_id, members in tasks.items():
@@ -165,12 +162,12 @@ def package_release(
         found = select_histories(artefacts, members, profile, facts[task_id], headroom=task.layout.name in headroom)
         if isinstance(found, LeftOutTask):
             omitted.append(found)
-            advance(1)
+            written(1)
         else:
             new.append(_new_task(found, profile, suite, facts[task_id], recorded))
             for returns in found.kept:
                 add_curve(curves, found.source, layout_title(task.layout.name), task.split, returns)
-        advance(0)
+        chosen(1)
     if not new:
         reasons = "; ".join(one.reason for one in omitted) or "there is no task"
         raise OptionError(f"{target}: no task has histories to keep: {reasons}")
@@ -179,9 +176,15 @@ def package_release(
     with TemporaryDirectory() as folder:
         files = {CURVES_FIGURE: Path(folder) / "curves.png"}
         save_figure(plot_source_curves(curves), files[CURVES_FIGURE], dpi=80)
-        version, done = profile.data_version, lambda task: advance(1)
         return write_release(
-            target, kind, new, data_version=version, left_out=omitted, files=files, overwrite=True, done=done
+            target,
+            kind,
+            new,
+            data_version=profile.data_version,
+            left_out=omitted,
+            files=files,
+            overwrite=True,
+            done=lambda task: written(1),
         )
 
 

@@ -49,7 +49,7 @@ from icrl4aht_generation.teammates.draws import (
     read_measured,
     write_table,
 )
-from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_thetas
+from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_teammates
 from icrl4aht_generation.teammates.references import REFERENCE_EGOS, reference_returns, stacked_families
 from icrl4aht_generation.teammates.registry import (
     HEURISTIC_FAMILIES,
@@ -131,9 +131,7 @@ def instance_policies(layout: Layout) -> list[Policy]:
 def instance_entries(layout: Layout) -> list[dict[str, Any]]:
     """Return the test instances of the layout that models of a layout are tested on, by family and number."""
     tested = TESTED_ON.get(layout.name, layout.name)
-    return [
-        {"family": family, "theta": theta} for family in TESTED_FAMILIES for theta in published_thetas(tested, family)
-    ]
+    return [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
 
 
 def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T N S"]:
@@ -316,7 +314,7 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
     ]
     records, tested = common_states(layout)
     actions = act_along(layout, policies, records)
-    distances, returns = distances_to_tests(tested, actions), _returns(layout, policies)
+    distances, returns = distances_to_tests(tested, actions), reference_returns(layout, policies)
     families = np.array([family for family, _, _ in numbers])
     behaviours = np.zeros(len(numbers), int)
     for family in np.unique(families):
@@ -332,11 +330,6 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
         )
         for k, (family, base_seed, theta_id) in enumerate(numbers)
     ]
-
-
-def _returns(layout: Layout, policies: Sequence[Policy]) -> np.ndarray:
-    """Return mean returns of the reference egos with each teammate, float64 (teammates, egos)."""
-    return np.stack(list(reference_returns(layout, policies).values()), axis=1)
 
 
 def _measured(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[str, Any]:
@@ -358,25 +351,24 @@ def _measured(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[st
     }
 
 
-def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]], most: int = MOST_CHOSEN) -> LayoutSpread:
+def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]]) -> LayoutSpread:
     """Choose teammates of a training layout that differ widely.
 
     Args:
         layout: the layout.
         candidates: entries of heuristic teammates.
-        most: most teammates to choose.
     """
     # Together with the test instances, so that there is one compilation for each family.
     tested, records = instance_entries(layout), common_records(layout, _SPREAD_EPISODES)
     policies = [build_teammate(None, entry) for entry in with_equal_parameters([*tested, *candidates])]
     actions, policies = act_along(layout, policies, records), policies[len(tested) :]
     tests, actions = distances_to_tests(actions[: len(tested)], actions[len(tested) :]), actions[len(tested) :]
-    returns = _returns(layout, policies)  # with all of them, so that layouts share one compilation
+    returns = reference_returns(layout, policies)  # with all of them, so that layouts share one compilation
     unlike = tests.min(axis=1) >= DIVERSE_DISTANCE
     headroom = unlike & (np.ptp(returns, axis=1) >= LEAST_HEADROOM)
     usable = np.flatnonzero(headroom if headroom.any() else unlike)
     distances = hamming_distances(actions[usable].reshape(len(usable), -1))
-    order, separations = choose_spread(distances, DIVERSE_DISTANCE, most)
+    order, separations = choose_spread(distances, DIVERSE_DISTANCE, MOST_CHOSEN)
     chosen = [
         SpreadTeammate(
             split="validation" if number % VALIDATES == VALIDATES - 1 else "train",

@@ -12,7 +12,6 @@ farther from every test instance.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
@@ -23,9 +22,10 @@ from msgspec import Struct
 
 from icrl4aht_data.benchmark.facts import LEAST_HEADROOM, SAME_BEHAVIOUR, TESTED_ON, TRACKS, layout_order
 from icrl4aht_data.benchmark.tasks import Task, make_task
-from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown
+from icrl4aht_data.errors import OptionError, TaskFormatError, check_choice, unknown
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import atomic_write, parse_json, read_lines
+from icrl4aht_data.utils.files import atomic_write, read_lines
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
 
 DRAWS_TABLE = Path(__file__).with_name("draws.jsonl")
@@ -129,8 +129,7 @@ def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
         UnknownNameError: for an unknown layout, family or seed, and for a layout without training tasks.
     """
     name = get_layout(layout).name
-    if name not in TESTED_ON:
-        raise unknown("training layout", layout, TESTED_ON)
+    check_choice("training layout", name, TESTED_ON)
     check_choice("teammate family", family, HEURISTIC_FAMILIES)
     if base_seed not in DRAWS_PER_SEED:
         raise unknown("base_seed of draws", base_seed, map(str, DRAWS_PER_SEED))
@@ -292,11 +291,8 @@ def _hosted_text(layout: str, base_seed: int) -> str:
 
 
 @lru_cache(maxsize=1)
-def _bundled_draws() -> dict[tuple[str, str, int], tuple[Draw, ...]]:
-    draws: dict[tuple[str, str, int], list[Draw]] = defaultdict(list)
-    for draw in read_measured(DRAWS_TABLE, Draw):
-        draws[draw.layout, draw.family, draw.base_seed].append(draw)
-    return {key: tuple(found) for key, found in draws.items()}
+def _bundled_draws() -> dict[tuple[str, str, int], list[Draw]]:
+    return grouped(read_measured(DRAWS_TABLE, Draw), lambda draw: (draw.layout, draw.family, draw.base_seed))
 
 
 AnyRow = TypeVar("AnyRow", bound=Struct)
@@ -312,8 +308,8 @@ def read_measured(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
     found = []
     for number, line in enumerate(read_lines(path), start=1):
         try:
-            found.append(msgspec.convert(parse_json(line), kind))
-        except (msgspec.ValidationError, Icrl4ahtError) as error:
+            found.append(msgspec.json.decode(line, type=kind))
+        except msgspec.DecodeError as error:
             raise TaskFormatError(f"{path}, line {number}: {error}") from error
     return found
 

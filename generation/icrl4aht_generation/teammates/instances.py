@@ -6,7 +6,6 @@ have parameters of their own on cramped_down; H3 and H4 have the same on every l
 
 from __future__ import annotations
 
-from collections import defaultdict
 from functools import cache
 from typing import Any
 
@@ -14,6 +13,7 @@ from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TRACKS, track_of
 from icrl4aht_data.benchmark.tasks import Task, make_task, manifest_path, read_tasks
 from icrl4aht_data.errors import check_choice
 from icrl4aht_data.overcooked.layouts import get_layout
+from icrl4aht_data.utils.groups import grouped
 
 TESTED_FAMILIES = tuple(HEURISTIC_KINDS)
 """Families with test instances: those of the paper."""
@@ -28,26 +28,19 @@ def published_tasks(track: str) -> list[Task]:
 
 
 @cache
-def _test_teammates() -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """Return layout and family -> teammate entries of t0..t4."""
-    found = defaultdict[tuple[str, str], list[dict[str, Any]]](list)
-    for task in (task for track in TRACKS for task in published_tasks(track)):
-        found[task.layout.name, task.teammate_kind].append(task.teammate)
-    return dict(found)
+def _test_tasks() -> dict[tuple[str, str], list[Task]]:
+    """Return layout and family -> tasks with t0..t4."""
+    tasks = (task for track in TRACKS for task in published_tasks(track))
+    return grouped(tasks, lambda task: (task.layout.name, task.teammate_kind))
 
 
-def published_teammate(layout: str, family: str, number: int) -> dict[str, Any]:
-    """Return the teammate entry of a test instance on a layout (short name), as in a task.
+def published_teammates(layout: str, family: str) -> list[dict[str, Any]]:
+    """Return the teammate entries of the test instances t0..t4 of a family on a layout (short name), as in tasks.
 
     Layouts without test tasks have the parameters that all layouts but cramped_down share.
     """
-    found = _test_teammates()
-    return found.get((layout, family), found["demo_wide", family])[number]
-
-
-def published_thetas(layout: str, family: str) -> list[dict[str, Any]]:
-    """Return the published parameter sets t0..t4 of a family on a layout (short name)."""
-    return [published_teammate(layout, family, number)["theta"] for number in range(INSTANCES)]
+    found = _test_tasks()
+    return [task.teammate for task in found.get((layout, family), found["demo_wide", family])]
 
 
 def published_task(layout: str, teammate: str) -> Task:
@@ -57,8 +50,12 @@ def published_task(layout: str, teammate: str) -> Task:
         UnknownNameError: for an unknown layout, family or instance.
     """
     name = get_layout(layout).name
-    names = {f"{short}/t{t}": (family, t) for family, short in HEURISTIC_KINDS.items() for t in range(INSTANCES)}
+    names = {
+        f"{short}/t{number}": entry
+        for family, short in HEURISTIC_KINDS.items()
+        for number, entry in enumerate(published_teammates(name, family))
+    }
     check_choice("teammate", teammate, names)
     track = track_of(name)
     split = "test" if name in TRACKS[track]["test"] else "train"
-    return make_task(track, split, name, published_teammate(name, *names[teammate]), seed=0)
+    return make_task(track, split, name, names[teammate], seed=0)

@@ -41,12 +41,14 @@ def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Po
     weights = {name: part for name, part in params["params"].items() if name not in _CRITIC}
     acting = ActorCritic(network.widths, critic=False)
     untrained = jax.eval_shape(lambda key: acting.untrained(key, layout.channels), jax.random.key(0))
-    expected = jax.tree.map(lambda leaf: leaf.shape, untrained["params"])
-    found = jax.tree.map(lambda leaf: leaf.shape, weights)
+    expected, found = (
+        flatten_dict(jax.tree.map(lambda leaf: leaf.shape, tree), sep="/") for tree in (untrained["params"], weights)
+    )
     if found != expected:
+        wrong, right = found.items() - expected.items(), expected.items() - found.items()
         raise OptionError(
             f"{folder}: does not fit {layout.name} (observations 5 x 5 x {layout.channels}): its weights have shapes "
-            f"{_differing(found, expected)}, expected {_differing(expected, found)}"
+            f"{dict(sorted(wrong))}, expected {dict(sorted(right))}"
         )
     init, act = _functions(network.widths, action)
     return Policy({"params": jax.tree.map(jnp.asarray, weights)}, init, act, "observation")
@@ -94,9 +96,3 @@ def _functions(widths: Widths, action: Action):
         return chosen.astype(jnp.int32), hidden
 
     return init, act
-
-
-def _differing(one: Any, other: Any) -> dict[str, Any]:
-    """Return the shapes in one tree that differ from the other's, by path."""
-    others = flatten_dict(other, sep="/")
-    return {name: shape for name, shape in flatten_dict(one, sep="/").items() if others.get(name) != shape}

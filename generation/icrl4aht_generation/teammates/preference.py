@@ -20,7 +20,7 @@ from icrl4aht_data.benchmark.facts import PLAIN, PREFERENCE, PREFERENCE_LAYOUTS
 from icrl4aht_data.benchmark.tasks import Dish, Task, make_task
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_generation.teammates.heuristics.territory import LAZY, TERRITORY
-from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_teammate
+from icrl4aht_generation.teammates.instances import INSTANCES, TESTED_FAMILIES, published_teammates
 from icrl4aht_generation.teammates.registry import sample_teammate
 
 WATCHER: dict[str, Any] = {
@@ -81,7 +81,7 @@ def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
     for instance in range(INSTANCES):
         for family in TESTED_FAMILIES:
             if split == "test":
-                found.append(published_teammate(layout.name.removesuffix(PLAIN), family, instance))
+                found.append(published_teammates(layout.name.removesuffix(PLAIN), family)[instance])
             else:
                 found.append(sample_teammate(family, instance, "diverse", _DRAWS[split]))
         found += [] if split == "train" else [WATCHER]

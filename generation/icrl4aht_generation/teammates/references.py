@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -17,6 +16,7 @@ from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.tables import Tables
+from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
 from icrl4aht_generation.experts.padded import own_layout, padded_layout
@@ -29,9 +29,7 @@ REFERENCE_EPISODES = 20
 _SEED = 11
 
 
-def reference_returns(
-    layout: Layout, teammates: Sequence[Policy], episodes: int = REFERENCE_EPISODES
-) -> dict[str, np.ndarray]:
+def reference_returns(layout: Layout, teammates: Sequence[Policy], episodes: int = REFERENCE_EPISODES) -> np.ndarray:
     """Measure the reference egos with teammates, in episodes of 100 steps.
 
     All pairs play from the same starts, and a teammate's returns do not depend on the other teammates. There is one
@@ -43,7 +41,7 @@ def reference_returns(
         episodes: number of episodes of each ego with each teammate.
 
     Returns:
-        "stay", "random" and "oracle" -> mean return with each teammate, float64 (teammates,).
+        Mean return of each of `REFERENCE_EGOS` with each teammate, float64 (teammates, egos).
     """
     families = list(stacked_families(teammates))
     # Observations and the state records that a policy of one layout sees are not padded.
@@ -53,19 +51,17 @@ def reference_returns(
         tuple((tuple(numbers), family._replace(params=())) for numbers, family in families), len(teammates), episodes
     )
     earned = np.asarray(play(tables, expert, [family.params for _, family in families]), np.float64)
-    means = earned.reshape(len(REFERENCE_EGOS), len(teammates), episodes).mean(axis=-1)
-    return dict(zip(REFERENCE_EGOS, means, strict=True))
+    return earned.reshape(len(REFERENCE_EGOS), len(teammates), episodes).mean(axis=-1).T
 
 
-def reference_egos(returns: Mapping[str, np.ndarray], number: int, self_play: float | None = None) -> ReferenceEgos:
+def reference_egos(returns: np.ndarray, self_play: float | None = None) -> ReferenceEgos:
     """Return the record of one teammate's measurements.
 
     Args:
-        returns: from `reference_returns`.
-        number: number of the teammate.
+        returns: float64 (egos,), its row of `reference_returns`.
         self_play: mean return of a learned teammate with the policy that it was trained with.
     """
-    stay, random, oracle = (float(returns[ego][number]) for ego in REFERENCE_EGOS)
+    stay, random, oracle = returns.tolist()  # in the order of `REFERENCE_EGOS`
     return ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES, self_play)
 
 
@@ -114,8 +110,6 @@ REFERENCE_EGOS = {
 
 def stacked_families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
     """Yield policies that share their functions: their numbers, and one policy with stacked parameters."""
-    groups: dict[tuple[Callable, Callable, str], list[int]] = defaultdict(list)
-    for number, policy in enumerate(policies):
-        groups[policy.init, policy.act, policy.sees].append(number)
+    groups = grouped(range(len(policies)), lambda number: policies[number]._replace(params=()))
     for numbers in groups.values():
         yield numbers, policies[numbers[0]]._replace(params=stacked(policies[n].params for n in numbers))

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import Struct
 
 from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS, TESTED_ON, layout_order
-from icrl4aht_data.errors import OptionError, unknown
+from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_generation.teammates.draws import Draw, equal_parameters, find_draw, read_measured
 from icrl4aht_generation.teammates.heuristics.assembly_line import PLATER, RUNNER
@@ -169,8 +169,7 @@ def read_spread(layout: str) -> LayoutSpread:
         OptionError: for a layout that was not measured.
     """
     name = get_layout(layout).name
-    if name not in TESTED_ON:
-        raise unknown("training layout", layout, TESTED_ON)
+    check_choice("training layout", name, TESTED_ON)
     if name not in _bundled_spreads():
         raise OptionError(f"{SPREAD_TABLE}: no line for {name}: `icrl4aht-data research draws --spread` measures it")
     return _bundled_spreads()[name]

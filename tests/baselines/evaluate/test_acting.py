@@ -19,7 +19,7 @@ from icrl4aht_baselines.training.run_folder import CHECKPOINTS, format_versions,
 from icrl4aht_generation.learners.resume import Checkpoints
 from icrl4aht_generation.teammates.instances import published_tasks
 
-from icrl4aht_data.errors import OptionError, UnknownNameError
+from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.files import file_hash
 from tests.helpers.commands import run_cli
 from tests.helpers.small_models import random_parameters
@@ -61,12 +61,6 @@ class TestBadRuns:
         arguments = ["evaluate", "--agent", str(runs / "ad"), "--layout", "coord_simple", "--out", str(tmp_path)]
         with pytest.raises(OptionError, match=r"trained on demo_wide with observations \(5, 5, 45\); coord_simple has"):
             run_cli(*arguments)
-
-    def test_folders_without_a_run(self, runs, tmp_path):
-        with pytest.raises(UnknownNameError, match="unknown agent 'no/where'; valid: stay, random, oracle, search"):
-            find_agent("no/where")
-        with pytest.raises(UnknownNameError, match=r"not a run: config\.json is missing; `icrl4aht-data train` makes"):
-            find_agent(tmp_path)
 
     def test_another_version_and_another_shape(self, runs, tmp_path):
         def copy(name: str, **changes) -> str:

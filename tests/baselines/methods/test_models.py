@@ -17,13 +17,7 @@ from icrl4aht_baselines.methods import attention
 from icrl4aht_baselines.methods.method import Method, change_if
 from icrl4aht_baselines.methods.options import ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
-from icrl4aht_baselines.methods.tokens import (
-    Transition,
-    batch_steps,
-    batch_transitions,
-    input_step,
-    plain_view,
-)
+from icrl4aht_baselines.methods.tokens import Transition, batch_steps, batch_transitions, input_step, plain_view
 
 from icrl4aht_data import get_layout
 from icrl4aht_data.errors import OptionError, UnknownNameError

@@ -379,19 +379,9 @@ class TestCommand:
     @pytest.mark.slow
     def test_train_and_play(self, tmp_path):
         out = tmp_path / "run"
-        sizes = ["--steps", "1", "--batch-size", "2", "--width", "8", "--epochs", "1", "--minibatches", "1"]
-        choice = [
-            "--layout",
-            "cramped_up",
-            "--source",
-            "noise",
-            "--teammate-family",
-            "H3",
-            "--hide-recipe",
-            "cramped_up",
-        ]
-        arguments = ["train", "rl2", *choice, "--out", str(out), *sizes]
-        printed = run_cli(*arguments)
+        choice = "--layout cramped_up --source noise --teammate-family H3 --hide-recipe cramped_up"
+        sizes = "--steps 1 --batch-size 2 --width 8 --epochs 1 --minibatches 1"
+        printed = run_cli(f"train rl2 {choice} {sizes} --out {out}")
         assert "each an episode of 2 tasks" in printed
         trained = read_trained(out)
         assert (trained.label, trained.step, trained.channels) == ("RL2+TA+mlp", 1, "canonical")

@@ -143,30 +143,26 @@ def test_a_resumed_run_has_every_line_once(tmp_path, name, offline, capfd):
     assert capfd.readouterr().out == ""
 
 
-def test_trackio_writes_into_one_folder_per_process(tmp_path, offline):
+def log_two_runs(folder: Path) -> None:
+    """Write a run with trackio, and another one in the same process."""
     pytest.importorskip("trackio")
     forget("trackio")
     for run in ("one", "two"):
-        (tmp_path / run).mkdir()
-        (tmp_path / run / "metrics.jsonl").touch()
-    with open_loggers(["trackio"], tmp_path / "one" / "metrics.jsonl", {}) as loggers:
-        write_lines(loggers, LINES)
-    with (
-        pytest.raises(OptionError, match=r"as long as this process runs, expected .*two.*: train in another process"),
-        open_loggers(["trackio"], tmp_path / "two" / "metrics.jsonl", {}),
-    ):
-        pass
+        (folder / run).mkdir()
+        (folder / run / "metrics.jsonl").touch()
+        with open_loggers(["trackio"], folder / run / "metrics.jsonl", {}) as loggers:
+            write_lines(loggers, LINES)
+
+
+def test_trackio_writes_into_one_folder_per_process(tmp_path, offline):
+    with pytest.raises(OptionError, match=r"as long as this process runs, expected .*two.*: train in another process"):
+        log_two_runs(tmp_path)
+    assert trackio_values(tmp_path / "one") == expected(LINES)
 
 
 def test_the_user_chooses_the_folder_of_trackio(tmp_path, offline, monkeypatch):
-    pytest.importorskip("trackio")
-    forget("trackio")
     monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
-    for run in ("one", "two"):
-        (tmp_path / run).mkdir()
-        (tmp_path / run / "metrics.jsonl").touch()
-        with open_loggers(["trackio"], tmp_path / run / "metrics.jsonl", {}) as loggers:
-            write_lines(loggers, LINES)
+    log_two_runs(tmp_path)
     with sqlite3.connect(tmp_path / "trackio" / "icrl4aht-data.db") as database:
         assert {name for (name,) in database.execute("select run_name from metrics")} == {"one", "two"}
     database.close()

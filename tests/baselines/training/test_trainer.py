@@ -242,6 +242,12 @@ def long_ppo(tmp_path_factory) -> Path:
     return root
 
 
+def job(root: Path | None, method: str = "ad", layout: str = "demo_wide", context: int = 7, **choice: Any) -> Any:
+    """Return a training on histories of a release, the bundled one by default."""
+    options = dataclasses.replace(OPTIONS, context=context)
+    return prepare(method, MODEL, options, HistoryOptions((layout,), root and str(root), **choice))
+
+
 class TestHeldOut:
     def test_parts_share_no_history_and_no_teammate(self, tmp_path, monkeypatch):
         """Without teammate descriptions, each task counts as its own teammate."""
@@ -262,15 +268,12 @@ class TestHeldOut:
         assert set(again.train.ids) == set(split.train.ids)
 
     def test_histories_of_split_validation_are_the_part_with_other_teammates(self, two_sources):
-        def job(**choice: Any) -> dict[str, Any]:
-            return prepare("ad", MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(two_sources[0]), **choice)).about
-
-        about = job()
+        about = job(two_sources[0]).about
         assert about["histories"]["sizes"] == {"train": 13, "histories": 1, "teammates": 6}
         assert about["histories"]["teammates_split"] == "validation"
         assert {cell["split"] for cell in about["trained_on"]} == {"train"}
         assert {cell["source"] for cell in about["trained_on"]} == {"ppo", "noise"}
-        learned = job(source=("ppo",))  # no validation histories are of this source
+        learned = job(two_sources[0], source=("ppo",)).about  # no validation histories are of this source
         assert learned["histories"]["sizes"] == {"train": 3, "histories": 1, "teammates": 4}
         assert learned["histories"]["teammates_split"] == "train"
 
@@ -285,30 +288,26 @@ class TestHeldOut:
             hold_out(dataset[3:4])
 
     def test_labels(self, two_sources):
-        def job(method: str, **choice: Any) -> Any:
-            return prepare(method, MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(two_sources[0]), **choice))
-
         for method, given, labels in (
-            ("dpt", {"labels": "oracle"}, "oracle"),
-            ("dpt", {}, "expert"),
-            ("ad", {"labels": "oracle"}, "oracle"),
-            ("hybrid_ad", {"labels": "expert"}, "expert"),
-            ("ad", {}, None),
-            ("amago_offline", {}, None),
+            ("dpt", "oracle", "oracle"),
+            ("dpt", None, "expert"),
+            ("ad", "oracle", "oracle"),
+            ("hybrid_ad", "expert", "expert"),
+            ("ad", None, None),
+            ("amago_offline", None, None),
         ):
-            found = job(method, **given)
+            found = job(two_sources[0], method, labels=given)
             assert found.about["histories"]["labels"] == labels
             assert {cell["labels"] for cell in found.about["trained_on"]} == {labels}
             assert {sampler.labels for sampler in (found.data.train, *found.data.validation.values())} == {labels}
 
     def test_samplers_draw_as_chosen(self, two_sources):
-        def job(method: str, **choice: Any) -> Any:
-            options = dataclasses.replace(OPTIONS, context=40)
-            return prepare(method, MODEL, options, HistoryOptions(("demo_wide",), str(two_sources[0]), **choice))
-
-        found = job("ad", every=3)
+        found = job(two_sources[0], context=40, every=3)
         assert {sampler.every for sampler in (found.data.train, *found.data.validation.values())} == {3}
-        assert job("dpt", queries=3).data.train[0].query_target.shape == (OPTIONS.batch_size, 3)
+        assert job(two_sources[0], "dpt", context=40, queries=3).data.train[0].query_target.shape == (
+            OPTIONS.batch_size,
+            3,
+        )
 
     def test_one_teammate_cannot_be_held_out(self):
         dataset = load_icrl4aht(layout="asymm_both_plain")
@@ -320,16 +319,13 @@ class TestHeldOut:
 
     def test_filters_choose_the_histories_and_are_recorded(self):
         """Filter the teammates of demo_simple, which have several families and algorithms."""
-
-        def job(**filters: Any) -> dict[str, Any]:
-            return prepare("ad", MODEL, OPTIONS, HistoryOptions(("demo_simple",), **filters)).about
-
-        everything, learned = job()["trained_on"], job(teammate_family=("rl",))
+        everything = job(None, layout="demo_simple").about["trained_on"]
+        learned = job(None, layout="demo_simple", teammate_family=("rl",)).about
         assert {cell["family"] for cell in everything} == {"rl", "H1", "H2", "H3", "H4"}
         assert {cell["family"] for cell in learned["trained_on"]} == {"rl"}
         assert learned["histories"]["teammate_family"] == ("rl",)
         one = load_icrl4aht(layout="demo_simple", teammate_family="rl").entries[0].teammate_kind
-        (cell,) = job(algorithm=(one,), source=("ppo",))["trained_on"]
+        (cell,) = job(None, layout="demo_simple", algorithm=(one,), source=("ppo",)).about["trained_on"]
         names = {"layout": "demo_simple", "split": "train", "family": "rl", "algorithm": one, "source": "ppo"}
         assert cell.items() >= names.items()
         assert cell["histories"] < len(load_icrl4aht(layout="demo_simple", teammate_kind=one))  # some are held out
@@ -350,7 +346,7 @@ class TestHeldOut:
     )
     def test_filters_that_no_history_passes(self, filters, message):
         with pytest.raises(EmptySelectionError, match=message):
-            prepare("ad", MODEL, OPTIONS, HistoryOptions(("asymm_both",), **filters))
+            job(None, layout="asymm_both", **filters)
 
     @pytest.mark.parametrize(
         ("method", "context", "choice", "message"),
@@ -363,14 +359,13 @@ class TestHeldOut:
         ],
     )
     def test_impossible_trainings(self, long_ppo, method, context, choice, message):
-        histories = HistoryOptions(**{"layouts": ("demo_wide",), "root": str(long_ppo)} | choice)
         with pytest.raises(OptionError, match=message):
-            prepare(method, MODEL, dataclasses.replace(OPTIONS, context=context), histories)
+            job(long_ppo, method, context=context, **choice)
 
     def test_releases_without_labels(self, tmp_path):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
         with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: take labels that all have"):
-            prepare("dpt", MODEL, OPTIONS, HistoryOptions(("demo_wide",), str(tmp_path / "r")))
+            job(tmp_path / "r", "dpt")
 
 
 DEVICES = """

@@ -68,17 +68,17 @@ def bundled(**filters) -> tuple:
     return dataset, dataset[0]
 
 
-def play_recorded(env, history, start: int, steps: int) -> tuple[list, list, list, list]:
-    """Return observations, states, rewards and the teammate's actions that a history's actions lead to."""
-    observations, states, rewards, teammate = [], [], [], []
-    for action in history.actions[start : start + steps]:
-        observation, reward, terminated, truncated, info = env.step(action)
-        assert not terminated and not truncated
-        observations.append(observation)
-        states.append(info["state"])
-        rewards.append(reward)
-        teammate.append(info["teammate_action"])
-    return observations, states, rewards, teammate
+def replay(env, history, episode: int, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Compare a recorded episode with one in which the ego acts as recorded; return its observations and last state."""
+    own = slice(100 * episode, 100 * episode + 100)
+    observation, info = env.reset(options=options)
+    observations, rewards, terminated, truncated, infos = zip(*map(env.step, history.actions[own]), strict=True)
+    assert not any(terminated + truncated)
+    states = [info["state"], *(one["state"] for one in infos)]
+    np.testing.assert_array_equal(states[:-1], history.state[own])
+    np.testing.assert_array_equal(rewards, history.rewards[own])
+    np.testing.assert_array_equal([one["teammate_action"] for one in infos], history.teammate_actions[own])
+    return np.array([observation, *observations[:-1]]), states[-1]
 
 
 @pytest.mark.parametrize(
@@ -95,14 +95,10 @@ def test_recorded_actions_lead_to_the_recorded_history(filters):
     assert recovered.spec.max_episode_steps == 400
     returns = history.returns()
     for episode in {0, int(returns.argmax()), len(returns) - 1}:
-        first = 100 * episode
-        observation, info = recovered.reset(options=dataset.reset_options(history.entry.history_id, episode))
-        observations, states, rewards, teammate = play_recorded(recovered, history, first, 100)
-        np.testing.assert_array_equal([observation, *observations[:-1]], history.obs[first : first + 100])
-        np.testing.assert_array_equal([info["state"], *states[:-1]], history.state[first : first + 100])
-        np.testing.assert_array_equal(states[-1], history.episode_end_state[episode])
-        np.testing.assert_array_equal(rewards, history.rewards[first : first + 100])
-        np.testing.assert_array_equal(teammate, history.teammate_actions[first : first + 100])
+        options = dataset.reset_options(history.entry.history_id, episode)
+        observations, last = replay(recovered, history, episode, options)
+        np.testing.assert_array_equal(observations, history.obs[100 * episode : 100 * episode + 100])
+        np.testing.assert_array_equal(last, history.episode_end_state[episode])
     assert returns.max() > 0
 
 
@@ -112,12 +108,7 @@ def test_recovered_keys_reproduce_heuristics(source):
     dataset, history = bundled(layout="demo_wide", source=source, teammate_family=["H1", "H2", "H3", "H4"])
     recovered = dataset.recover_environment(history.entry.history_id)
     for episode in (0, int(history.returns().argmax())):
-        _, info = recovered.reset(options=recorded_draws(dataset, history.entry.history_id, episode))
-        first = 100 * episode
-        _, states, rewards, teammate = play_recorded(recovered, history, first, 100)
-        np.testing.assert_array_equal([info["state"], *states[:-1]], history.state[first : first + 100])
-        np.testing.assert_array_equal(rewards, history.rewards[first : first + 100])
-        np.testing.assert_array_equal(teammate, history.teammate_actions[first : first + 100])
+        replay(recovered, history, episode, recorded_draws(dataset, history.entry.history_id, episode))
 
 
 def test_the_policy_acts_after_the_recorded_steps():
@@ -126,7 +117,7 @@ def test_the_policy_acts_after_the_recorded_steps():
     number = history.entry.history_id
     scripted = {name: array[:50] for name, array in dataset.reset_options(number).items() if name != "state"}
     recovered.reset(options=recorded_draws(dataset, number) | scripted | {"teammate_actions": np.full(50, 4)})
-    *_, teammate = play_recorded(recovered, history, 0, 100)
+    teammate = [recovered.step(action)[-1]["teammate_action"] for action in history.actions[:100]]
     assert teammate[:50] == [4] * 50
     assert set(teammate[50:]) - {4}
 

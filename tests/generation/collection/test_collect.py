@@ -6,12 +6,13 @@ import errno
 import os
 import shutil
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from icrl4aht_generation.collection import job as collection_job
 from icrl4aht_generation.collection import task as collect
+from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.task_folder import (
     LEARNER,
     METADATA,
@@ -22,7 +23,7 @@ from icrl4aht_generation.collection.task_folder import (
     partial_folder,
 )
 from icrl4aht_generation.learners.resume import StateFile
-from icrl4aht_generation.profiles import Profile, Work, load_profile
+from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.check import compare_rebuilds
 
 from tests.helpers.tiny import TINY, artefact, start
@@ -31,40 +32,40 @@ from tests.robustness.limits import file_size_limit
 COLLECT = """
 import sys, time
 from pathlib import Path
-from icrl4aht_generation.collection.job import run_task
-from icrl4aht_generation.profiles import Profile, load_profile
+from icrl4aht_generation.collection.job import CollectionJob
+from icrl4aht_generation.profiles import load_profile
 
-def report(update, metrics):
-    print(update, flush=True)
+def report(updates, speed):
+    print(updates, flush=True)
     time.sleep(0.1)
 
 profile = load_profile(sys.argv[1])
-run_task(*profile.units(), profile, Path(sys.argv[2]), report, save_seconds=float(sys.argv[3]))
+CollectionJob(*profile.units(), profile, Path(sys.argv[2])).run(report, save_seconds=float(sys.argv[3]))
 """
 
 
 @pytest.fixture
-def task(built):
+def job(built, tmp_path) -> CollectionJob:
     profile = load_profile(str(built / "tiny.toml"))
-    return profile.units()[0], profile
+    return CollectionJob(profile.units()[0], profile, tmp_path)
 
 
-def run_task(task: tuple[Work, Profile], *arguments, **options) -> bool:
-    return collection_job.run_task(task[0], task[1], *arguments, **options)
-
-
-def stop_after(update: int):
-    def report(number, metrics):
-        if number == update:
+def stop_after(updates: int):
+    def report(done, speed):
+        if done == updates:
             raise KeyboardInterrupt
 
     return report
 
 
+def never(updates, speed):
+    raise AssertionError("the task was started")
+
+
 @pytest.mark.slow
 def test_runs_killed_at_random_write_the_same_artefact(built, tmp_path):
     folder = tmp_path / artefact(built / "a").name
-    command = ["-c", COLLECT, str(built / "tiny.toml"), str(folder), "0.1"]
+    command = ["-c", COLLECT, str(built / "tiny.toml"), str(tmp_path), "0.1"]
     seed = int(os.environ.get("KILL_SEED", "7"))
     print(f"KILL_SEED={seed}")
     random, firsts, killed = np.random.default_rng(seed), [], []
@@ -83,53 +84,48 @@ def test_runs_killed_at_random_write_the_same_artefact(built, tmp_path):
     output, errors = start(*command).communicate()
     assert folder.exists(), errors
     firsts.append(int(output.split()[0]))
-    assert firsts[0] == 0
+    assert firsts[0] == 1
     assert firsts == sorted(set(firsts)), f"killed {killed}, began at {firsts}"
     assert not compare_rebuilds(folder, artefact(built / "a")).differences, killed
     assert not partial_folder(folder).exists()
 
 
-def test_updates_after_the_last_save_are_repeated(built, task, tmp_path):
-    folder = tmp_path / "task"
+def test_updates_after_the_last_save_are_repeated(built, job):
     with pytest.raises(KeyboardInterrupt):
-        run_task(task, folder, stop_after(6), save_seconds=0)
-    partial = partial_folder(folder)
+        job.run(stop_after(7), save_seconds=0)
+    partial = partial_folder(job.folder)
     assert StateFile(partial / LEARNER).progress == 6
     with (partial / METRICS).open("a") as stream:
         stream.write('{"update": 6, "half a li')
     rewards = np.load(partial / "rewards.npy", mmap_mode="r+")
     rewards[:, 180:] = 77  # six updates of 80 steps led to the first 180 that are kept
     rewards.flush()
-    run_task(task, folder)
-    assert not compare_rebuilds(folder, artefact(built / "a")).differences
+    job.run()
+    assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
-def test_killed_after_the_last_update(built, task, tmp_path, monkeypatch):
-    folder = tmp_path / "task"
-
+def test_killed_after_the_last_update(built, job, monkeypatch):
     def kill(*arguments):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(collect, "finish_artefact", kill)
         with pytest.raises(KeyboardInterrupt):
-            run_task(task, folder)
-    assert run_task(task, folder, kill)
-    assert not compare_rebuilds(folder, artefact(built / "a")).differences
+            job.run()
+    job.run(kill)
+    assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
-def test_killed_before_renaming(built, task, tmp_path):
-    folder = tmp_path / "task"
-    shutil.copytree(artefact(built / "a"), partial_folder(folder))
-    (partial_folder(folder) / LEARNER).write_bytes(b"no longer needed")
-    assert run_task(task, folder)
-    assert not compare_rebuilds(folder, artefact(built / "a")).differences
+def test_killed_before_renaming(built, job):
+    shutil.copytree(artefact(built / "a"), partial_folder(job.folder))
+    (partial_folder(job.folder) / LEARNER).write_bytes(b"no longer needed")
+    job.run(never)
+    assert not compare_rebuilds(job.folder, artefact(built / "a")).differences
 
 
-def test_a_partial_of_other_settings_is_started_again(built, task, tmp_path, monkeypatch):
-    folder = tmp_path / "task"
+def test_a_partial_of_other_settings_is_started_again(job, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
-        run_task(task, folder, stop_after(3), save_seconds=0)
+        job.run(stop_after(4), save_seconds=0)
     (tmp_path / "other.toml").write_text(TINY.replace("rollout = 80", "rollout = 80\nclip = 0.1"))
     firsts = []
 
@@ -138,41 +134,34 @@ def test_a_partial_of_other_settings_is_started_again(built, task, tmp_path, mon
         raise KeyboardInterrupt
 
     monkeypatch.setattr(collect, "ArtefactWriter", writer)
-    for profile in (task[1], load_profile(str(tmp_path / "other.toml"))):
+    for profile in (job.profile, load_profile(str(tmp_path / "other.toml"))):
         with pytest.raises(KeyboardInterrupt):
-            run_task((task[0], profile), folder)
+            replace(job, profile=profile).run()
     assert firsts == [3, 0]
 
 
-def test_a_finished_task_is_unchanged(built, task, tmp_path):
-    folder = tmp_path / "task"
-    shutil.copytree(artefact(built / "a"), folder)
-    before = (folder / METADATA).stat().st_mtime_ns
-    assert not run_task(task, folder, stop_after(0))
-    assert (folder / METADATA).stat().st_mtime_ns == before
+def test_a_finished_task_is_unchanged(built, job):
+    shutil.copytree(artefact(built / "a"), job.folder)
+    before = (job.folder / METADATA).stat().st_mtime_ns
+    job.run(never)
+    assert (job.folder / METADATA).stat().st_mtime_ns == before
 
 
 # A full disk: a clear error, no SIGBUS, no leftover files.
 
 
-def never(update, metrics):
-    raise AssertionError("the task was started")
-
-
-def test_free_space_is_checked_before_the_work(task, tmp_path, monkeypatch):
+def test_free_space_is_checked_before_the_work(job, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=5_000))
-    folder = tmp_path / "task"
-    message = rf"^{folder}: the disk is full: this task needs [\d,]{{6,}} bytes, 5,000 are free; .* another --out$"
+    message = rf"^{job.folder}: the disk is full: this task needs [\d,]{{6,}} bytes, 5,000 are free; .* another --out$"
     with pytest.raises(DiskFullError, match=message):
-        run_task(task, folder, never)
+        job.run(never)
     assert not [path for path in tmp_path.iterdir() if not path.name.endswith(".lock")]
 
 
-def test_arrays_are_allocated_not_sparse(task, tmp_path):
-    ego = task[1].ego
-    writer = ArtefactWriter(tmp_path, task[0].task, ego, 0)
-    writer.close()
-    for name, (shape, dtype) in array_shapes(task[0].task.layout, ego.environments, ego.episodes).items():
+def test_arrays_are_allocated_not_sparse(job, tmp_path):
+    task, ego = job.work.task, job.profile.ego
+    ArtefactWriter(tmp_path, task, ego, 0).close()
+    for name, (shape, dtype) in array_shapes(task.layout, ego.environments, ego.episodes).items():
         path = tmp_path / f"{name}.npy"
         assert path.stat().st_blocks * 512 >= path.stat().st_size
         found = np.load(path)
@@ -181,17 +170,17 @@ def test_arrays_are_allocated_not_sparse(task, tmp_path):
         assert path.read_bytes() == (tmp_path / "saved.npy").read_bytes()
 
 
-def test_a_failed_allocation_leaves_no_files(task, tmp_path):
-    with file_size_limit(64 * 1024), pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
-        run_task(task, tmp_path / "task", never)
-    assert not partial_folder(tmp_path / "task").exists()
+def test_a_failed_allocation_leaves_no_files(job):
+    with file_size_limit(64 * 1024), pytest.raises(DiskFullError, match=r": the disk is full: this task needs "):
+        job.run(never)
+    assert not partial_folder(job.folder).exists()
 
 
-def test_a_full_disk_keeps_the_saved_state(task, tmp_path):
-    def fill(update, metrics):
-        if update == 6:
+def test_a_full_disk_keeps_the_saved_state(job):
+    def fill(updates, speed):
+        if updates == 7:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with pytest.raises(DiskFullError, match="task: the disk is full: this task needs "):
-        run_task(task, tmp_path / "task", fill, save_seconds=0)
-    assert StateFile(partial_folder(tmp_path / "task") / LEARNER).progress == 6
+    with pytest.raises(DiskFullError, match=": the disk is full: this task needs "):
+        job.run(fill, save_seconds=0)
+    assert StateFile(partial_folder(job.folder) / LEARNER).progress == 6

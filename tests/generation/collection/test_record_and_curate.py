@@ -106,14 +106,9 @@ def test_recording_is_idempotent_and_independent_of_order():
 
 
 def rewards_of(returns: list[list[int]]) -> np.ndarray:
-    """int8 (N, T): rewards, at any steps, that add up to these episode returns."""
-    rng = np.random.default_rng(0)
-    rewards = np.zeros((len(returns), len(returns[0]), 100), np.int8)
-    for n, curve in enumerate(returns):
-        for e, total in enumerate(curve):
-            steps = rng.permutation(100)
-            pieces = [5 * int(np.sign(total))] * (abs(total) // 5)
-            rewards[n, e, steps[: len(pieces)]] = pieces
+    """int8 (N, T): rewards of 5 or -5 that add up to these episode returns."""
+    totals = np.array(returns)[..., None] // 5
+    rewards = np.where(np.arange(100) < abs(totals), 5 * np.sign(totals), 0).astype(np.int8)
     assert rewards.sum(axis=-1).tolist() == returns
     return rewards.reshape(len(returns), -1)
 
@@ -179,8 +174,7 @@ def labelled():
     rng = np.random.default_rng(3)
     states = random_records(LAYOUT, 400, rng).reshape(2, 200, -1)
     obs = observe(LAYOUT, states, EGO)
-    hidden = network.initial_hidden(2)
-    tree = jax.eval_shape(network.init, jax.random.key(0), hidden, obs[None, :, 0], np.zeros((1, 2), bool))
+    tree = jax.eval_shape(lambda key: network.untrained(key, LAYOUT.channels), jax.random.key(0))
 
     def random(weight) -> np.ndarray:  # actions as different as the states
         if len(weight.shape) == 1:

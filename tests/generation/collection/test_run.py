@@ -1,4 +1,4 @@
-"""All tasks of a rebuild: failures, retries, two collectors at once, Ray."""
+"""All tasks of a rebuild: missing ones, two collectors at once, Ray."""
 
 from __future__ import annotations
 
@@ -7,18 +7,15 @@ import json
 import shutil
 import sys
 import time
-from io import StringIO
-from pathlib import Path
 
 import psutil
 import pytest
-from icrl4aht_generation.collection import job
 from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.task_folder import LEARNER, partial_folder
-from icrl4aht_generation.jobs.job import FailedJobsError, JobBoard, run_job
+from icrl4aht_generation.jobs.job import JobBoard, run_job
 from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.queue import run_jobs
-from icrl4aht_generation.learners.resume import BusyError, run_lock
+from icrl4aht_generation.learners.resume import run_lock
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.check import compare_rebuilds
 from rich.console import Console
@@ -26,6 +23,7 @@ from rich.console import Console
 from icrl4aht_data import verify_release
 from icrl4aht_data.commands.cli import main
 from icrl4aht_data.errors import OptionError
+from tests.helpers.jobs import FileJob
 from tests.helpers.tiny import artefact, start
 
 
@@ -33,79 +31,6 @@ from tests.helpers.tiny import artefact, start
 def tasks(built):
     profile = load_profile(str(built / "pair.toml"))
     return profile.units(), profile
-
-
-def failures(out: Path) -> list[dict]:
-    path = out / "failed.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def collect(tasks, out: Path, console: Console | None = None, **options) -> str:
-    """Collect the tasks and return the printed output."""
-    console = console or Console(file=StringIO(), width=500)
-    jobs = [CollectionJob(work, tasks[1], out / "artefacts") for work in tasks[0]]
-    run_jobs(jobs, out, console, QueueOptions(**options))
-    return console.file.getvalue()  # type: ignore[attr-defined]
-
-
-def failing(monkeypatch, *errors: Exception | None) -> list[int]:
-    """Replace the runner by one whose n-th call raises the n-th error; returns the seeds it was called with."""
-    calls: list[int] = []
-
-    def run_task(work, profile, folder, report, *, suite, wait):
-        calls.append(work.task.seed)
-        error = errors[len(calls) - 1] if len(calls) <= len(errors) else None
-        if error is not None:
-            raise error
-        return True
-
-    monkeypatch.setattr(job, "run_task", run_task)
-    return calls
-
-
-def test_a_failing_task_is_reported_and_others_finish(tasks, tmp_path, monkeypatch):
-    calls = failing(monkeypatch, ZeroDivisionError("no steps"))
-    with pytest.raises(FailedJobsError, match=r"1 of 2 jobs are unfinished: .*_s0_.*failed\.jsonl has the reasons"):
-        collect(tasks, tmp_path)
-    assert calls == [0, 1]
-    (line,) = failures(tmp_path)
-    assert (line["task_id"], line["attempts"]) == (tasks[0][0].name, 1)
-    assert line["error"] == "ZeroDivisionError: no steps"
-    assert "Traceback" in line["traceback"]
-    assert "finished" in collect(tasks, tmp_path)
-    assert not (tmp_path / "failed.jsonl").exists()
-
-
-def test_retries(tasks, tmp_path, monkeypatch):
-    calls = failing(monkeypatch, OSError("once"), OSError("twice"))
-    collect(tasks, tmp_path, retries=2)
-    assert calls == [0, 0, 0, 1]
-    calls = failing(monkeypatch, *[OSError("always")] * 3)
-    with pytest.raises(FailedJobsError):
-        collect(tasks, tmp_path, retries=2)
-    assert calls == [0, 0, 0, 1]
-    assert [line["attempts"] for line in failures(tmp_path)] == [3]
-
-
-def test_fail_fast(tasks, tmp_path, monkeypatch):
-    calls = failing(monkeypatch, OSError("first"))
-    with pytest.raises(FailedJobsError, match=r"failed\.jsonl: the first failure: OSError: first"):
-        collect(tasks, tmp_path, fail_fast=True)
-    assert calls == [0]
-    assert len(failures(tmp_path)) == 1
-
-
-def test_an_interrupt_is_no_failure(tasks, tmp_path, monkeypatch):
-    failing(monkeypatch, KeyboardInterrupt())  # type: ignore[arg-type]
-    with pytest.raises(KeyboardInterrupt):
-        collect(tasks, tmp_path, retries=3)
-    assert not failures(tmp_path)
-
-
-def test_tasks_of_another_collector_come_last(tasks, tmp_path, monkeypatch):
-    calls = failing(monkeypatch, BusyError("busy"))
-    assert "another process works on it" in collect(tasks, tmp_path)
-    assert calls == [0, 1, 0]
 
 
 def test_waiting_for_the_other_collector(tasks, built, tmp_path):
@@ -177,7 +102,7 @@ def test_ray_with_two_workers(built, pair, tmp_path):
     output, errors = process.communicate()
     assert process.returncode == 1, output + errors
     assert "1 of 2 jobs are unfinished" in errors
-    (line,) = failures(tmp_path)
+    (line,) = map(json.loads, (tmp_path / "failed.jsonl").read_text().splitlines())
     assert line["attempts"] == 2
     assert line["error"].startswith("OptionError: ")
     assert "in progress" in line["traceback"]
@@ -192,9 +117,10 @@ def test_ray_with_two_workers(built, pair, tmp_path):
     assert all(ipaddress.ip_address(address.removeprefix("::ffff:")).is_loopback for address in addresses), addresses
 
 
-def test_workers_of_a_cluster_are_its_own(tasks, tmp_path):
+def test_workers_of_a_cluster_are_its_own(tmp_path):
+    jobs = [FileJob(tmp_path, "one")]
     with pytest.raises(OptionError, match="workers = 2: the Ray at there:6379 has its own"):
-        collect(tasks, tmp_path, executor="ray", address="there:6379", workers=2)
+        run_jobs(jobs, tmp_path, Console(), QueueOptions(executor="ray", address="there:6379", workers=2))
 
 
 def test_the_board_counts_tasks_updates_and_speed():

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,10 +13,11 @@ import numpy as np
 import pytest
 from icrl4aht_generation.collection import scripted_rollout
 from icrl4aht_generation.collection.curate import oracle_labels
-from icrl4aht_generation.collection.job import run_task
+from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.collection.scripted import scripted_bytes
 from icrl4aht_generation.collection.scripted_rollout import noise_schedules, play_scripted_histories
 from icrl4aht_generation.collection.task_folder import METADATA, TIMING, last_timing, partial_folder
+from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.releases.check import compare_rebuilds
@@ -61,9 +60,9 @@ def profile(tmp_path_factory) -> Profile:
 @pytest.fixture(scope="module")
 def made(profile, short_pieces, tmp_path_factory) -> Path:
     """Return a finished artefact."""
-    folder = tmp_path_factory.mktemp("noise") / WORK.name
-    assert run_task(WORK, profile, folder)
-    return folder
+    job = CollectionJob(WORK, profile, tmp_path_factory.mktemp("noise"))
+    job.run()
+    return job.folder
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +70,9 @@ def arrays(made) -> dict[str, np.ndarray]:
     return {path.stem: np.load(path) for path in made.glob("*.npy")}
 
 
-def stop_after(history: int) -> Callable[[int, dict[str, float]], None]:
-    def report(number, metrics):
-        if number >= history:
+def stop_after(pieces: int) -> OnUpdate:
+    def report(done, speed):
+        if done >= pieces:
             raise KeyboardInterrupt
 
     return report
@@ -140,8 +139,9 @@ def test_an_episode_is_a_function_of_its_numbers(arrays):
 @pytest.mark.slow
 def test_the_bits_do_not_depend_on_the_piece(made, profile, tmp_path, monkeypatch):
     monkeypatch.setattr(scripted_rollout, "EPISODES_AT_ONCE", 23)
-    run_task(WORK, profile, tmp_path / "task")
-    assert not compare_rebuilds(tmp_path / "task", made).differences
+    job = CollectionJob(WORK, profile, tmp_path)
+    job.run()
+    assert not compare_rebuilds(job.folder, made).differences
 
 
 def test_schedules():
@@ -166,14 +166,14 @@ def test_schedules():
 
 
 def test_a_stopped_task_is_made_again(made, profile, tmp_path):
-    folder, seen = tmp_path / WORK.name, []
+    job, seen = CollectionJob(WORK, profile, tmp_path), []
     with pytest.raises(KeyboardInterrupt):
-        run_task(WORK, profile, folder, stop_after(1))
-    assert (partial_folder(folder) / "rewards.npy").exists()
-    assert run_task(WORK, profile, folder, lambda number, metrics: seen.append(number))
-    assert seen == [0, 1, 2]
-    assert not compare_rebuilds(folder, made).differences
-    assert not partial_folder(folder).exists()
+        job.run(stop_after(2))
+    assert (partial_folder(job.folder) / "rewards.npy").exists()
+    job.run(lambda done, speed: seen.append(done))
+    assert seen == [1, 2, 3]
+    assert not compare_rebuilds(job.folder, made).differences
+    assert not partial_folder(job.folder).exists()
 
 
 def test_wall_clock_figures_are_apart_from_what_is_hashed(made):
@@ -184,27 +184,23 @@ def test_wall_clock_figures_are_apart_from_what_is_hashed(made):
     assert 0 < timing["recording"] < timing["seconds"]
 
 
-def test_a_full_disk(profile, tmp_path, monkeypatch):
-    def fill(piece, metrics):
+def test_a_full_disk_leaves_no_files(profile, tmp_path):
+    def fill(pieces, speed):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with pytest.raises(DiskFullError, match=r"task: the disk is full: this task needs "):
-        run_task(WORK, profile, tmp_path / "task", fill)
-    assert not partial_folder(tmp_path / "task").exists()
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: type("Usage", (), {"free": 5_000}))
-    with pytest.raises(
-        DiskFullError, match=r"other: the disk is full: this task needs [\d,]{6,} bytes, 5,000 are free"
-    ):
-        run_task(WORK, profile, tmp_path / "other", stop_after(0))
-    assert not partial_folder(tmp_path / "other").exists()
+    job = CollectionJob(WORK, profile, tmp_path)
+    with pytest.raises(DiskFullError, match=r": the disk is full: this task needs "):
+        job.run(fill)
+    assert not partial_folder(job.folder).exists()
 
 
 def searched(profile: Profile, folder: Path, dish: tuple[int, int, int]) -> dict[str, np.ndarray]:
     """Return histories of the searcher in a task with one wanted dish, whose teammate only watches."""
     work = Work(make_task("preference", "train", "asymm_both_plain", WATCHER, 5, [dish]), "search")
-    assert run_task(work, profile, folder / str(dish))
-    assert not run_task(work, profile, folder / str(dish)), "a finished task is kept"
-    return {path.stem: np.load(path) for path in (folder / str(dish)).glob("*.npy")}
+    job = CollectionJob(work, profile, folder)
+    job.run()
+    assert job.is_finished()
+    return {path.stem: np.load(path) for path in job.folder.glob("*.npy")}
 
 
 def test_a_searcher_finds_the_dish_and_remembers_it(profile, tmp_path):
@@ -228,7 +224,7 @@ def test_a_searcher_finds_the_dish_and_remembers_it(profile, tmp_path):
     assert any(not np.array_equal(a, b) for a, b in zip(one["actions"], other["actions"], strict=True))
 
 
-def test_a_search_history_has_one_chance_until_its_end(profile, tmp_path):
+def test_a_search_history_has_one_chance_until_its_end():
     chances = noise_schedules(replace(SEARCH, histories=50), 0)
     assert (chances[:, :-1] == chances[:, :1]).all()
     assert chances.min() >= 0
@@ -242,12 +238,12 @@ def test_histories_with_a_learned_teammate(profile, tmp_path):
     save(tmp_path / "suite/member", LAYOUT)
     mate = entry(tmp_path / "suite", "member")
     work = Work(make_task("teammate", "train", "demo_wide", mate, 3), "noise")
-    folder, suite = tmp_path / work.name, tmp_path / "suite"
-    assert run_task(work, profile, folder, suite=suite)
-    states = np.load(folder / "state.npy").reshape(40, 100, -1)[[0, 25]].swapaxes(0, 1)
-    policy = build_learned(LAYOUT, suite / "member")
+    job = CollectionJob(work, profile, tmp_path, tmp_path / "suite")
+    job.run()
+    states = np.load(job.folder / "state.npy").reshape(40, 100, -1)[[0, 25]].swapaxes(0, 1)
+    policy = build_learned(LAYOUT, tmp_path / "suite/member")
     expected = act_along(LAYOUT, [policy], jnp.asarray(states))[0].T
-    played = np.load(folder / "teammate_actions.npy").reshape(40, 100)[[0, 25]]
+    played = np.load(job.folder / "teammate_actions.npy").reshape(40, 100)[[0, 25]]
     np.testing.assert_array_equal(played, expected)
     assert len(np.unique(played)) > 1
 

@@ -14,7 +14,7 @@ from icrl4aht_baselines.agents.egos import AGENTS
 from icrl4aht_baselines.evaluate.evaluator import play_tasks
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.teammates.instances import published_tasks, published_thetas
+from icrl4aht_generation.teammates.instances import published_tasks, published_teammates
 from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_data.benchmark.facts import TRACKS
@@ -47,8 +47,7 @@ def by_layout(*names: str) -> list[Any]:
 
 def h4(layout: Layout) -> Policy:
     """Heuristic H4 in the ego's agent slot."""
-    theta = published_thetas(layout.name, "utility_greedy")[0]
-    return build_teammate(layout, {"family": "utility_greedy", "theta": theta}, EGO)
+    return build_teammate(layout, published_teammates(layout.name, "utility_greedy")[0], EGO)
 
 
 @cache

@@ -30,6 +30,59 @@ def run(jobs, out: Path, **options) -> str:
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
+def failures(out: Path) -> list[dict]:
+    path = out / "failed.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def tries(out: Path, *names: str) -> list[int]:
+    """Return how often jobs were begun."""
+    return [len(path.read_text()) if (path := out / f"{name}.tries").exists() else 0 for name in names]
+
+
+def test_a_failing_job_is_reported_and_others_finish(tmp_path):
+    jobs = [FileJob(tmp_path, "bad", failures=1), FileJob(tmp_path, "good")]
+    with pytest.raises(FailedJobsError, match=r"1 of 2 jobs are unfinished: bad; .*failed\.jsonl has the reasons"):
+        run(jobs, tmp_path)
+    (line,) = failures(tmp_path)
+    assert (line["task_id"], line["attempts"], line["error"]) == ("bad", 1, "ValueError: attempt 1")
+    assert "Traceback" in line["traceback"]
+    assert "finished" in run(jobs, tmp_path)
+    assert tries(tmp_path, "bad", "good") == [2, 1]
+    assert not failures(tmp_path)
+
+
+def test_retries(tmp_path):
+    run([FileJob(tmp_path, "later", failures=2)], tmp_path, retries=2)
+    with pytest.raises(FailedJobsError):
+        run([FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "good")], tmp_path, retries=2)
+    assert tries(tmp_path, "later", "bad", "good") == [3, 3, 1]
+    assert [line["attempts"] for line in failures(tmp_path)] == [3]
+
+
+def test_fail_fast(tmp_path):
+    with pytest.raises(FailedJobsError, match=r"failed\.jsonl: the first failure: ValueError: attempt 1"):
+        run([FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "good")], tmp_path, fail_fast=True)
+    assert tries(tmp_path, "bad", "good") == [1, 0]
+    assert len(failures(tmp_path)) == 1
+
+
+def test_an_interrupt_is_no_failure(tmp_path, monkeypatch):
+    def interrupt(*arguments) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FileJob, "run", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run([FileJob(tmp_path, "one")], tmp_path, retries=3)
+    assert not failures(tmp_path)
+
+
+def test_jobs_of_another_process_come_last(tmp_path):
+    printed = run([FileJob(tmp_path, "busy", busy=True), FileJob(tmp_path, "good")], tmp_path)
+    works, good, busy = (printed.index(text) for text in ("1/2 busy: another process", "2/2 good: f", "1/2 busy: f"))
+    assert works < good < busy
+
+
 def test_local_processes(tmp_path):
     """Two workers: one job fails once and is tried again, one always fails, one is killed."""
     jobs = [FileJob(tmp_path, "killed", killed=True), FileJob(tmp_path, "busy", busy=True)]
@@ -37,7 +90,7 @@ def test_local_processes(tmp_path):
     with pytest.raises(FailedJobsError, match=r"2 of 4 jobs are unfinished: bad, killed; .*has the reasons"):
         run(jobs, tmp_path, workers=2, retries=1)
     assert str(os.getpid()) not in {(tmp_path / name).read_text() for name in ("busy", "later")}
-    lines = {line["task_id"]: line for line in map(json.loads, (tmp_path / "failed.jsonl").read_text().splitlines())}
+    lines = {line["task_id"]: line for line in failures(tmp_path)}
     assert lines.keys() == {"bad", "killed"}
     assert (lines["bad"]["attempts"], lines["bad"]["error"]) == (2, "ValueError: attempt 2")
     assert "helpers/jobs.py" in lines["bad"]["traceback"]

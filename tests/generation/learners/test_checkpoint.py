@@ -13,6 +13,7 @@ from safetensors.numpy import load_file, save_file
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
+from tests.helpers.trees import same_bytes
 
 
 @pytest.fixture(scope="module")
@@ -20,10 +21,6 @@ def policy():
     layout = get_layout("demo_wide")
     network = ActorCritic(Widths(encoder="mlp", dense=16, gru=8, head=8), view=CompactView("mlp", (layout,)))
     return network, jax.jit(network.untrained, static_argnums=1)(jax.random.key(0), layout.channels)
-
-
-def equal(ours, theirs) -> bool:
-    return jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(np.asarray(a), np.asarray(b)), ours, theirs))
 
 
 def flat_kernel(folder) -> str:
@@ -36,7 +33,7 @@ def test_rows_of_zeros_take_no_space(policy, tmp_path):
     network, params = policy
     save_policy(tmp_path / "p", network, params, {"step": 3})
     found, read, card = load_policy(tmp_path / "p")
-    assert equal(read, params)
+    assert same_bytes(read, params)
     assert (found.widths, card["step"]) == (network.widths, 3)
     full = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(params))
     assert (tmp_path / "p" / POLICY_WEIGHTS).stat().st_size < full / 3

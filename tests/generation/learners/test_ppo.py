@@ -176,29 +176,14 @@ def test_generalised_advantage(gamma, lam):
 
 
 def replay(learner: Learner, state: LearnerState, rollout: Rollout, reset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return log-probabilities and values as the loss has them, read from its derivatives.
-
-    At unchanged parameters the ratio is the derivative of the policy loss by the old log-probability, over the
-    advantage; the value is the target less the derivative of the value loss by the target.
-    """
-    rng = np.random.default_rng(9)
-    advantage, target = rng.normal(size=(2, *rollout.done.shape)).astype(np.float32)
-    normalised = (advantage - advantage.mean()) / advantage.std()
-    own = egos_sequences(state, rollout)._replace(reset=jnp.asarray(reset))
-
-    def losses(log_prob, target):
-        batch = Batch(own._replace(log_prob=log_prob), jnp.asarray(advantage), target)
-        return learner.ppo.loss(state.params, jax.tree.map(jnp.asarray, batch))[1]
-
-    by_log_prob = jax.jit(jax.grad(lambda p, t: losses(p, t)["policy_loss"]))
-    by_target = jax.jit(jax.grad(lambda t, p: losses(p, t)["value_loss"]))
-    log_prob = egos(rollout).log_prob
-    ratio = np.asarray(by_log_prob(log_prob, target)) * target.size / normalised
-    value = target - np.asarray(by_target(target, log_prob)) * target.size
-    return np.log(np.maximum(ratio, 1e-6)) + log_prob, value
+    """Return log-probabilities and values of the network on the sequences that the ego learns from."""
+    own = egos_sequences(state, rollout)
+    output: Any = jax.jit(learner.network.apply)(state.params, own.hidden[0], own.seen, reset)
+    log_probs = np.asarray(jax.nn.log_softmax(output[1]))
+    return np.take_along_axis(log_probs, np.asarray(own.action)[..., None], axis=-1)[..., 0], np.asarray(output[2])
 
 
-def test_the_loss_replays_the_rollout_across_an_episode_end(learner, played):
+def test_sequences_replay_the_rollout_across_an_episode_end(learner, played):
     """The second roll-out: it starts within an episode, with a hidden state, and the next episode starts at step 4."""
     state, rollout = played.before[1], played.rollouts[1]
     np.testing.assert_array_equal(rollout.reset.nonzero()[0], [4] * 4)

@@ -108,10 +108,7 @@ def restarted() -> Played:
 @pytest.fixture(scope="module")
 def params() -> Any:
     """Return parameters of three policies, leaves (3, ...), whose action probabilities are far from uniform."""
-    obs = jnp.zeros((1, 1, 5, 5, LAYOUT.channels), jnp.uint8)
-    shapes = jax.eval_shape(
-        NETWORK.init, jax.random.key(0), NETWORK.initial_hidden(1), obs, jnp.ones((1, 1), bool), jnp.zeros(1, int)
-    )
+    shapes = jax.eval_shape(lambda key: NETWORK.untrained(key, LAYOUT.channels), jax.random.key(0))
     rng = np.random.default_rng(4)
     return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=(3, *leaf.shape)), jnp.float32) * 0.4, shapes)
 

@@ -8,10 +8,7 @@ Fast tests train LBRDiv alone.
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import cache, partial
@@ -32,11 +29,10 @@ from icrl4aht_generation.populations.select import (
     write_manifests,
 )
 from icrl4aht_generation.populations.train import (
+    PopulationJob,
     PopulationRun,
     SuiteCheckpoint,
-    is_population_finished,
     suite_checkpoints,
-    train_population,
 )
 from icrl4aht_generation.profiles import load_profile
 from icrl4aht_generation.releases.check import compare_rebuilds
@@ -46,7 +42,8 @@ from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import file_hash
-from tests.helpers.paths import ROOT
+from tests.helpers.damages import flip_bit
+from tests.helpers.tiny import start
 from tests.helpers.xla_flags import add_xla_flag
 
 LAYOUT = get_layout("cramped_up")
@@ -81,6 +78,10 @@ def run_of(algorithm: str) -> PopulationRun:
     return PopulationRun(LAYOUT, algorithm, SMOKE.members, CONFIG, seed=0)
 
 
+def job_of(algorithm: str, suite: Path) -> PopulationJob:
+    return PopulationJob(run_of(algorithm), suite)
+
+
 short_cross_play = partial(cross_play.cross_play_returns, episodes=2)
 
 
@@ -99,7 +100,7 @@ def trained(tmp_path_factory) -> Callable[..., Path]:
 
     def train(*algorithms: str) -> Path:
         for algorithm in algorithms:
-            train_population(run_of(algorithm), population(root, algorithm))
+            job_of(algorithm, root).run()
         return root
 
     return train
@@ -112,14 +113,6 @@ def population(root: Path, algorithm: str) -> Path:
 def weights(folder: Path) -> dict[str, str]:
     """Return the hash of every policy of a population."""
     return {str(path.relative_to(folder)): file_hash(path) for path in sorted(folder.rglob(POLICY_WEIGHTS))}
-
-
-def child(script: str, *arguments: str, devices: int = 1) -> subprocess.Popen[str]:
-    settings = {"PYTHONPATH": str(ROOT)}
-    if devices > 1:
-        settings["XLA_FLAGS"] = add_xla_flag(f"--xla_force_host_platform_device_count={devices}")
-    command = [sys.executable, "-c", script, *arguments]
-    return subprocess.Popen(command, env=os.environ | settings, stdout=subprocess.PIPE, text=True)
 
 
 # What a population is on disk.
@@ -135,7 +128,7 @@ def test_a_population_has_five_checkpoints_of_each_member(trained, algorithm):
     responses = ["m0", "m1"] if algorithm in ("brdiv", "lbrdiv") else []
     assert sorted(path.name for path in folder.glob("responses/*")) == responses
     assert len(set(weights(folder).values())) == start + 10 + len(responses), "all differ"
-    assert is_population_finished(folder, run_of(algorithm))
+    assert job_of(algorithm, trained(algorithm)).is_finished()
     assert not list(folder.glob("resume*"))
 
 
@@ -193,15 +186,15 @@ class Stopped(Exception):
 
 @pytest.fixture
 def stopped(tmp_path, monkeypatch) -> Path:
-    """LBRDiv, stopped in the last update: the first episodes are over, and the multipliers have moved."""
+    """A suite with LBRDiv, stopped in the last update: the first episodes are over, and the multipliers have moved."""
 
     def stop(updates: int, speed: float) -> None:
         if updates == run_of("lbrdiv").updates:
             raise Stopped
 
     with pytest.raises(Stopped):
-        train_population(run_of("lbrdiv"), tmp_path / "lbrdiv", stop, save_seconds=0.0)
-    return tmp_path / "lbrdiv"
+        job_of("lbrdiv", tmp_path).run(stop, save_seconds=0.0)
+    return tmp_path
 
 
 @pytest.mark.slow
@@ -211,33 +204,31 @@ def test_a_stopped_run_resumes_with_its_multipliers_and_only_under_its_settings(
         OptionError,
         match=r"lbrdiv.resume\.safetensors: saved by a training of other settings: seed was 0, now it is 1",
     ):
-        train_population(replace(run_of("lbrdiv"), seed=1), stopped)
+        PopulationJob(replace(run_of("lbrdiv"), seed=1), stopped).run()
     assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
 
     done: list[int] = []
-    train_population(run_of("lbrdiv"), stopped, lambda updates, speed: done.append(updates))
+    job_of("lbrdiv", stopped).run(lambda updates, speed: done.append(updates))
     assert done == [6]
-    uninterrupted = population(trained("lbrdiv"), "lbrdiv")
-    assert weights(stopped) == weights(uninterrupted)
-    assert not compare_rebuilds(stopped, uninterrupted).differences
+    folders = [population(suite, "lbrdiv") for suite in (stopped, trained("lbrdiv"))]
+    assert weights(folders[0]) == weights(folders[1])
+    assert not compare_rebuilds(*folders).differences
 
 
 def test_a_folder_takes_one_run_at_a_time(tmp_path):
-    with run_lock(tmp_path / "fcp"), pytest.raises(BusyError, match="another process works in"):
-        train_population(run_of("fcp"), tmp_path / "fcp")
+    with run_lock(population(tmp_path, "fcp")), pytest.raises(BusyError, match="another process works in"):
+        job_of("fcp", tmp_path).run()
 
 
 @pytest.mark.parametrize("name", [f"m0/c0/{POLICY_WEIGHTS}", f"m1/c4/{POLICY_CARD}", f"responses/m1/{POLICY_WEIGHTS}"])
 def test_a_changed_byte_or_a_missing_file_makes_a_population_unfinished(trained, tmp_path, name):
-    folder, run = tmp_path / "lbrdiv", run_of("lbrdiv")
+    folder, job = population(tmp_path, "lbrdiv"), job_of("lbrdiv", tmp_path)
     shutil.copytree(population(trained("lbrdiv"), "lbrdiv"), folder)
-    assert is_population_finished(folder, run)
-    content = bytearray((folder / name).read_bytes())
-    content[len(content) // 2] ^= 1
-    (folder / name).write_bytes(content)
-    assert not is_population_finished(folder, run)
+    assert job.is_finished()
+    flip_bit(folder / name)
+    assert not job.is_finished()
     (folder / name).unlink()
-    assert not is_population_finished(folder, run)
+    assert not job.is_finished()
 
 
 def test_checkpoints_of_an_unfinished_population_are_refused(tmp_path):
@@ -250,9 +241,10 @@ def test_a_population_learns_the_same_on_two_devices(tmp_path):
     """To rounding: half of the policies on each device, one update."""
     (stage,) = run_of("fcp").stages
     state, _ = jax.jit(stage.update)(jax.jit(stage.init)(jax.random.fold_in(jax.random.key(0), 0)))
-    process = child(TWO_DEVICES, str(tmp_path / "weights.npz"), devices=2)
-    process.communicate(timeout=300)
-    assert process.returncode == 0
+    flags = add_xla_flag("--xla_force_host_platform_device_count=2")
+    process = start("-c", TWO_DEVICES, str(tmp_path / "weights.npz"), XLA_FLAGS=flags)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
     found = np.load(tmp_path / "weights.npz")
     for path, leaf in jax.tree.leaves_with_path(state.params):
         name = "/".join(str(part.key) for part in path)

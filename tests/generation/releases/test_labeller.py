@@ -17,21 +17,25 @@ from icrl4aht_generation.collection.curate import relabel
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, is_task_finished
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.learners.checkpoint import POLICY_CARD, POLICY_WEIGHTS, load_policy
-from icrl4aht_generation.profiles import Work, load_profile
+from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.releases import labeller
 from icrl4aht_generation.releases.labeller import CheckpointReturns, choose_checkpoint, choose_labeller
+from icrl4aht_generation.releases.measures import teammate_facts
 from icrl4aht_generation.releases.package import package_release
 from icrl4aht_generation.teammates.registry import build_teammate
 
 from icrl4aht_data import load_icrl4aht, verify_release
 from icrl4aht_data.benchmark.facts import LABEL_EPISODES
+from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.format.manifest import read_manifest, write_manifest
 from icrl4aht_data.format.provenance import read_provenance
+from icrl4aht_data.format.schema import Kind
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.utils.files import file_hash
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
+from tests.helpers.damages import flip_bit
 from tests.helpers.tiny import artefact
 
 # Choice of the checkpoint
@@ -84,6 +88,13 @@ def measured(folder: Path) -> dict:
     return json.loads((folder / LABELLER_RETURNS).read_text())["measured"]
 
 
+def pack(task: tuple[Task, Profile, Path], target: Path, kind: Kind = "lite", **changes: Any) -> Path:
+    """Pack the task under its profile with changes."""
+    chosen, profile, folder = task
+    facts = teammate_facts([chosen], folder.parent, target)
+    return package_release(folder.parent, target, [Work(chosen)], replace(profile, **changes), target, kind, facts)
+
+
 def never(*arguments):
     raise AssertionError("measured again")
 
@@ -96,7 +107,7 @@ def test_packing_measures_every_checkpoint_once(task, tmp_path, monkeypatch):
         assert (np.array(found[way]) % 5 == 0).all()  # rewards are multiples of 5
     assert len(np.unique(found["sampled"])) > 1
     monkeypatch.setattr(labeller, "_measure", never)
-    package_release(folder.parent, tmp_path / "full", [Work(chosen)], profile, tmp_path, "full")
+    pack(task, tmp_path / "full", "full")
     assert is_task_finished(folder, Work(chosen), profile)
 
 
@@ -176,9 +187,9 @@ def test_index_provenance_and_card_state_the_labeller(built):
 
 
 def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
-    chosen, profile, folder = task
+    chosen, _, folder = task
     with_returns(folder, [0, 60, 20, 5, 0])
-    root = package_release(folder.parent, tmp_path / "lite", [Work(chosen)], profile, tmp_path, "lite")
+    root = pack(task, tmp_path / "lite")
     dataset = load_icrl4aht(root)
     network, params, card = load_policy(folder / "checkpoints/c1")
     for history in dataset:
@@ -197,10 +208,7 @@ def test_an_earlier_checkpoint_that_earns_clearly_more_labels(task, tmp_path):
 @pytest.fixture
 def with_policies(task, tmp_path) -> Path:
     """Return a release with the policies of the labellers."""
-    chosen, profile, folder = task
-    return package_release(
-        folder.parent, tmp_path / "with", [Work(chosen)], replace(profile, policies=True), tmp_path, "lite"
-    )
+    return pack(task, tmp_path / "with", policies=True)
 
 
 def policy_files(root: Path) -> dict[str, str]:
@@ -225,9 +233,7 @@ def test_policies_are_in_the_release_if_the_profile_says_so(built, with_policies
 def test_verify_compares_policies_and_index_with_the_provenance(with_policies):
     root = with_policies
     weights = next(root.glob("experts/*/policy.safetensors"))
-    content = bytearray(weights.read_bytes())
-    content[-1] ^= 1
-    weights.write_bytes(content)
+    flip_bit(weights)
     provenance = json.loads((root / "meta/provenance.json").read_text())
     (of_task,) = provenance.values()
     of_task["expert"]["return_greedy"] = 99.0

@@ -81,8 +81,7 @@ def make_tasks(profile: Profile, count: int) -> list[Task]:
 
 
 def pack(tmp_path: Path, profile: Profile, works: Sequence[Work], facts: dict[str, TeammateFacts]) -> Path:
-    target = tmp_path / "release"
-    return package_release(tmp_path / "artefacts", target, works, profile, tmp_path, "lite", facts=facts)
+    return package_release(tmp_path / "artefacts", tmp_path / "release", works, profile, tmp_path, "lite", facts)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from icrl4aht_generation.teammates.distances import (
     nearest_test,
 )
 from icrl4aht_generation.teammates.draws import read_draws
-from icrl4aht_generation.teammates.instances import published_thetas
+from icrl4aht_generation.teammates.instances import published_teammates
 from icrl4aht_generation.teammates.references import reference_returns
 from icrl4aht_generation.teammates.registry import build_teammate
 from msgspec.structs import replace
@@ -85,12 +85,13 @@ def test_returns_belong_to_their_teammates(monkeypatch):
     actions = {0: walks, 2: walks_too, 5: walks}
     mates = [Policy(jnp.int32(action), count, act, "state") for action, act in actions.items()]
     found = reference_returns(LAYOUT, mates, episodes=2)
-    np.testing.assert_array_equal(found["stay"], [12, 312, 12])
-    np.testing.assert_array_equal(found["oracle"], [3, 303, 3])
-    assert found["random"].dtype == np.float64
-    np.testing.assert_array_equal(found["random"] - found["random"][0], [0, 300, 0])  # the same draws with each
-    assert 0 < found["random"][0] < 15
-    np.testing.assert_array_equal(reference_returns(LAYOUT, mates[1:], episodes=2)["random"], found["random"][1:])
+    stay, random, oracle = found.T
+    np.testing.assert_array_equal(stay, [12, 312, 12])
+    np.testing.assert_array_equal(oracle, [3, 303, 3])
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(random - random[0], [0, 300, 0])  # the same draws with each
+    assert 0 < random[0] < 15
+    np.testing.assert_array_equal(reference_returns(LAYOUT, mates[1:], episodes=2), found[1:])
 
 
 # The shipped table, on one layout: slow, since all families and the scripted ego are compiled.
@@ -102,9 +103,9 @@ SHIPPED = get_layout("demo_wide")
 @pytest.mark.parametrize("family", ["assembly_line", "utility_greedy"])
 def test_a_test_instance_acts_like_itself(family):
     """Also where its actions are random: the noise of a state is that of the episode, not of the teammate."""
-    thetas = published_thetas(SHIPPED.name, family)
-    found = nearest_test(SHIPPED, [build_teammate(SHIPPED, {"family": family, "theta": theta}) for theta in thetas])
-    assert [near.distance for near in found] == [0.0] * len(thetas)
+    entries = published_teammates(SHIPPED.name, family)
+    found = nearest_test(SHIPPED, [build_teammate(SHIPPED, entry) for entry in entries])
+    assert [near.distance for near in found] == [0.0] * len(entries)
     assert found[0].teammate == {"assembly_line": "H3/t0", "utility_greedy": "H4/t0"}[family]
 
 

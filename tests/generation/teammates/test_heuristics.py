@@ -16,7 +16,7 @@ from icrl4aht_generation.env import Environment
 from icrl4aht_generation.policy import Noise
 from icrl4aht_generation.teammates.heuristics import territory
 from icrl4aht_generation.teammates.heuristics.heuristic import draw
-from icrl4aht_generation.teammates.instances import published_thetas
+from icrl4aht_generation.teammates.instances import published_teammates
 from icrl4aht_generation.teammates.registry import (
     HEURISTIC_FAMILIES,
     build_teammate,
@@ -94,8 +94,8 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
     The last episode starts from the published scene and its recipe stays.
     """
     layout = LAYOUTS[name]
-    thetas = published_thetas(name, family)
-    policy = build_teammate(layout, {"family": family, "theta": thetas[0]}, noise="fixed")
+    entries = published_teammates(name, family)
+    policy = build_teammate(layout, entries[0], noise="fixed")
     records = jax.jit(Environment(layout).init)(jax.random.split(jax.random.key(7), episodes)).record
     pinned = state_record(layout, (1, 1, "up"), (5, 2, "up"))
     recipes = np.random.default_rng(3).choice(layout.recipe_items, (100, episodes + 1))
@@ -112,7 +112,8 @@ def played(name: str, family: str, episodes: int = 128) -> tuple[np.ndarray, np.
 
     batch = jax.vmap(jax.vmap(one, (None, 0, 1), 1), (0, None, None), 1)
     run = jax.jit(batch)
-    actions, rewards = run(stacked(family, thetas), np.concatenate([records, pinned]), recipes)
+    params = stacked(family, [entry["theta"] for entry in entries])
+    actions, rewards = run(params, np.concatenate([records, pinned]), recipes)
     return np.asarray(actions), np.asarray(rewards.sum(axis=0))
 
 
@@ -147,7 +148,7 @@ def key_of(memory: Any) -> jax.Array:
     return getattr(memory, "key", memory)
 
 
-@pytest.mark.parametrize("family", [H1, H2, H3])
+@pytest.mark.parametrize("family", HEURISTIC_FAMILIES)
 def test_fixed_noise_ignores_the_episode_and_seeded_does_not(family):
     for slot in (0, 1):
         teammate = heuristic_teammate(family, "default", 0)
@@ -199,7 +200,8 @@ def many_params(name: str) -> dict:
         sampled = [
             sample_teammate(family, number, split)["theta"] for number in range(3) for split in ("train", "test")
         ]
-        thetas = [*published_thetas(name, family), *presets, *sampled]
+        published = [entry["theta"] for entry in published_teammates(name, family)]
+        thetas = [*published, *presets, *sampled]
         params[family, 0] = params[family, 1] = stacked(family, [thetas[i % len(thetas)] for i in range(ROWS)])
     return params
 

@@ -30,13 +30,9 @@ STEPS, ENVS = 5, 3
 
 def save(folder: Path, layout: Layout = LAYOUT, widths: Widths = WIDTHS, partners: int = 0, seed: int = 0) -> Any:
     """Return a checkpoint of random weights, far from uniform; its parameters."""
-    network = ActorCritic(widths, partners)
-    obs = jnp.zeros((1, 1, 5, 5, layout.channels), jnp.uint8)
-    args = jax.random.key(0), network.initial_hidden(1), obs, jnp.ones((1, 1), bool), jnp.zeros(1, jnp.int32)
-    rng = np.random.default_rng(seed)
-    params = jax.tree.map(
-        lambda leaf: rng.normal(size=leaf.shape).astype(np.float32) * 0.5, jax.eval_shape(network.init, *args)
-    )
+    network, rng = ActorCritic(widths, partners), np.random.default_rng(seed)
+    shapes = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
+    params = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32) * 0.5, shapes)
     save_policy(folder, network, params, {"layout": layout.name})
     return params
 

@@ -9,13 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from icrl4aht_generation.policy import Noise
 from icrl4aht_generation.teammates.heuristics import utility_greedy
-from icrl4aht_generation.teammates.heuristics.heuristic import next_key
 from icrl4aht_generation.teammates.heuristics.utility_greedy import GreedyMemory
 from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
 
-from icrl4aht_data.overcooked.actions import STAY, TEAMMATE, UP
+from icrl4aht_data.overcooked.actions import STAY, UP
 from icrl4aht_data.overcooked.layouts import LAYOUTS
 from tests.helpers.states import state_record
 
@@ -34,11 +32,6 @@ def _act(slot: int):
 def _memory(rolls: list[int], intent: int = -1, wait: int = 0) -> GreedyMemory:
     key = jax.random.wrap_key_data(jnp.array([[300 + roll, 7] for roll in rolls], jnp.uint32))
     return GreedyMemory(key, jnp.full(8, intent), jnp.full(8, wait))
-
-
-def _first_memory(noise: Noise, keys: jax.Array, slot: int = TEAMMATE) -> GreedyMemory:
-    policy = build_teammate(LAYOUTS["cramped_up"], heuristic_teammate("utility_greedy", "default", 0), slot, noise)
-    return jax.vmap(policy.init, in_axes=(None, 0))(policy.params, keys)
 
 
 def _heading_up(slot: int, partner: tuple[int, int, str]) -> np.ndarray:
@@ -71,16 +64,3 @@ def test_waiting_keeps_the_intent_and_advances_the_key():
     for before, after in pairwise(keys):
         links = jax.vmap(lambda key: jax.random.split(key, 3)[0])(before)
         np.testing.assert_array_equal(jax.random.key_data(after), jax.random.key_data(links))
-
-
-def test_fixed_key_chain_is_the_published_one():
-    chain = [(0, 1), (507451445, 1853169794), (3704974950, 1863054868)]
-    keys = jax.random.split(jax.random.key(123), 8)
-    assert jax.random.key_data(_first_memory("fixed", keys, slot=0).key).tolist() == [[0, 0]] * 8
-    memory = _first_memory("fixed", keys)
-    assert memory.intent.tolist() == [-1] * 8
-    assert memory.wait.tolist() == [0] * 8
-    assert tuple(jax.random.key_data(next_key(next_key(memory.key[0]))).tolist()) == chain[2]
-    for expected in chain:
-        assert {tuple(key) for key in jax.random.key_data(memory.key).tolist()} == {expected}
-        _, memory = _act(1)(memory, _heading_up(1, (2, 1, "down")))
