@@ -1,1 +1,1 @@
-"""Benchmarks as commands: JSON lines, with the peer measured in the same run."""
+"""Benchmark commands that print JSON lines; a comparison measures both programs in the same run."""

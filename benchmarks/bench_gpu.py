@@ -440,7 +440,7 @@ def child_environment() -> dict[str, str]:
 
 
 def chosen_sizes(small: bool, seconds: float | None) -> Sizes:
-    """Return the sizes of this process; initialises JAX."""
+    """Return the benchmark's sizes: small on request or on a CPU. Initialises JAX."""
     sizes = FULL_SIZES
     if small or jax.default_backend() == "cpu":
         sizes = SMALL_SIZES

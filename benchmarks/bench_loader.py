@@ -171,7 +171,7 @@ def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads:
 @click.option("--threads", type=COUNT, default=2, show_default=True)
 @click.option("--peer-windows", type=COUNT, help="Windows that the peers read in a round.", show_default="a batch")
 def main(folder: Path, layout: str, histories: int, peer_windows: int | None, **read: int) -> None:
-    """Compare our loader with two readers of the published format; one JSON line each."""
+    """Compare our loader with two readers of the published format; print one JSON line per comparison."""
     os.environ.setdefault("ICRL4AHT_CACHE_DIR", str(folder.resolve() / "cache"))
     make_data(folder, layout, histories)
     compare_readers(folder, **read, peer_windows=peer_windows or read["batch"])

@@ -50,7 +50,7 @@ def check_credentials(address: str) -> None:
     """
     try:
         parts = urlsplit(address)
-        # With a port and a later "@", the part before may be USER:PASSWORD, unless it looks like a host with a dot.
+        # "s3://user:12/3@host" parses as host "user" with port 12: refused, unless the host has a dot.
         is_clear = parts.port is None or "@" in parts.netloc or "@" not in parts.path or "." in parts.netloc
     except ValueError:  # the port is not a number
         is_clear = False

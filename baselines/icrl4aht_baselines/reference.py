@@ -238,7 +238,7 @@ class _Steps:
         return folder
 
     def teacher_histories(self, kind: str) -> Path:
-        """Record histories of the teacher with falling noise, of a kind in `RL2_HISTORIES`. Return the release."""
+        """Record histories of the teacher with noise as in `RL2_HISTORIES[kind]`. Return the path of the release."""
         folder = self.out / f"{kind}-{self.track}"
         if not folder.is_dir():
             agent = find_agent(self.teacher or self.play(), greedy=False)

@@ -339,7 +339,7 @@ class Scene:
 
     @cached_property
     def ways(self) -> Int[Array, " 4"]:
-        """The cells to the right, below, left and above; the own cell where the way is blocked."""
+        """Cells to which a move right, down, left or up leads; the agent's own cell if the move is blocked."""
         return jnp.asarray(self.tables.moves)[self.me, jnp.array(SEARCH_ORDER)].astype(jnp.int32)
 
     @cached_property

@@ -85,7 +85,7 @@ def _read_layouts_file(path: Path) -> ReleaseLayouts:
     return ReleaseLayouts(families, tuple(layouts))
 
 
-@lru_cache(maxsize=1024)  # the search for a way takes half a millisecond, and opening a release reads the file twice
+@lru_cache(maxsize=1024)  # a check of solvability takes 0.5 ms, and opening a release reads the file twice
 def _parse(line: str) -> tuple[Layout, str]:
     """Return the layout of a line, and its family; see `read_layouts` for the errors."""
     fields = msgspec.json.decode(line, type=LayoutLine)

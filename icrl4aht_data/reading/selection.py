@@ -228,7 +228,7 @@ class Selection:
         For noise histories the oracle labels are the expert actions, even if `has_oracle_actions` is False because they
         are not stored twice; see `Entry.stored_field`.
         """
-        # The index says what is stored, and noise histories store their two equal columns of labels once.
+        # In noise histories oracle and expert labels are equal, and stored once, as expert labels.
         has = self.column(f"has_{labels}_actions")
         return has if labels == "expert" else has | ((self.column("source") == "noise") & self.has_labels("expert"))
 

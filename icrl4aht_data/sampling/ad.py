@@ -197,7 +197,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         # -1 comes first, for `prev_*`. Padding repeats the last step, since all rows must exist.
         t = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
         rows = low[:, None] + (first[:, None] + self.every * (t // steps)) * steps + t % steps
-        # Before the first of these episodes, `prev_*` come from the step that precedes it in the history.
+        # At a window's first step, `prev_*` come from the preceding step of the history, of any episode.
         rows[start == 0, 0] = (low + first * steps - 1)[start == 0]
         return _Windows(position, rows[:, 1], rows[:, 1:], rows[:, :-1], valid)
 

@@ -73,7 +73,7 @@ class Batches(Iterator[B], Generic[B]):
         self._lent: B | None = None  # buffer of the batch in use by the consumer
 
     def __iter__(self) -> Batches[B]:
-        # Only after the end of a pass: a position that was loaded there is the end of a finished training.
+        # Another pass starts only if iteration reached the end: a position loaded at the end means a finished training.
         if self._ended and self._stop is not None and self._per_pass:
             self._stop += (self.next - self._stop) // self._per_pass * self._per_pass + self._per_pass
             self._closed = self._ended = False

@@ -326,7 +326,7 @@ class _PublishedHistory:
         """Return one array in the field's compact dtype: (T, ...), or (E, S) for `episode_end_state`.
 
         Raises:
-            PublishedFormatError: if the array is invalid; with its name, the expected and the found values.
+            PublishedFormatError: if the array is invalid; the message has its name, and what was expected and found.
         """
         layout, steps = get_layout(self.line["layout"]), self.line["T"]
         if name == "obs" and self.short and self.kind != OBSERVATIONS:  # rendered, since states show the missing rows

@@ -1,4 +1,4 @@
-"""Runs of the program, in this process and in others."""
+"""Helpers that run the command-line program, in this process or in another."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def test_the_depth_of_json_is_limited():
         parse_json("[" * 65 + "]" * 65)
 
 
-def test_reserved_names_of_windows(tmp_path):
+def test_file_names_reserved_by_microsoft_windows(tmp_path):
     for name in ("con", "meta/NUL.json", "com1.h5/x", "a./b", "a /b", "data/teammate/aux/train.h5"):
         with pytest.raises(Icrl4ahtError, match="leads out"):
             parse_manifest(f"{'0' * 64}  {name}\n", "MANIFEST")

@@ -34,10 +34,10 @@ PACE = 0.02  # seconds between the blocks of a slow body
 
 @dataclass(frozen=True)
 class Answer:
-    """A route's answer.
+    """HTTP response of a route.
 
     Args:
-        body: content, or the file that has it.
+        body: content, or the path of a file with it.
         status: HTTP status.
         headers: besides Content-Length.
     """

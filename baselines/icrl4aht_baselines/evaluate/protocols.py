@@ -113,7 +113,7 @@ same with another teammate every 25 episodes, without a sign."""
 
 
 def get_protocol(name: str, episodes: int | None = None) -> Protocol:
-    """Return the protocol with a name, with another number of episodes per task if one is given.
+    """Return the protocol called `name`; `episodes`, if given, replaces its number of episodes per task.
 
     Raises:
         UnknownNameError: if there is no such protocol; lists the valid names and the nearest.

@@ -52,7 +52,7 @@ class World(NamedTuple):
 
 @dataclass(frozen=True)
 class Method:
-    """One way to learn from histories, made by a function of (ModelOptions, World).
+    """A method of training: its model, data and loss; a function of (ModelOptions, World) makes it.
 
     Attributes:
         name: as in `registry.METHODS`.

@@ -177,8 +177,8 @@ def read_adaptation(folder: Path) -> list[dict[str, Any]]:
 def adaptation_table(folder: Path, layouts: bool = True) -> str:
     """Return a Markdown table of the measured sets: returns of both egos, and their difference with its 95 % interval.
 
-    The interval is Student's over the seeds, which trained both egos; without a second seed there is none. Sets of
-    several layouts are followed by a row for each layout, unless `layouts` is False.
+    The interval is a Student's t interval over the training seeds; with one seed there is none. A set of several
+    layouts also gets a row for each layout, unless `layouts` is False.
     """
     rows = []
     for entry in read_adaptation(folder):

@@ -168,7 +168,7 @@ class TrainingJob:
 
     @property
     def updates(self) -> int:
-        """Updates of the training."""
+        """Number of training updates."""
         return self.options.updates
 
     def is_finished(self) -> bool:

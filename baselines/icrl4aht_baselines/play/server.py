@@ -85,7 +85,7 @@ class PlaySession:
         start = [game.record, swapped(game.record)]
         self._layout = [layout_drawings(game.layout, record[None]) for record in start]
 
-    # ---- what a browser is sent
+    # ---- messages to the browser
 
     def _setup(self, slot: int) -> dict[str, Any]:
         game, recorder = self.game, self.recorder

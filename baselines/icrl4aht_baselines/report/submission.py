@@ -35,7 +35,7 @@ SUBMITTED_SEEDS = (0, 1, 2)
 """Seeds with which every task has to be played."""
 
 _Text = Annotated[str, Meta(min_length=1)]
-_Name = Annotated[str, Meta(pattern=r"^[^\s`|]([^\n`|]*[^\s`|])?$")]  # does not end a cell of a Markdown table
+_Name = Annotated[str, Meta(pattern=r"^[^\s`|]([^\n`|]*[^\s`|])?$")]  # nothing that would end a cell of a table
 
 
 class AgentFacts(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):

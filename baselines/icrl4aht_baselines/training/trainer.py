@@ -256,7 +256,7 @@ class TrainingTask(NamedTuple):
             if writes:
                 stack.enter_context(run_lock(folder))
             config = open_run(folder, config)
-            # The number of threads decides the order of sums, and so the bits that a resumed run must reach.
+            # The number of threads decides the order of sums: a resumed run needs the same number for equal bits.
             checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
             if checkpoints.latest is None:
                 state = trainer.init()

@@ -124,7 +124,7 @@ def _far(steps: np.ndarray, far: int) -> np.ndarray:
 def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
     """Return `LayoutFacts.ways`: walk as near as possible, then make the move that ends facing the cell."""
     room = layout.rooms[EGO].astype(int)
-    position = np.zeros(layout.cells, int)  # of a cell in the room
+    position = np.zeros(layout.cells, int)  # index of each cell within the ego's room
     position[room] = range(len(room))
     moves = layout.moves[room, :4].astype(int)
     ends = np.where(moves == obstacles[:, None, None], room[:, None], moves)  # (O, room, actions)
@@ -165,7 +165,7 @@ def _hindrance(layout: Layout, tables: Tables) -> np.ndarray:
     that the teammate may be taking counts 16, cells next to that one 8, and cells from which something other than a
     counter is used 4.
     """
-    # The ego cannot know where the teammate goes: all cells where it can use what it carries count.
+    # The ego does not know the teammate's target: every cell where the teammate could use what it carries is one.
     used = np.isin(layout.kinds, [GOAL, POT, PILE, PLATES])[layout.ahead].any(axis=1) & layout.walkable
     hindrance = np.tile(4 * used, (3, layout.cells, 1)).astype(np.int16)
     near = (8 * np.maximum(2 - tables.distance.astype(int), 0)).astype(np.int16)

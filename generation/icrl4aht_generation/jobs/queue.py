@@ -159,7 +159,7 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                     pool[1].shutdown(wait=False)
                 if error is None:
                     yield JobOutcome(job, future.result(), attempts[job.name])
-                elif not isinstance(error, Exception):  # the worker was told to stop
+                elif not isinstance(error, Exception):  # an interrupt or exit of the worker: no retry
                     raise error
                 elif attempts[job.name] <= options.retries:
                     waiting.append(job)

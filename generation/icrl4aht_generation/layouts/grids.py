@@ -23,7 +23,7 @@ def rows_of(grid: np.ndarray) -> tuple[str, ...]:
 
 
 def neighbours(mask: np.ndarray) -> np.ndarray:
-    """Return bool (H, W), the cells above, below, right or left of a cell of a mask, bool (H, W)."""
+    """Return a mask of the cells next to the cells in `mask`, in four directions; both are bool (H, W)."""
     found = np.zeros_like(mask)
     found[1:] |= mask[:-1]
     found[:-1] |= mask[1:]

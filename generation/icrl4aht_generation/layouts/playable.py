@@ -61,7 +61,7 @@ def _delivered(
     # The largest layouts give all batches equal shapes, and short batches repeat layouts, so that all share a program.
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
-    # The oracles' facts take longer than an episode, so that all tries of a batch share them.
+    # Computing the oracles' facts takes longer than an episode, so all tries of a batch share them.
     egos = oracle_params(own), oracle_params([_exchanged(layout) for layout in own])
     starts = np.array([layout.agent_cells for layout in own], np.uint8)
     earned = np.zeros(len(own), bool)

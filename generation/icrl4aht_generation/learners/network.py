@@ -48,10 +48,10 @@ def recurrent_states(
 
     Args:
         hidden: state before the first step.
-        gates: the input's part of reset gate, update gate and candidate.
+        gates: contribution of the input to the reset gate, update gate and candidate.
         reset: whether the state is zero before a step.
-        recurrent: weights of the state for the same three.
-        bias: of the state's part of the candidate.
+        recurrent: weights from the state to the reset gate, update gate and candidate.
+        bias: bias of the state's contribution to the candidate.
     """
     return _scan_states(hidden, gates, reset, recurrent, bias)[0]
 

@@ -119,13 +119,13 @@ def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 class SaveInterval:
-    """Decides after which updates a training is saved: after the last one, and at least as often as stated.
+    """Schedule for saving a training: after its last update, and whenever an interval has passed.
 
     Args:
         last: number of the last update.
         updates: save when the number of updates is a multiple of this.
-        seconds: save when this much time has passed since the last save. Clocks of several processes disagree, and all
-            must call `save` together, so that one has to decide for all.
+        seconds: save when this much time has passed since the last save. Processes must
+            call `save` together but their clocks differ, so one process decides for all.
     """
 
     def __init__(self, last: int, *, updates: int | None = None, seconds: float | None = None) -> None:

@@ -1,4 +1,4 @@
-"""A complete rebuild: the teammates trained, every task of a profile collected, then packed."""
+"""Rebuild a release: train the teammates of a profile, collect its tasks, and pack them."""
 
 from __future__ import annotations
 

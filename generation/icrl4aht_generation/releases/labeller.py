@@ -73,9 +73,9 @@ def choose_labeller(folders: Sequence[Path], task: Task, suite: Path) -> tuple[P
 
 
 def learner_labeller(folder: Path, task: Task, suite: Path) -> tuple[Path, ExpertLabels]:
-    """Measure the checkpoints of a finished artefact, and choose the one that would label its histories.
+    """Measure the checkpoints of a finished artefact, and choose the one to label its histories.
 
-    The measurements are kept in the artefact, in `LABELLER_RETURNS`, and are not repeated there.
+    The measurements are stored in the artefact, in `LABELLER_RETURNS`, and reused.
 
     Args:
         folder: the artefact.

@@ -100,7 +100,7 @@ class Draw(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def nearest_counted(self) -> tuple[float, str]:
-        """Distance to the test instance that decides whether it is admissible, and that instance."""
+        """The test instance by which the draw is admissible or not: distance to it, and its name."""
         own, other = (self.distance, self.nearest), (self.other_distance, self.other)
         diverse = self.base_seed in _DIVERSE_SEEDS.values()
         return other if diverse and other[0] < own[0] else own
@@ -209,7 +209,7 @@ def diverse_tasks(track: str, split: str) -> list[Task]:
 
 
 def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
-    """Return the draw of the table that a teammate entry is, or None."""
+    """Return the draw that a teammate entry describes, or None."""
     family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
     if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
         return None

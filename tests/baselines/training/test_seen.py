@@ -58,7 +58,7 @@ def test_releases_without_tasks_do_not_know_their_teammates(dataset, monkeypatch
     assert teammate_ids(dataset, dataset.ids.tolist()) is None
 
 
-def test_records_join_the_entries_of_a_kind():
+def test_teammates_of_the_same_kind_are_merged():
     greedy = {"layout": "demo_wide", "family": "H4", "algorithm": "utility_greedy", "teammates": ["b"]}
     learned = {"layout": "demo_wide", "split": "train", "family": "rl", "algorithm": "fcp", "teammates": ["a", "c"]}
     found = read_trained_on([greedy, greedy | {"layout": "demo_simple", "teammates": ["a"]}, learned], "run.json")

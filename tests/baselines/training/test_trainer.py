@@ -358,7 +358,7 @@ class TestHeldOut:
             ("ad", 7, {"queries": 3}, "queries = 3: ad learns from windows without queries"),
         ],
     )
-    def test_impossible_trainings(self, long_ppo, method, context, choice, message):
+    def test_invalid_training_options(self, long_ppo, method, context, choice, message):
         with pytest.raises(OptionError, match=message):
             job(long_ppo, method, context=context, **choice)
 

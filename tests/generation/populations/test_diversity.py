@@ -32,7 +32,7 @@ def turning(params, steps, view, key):
 
 
 def by_state(params, steps, view, key):
-    """Acts by the position of agent 1."""
+    """Chooses an action by its parameter and the position of agent 1."""
     return (view[1].astype(jnp.int32) + params["turn"]) % 6, steps
 
 

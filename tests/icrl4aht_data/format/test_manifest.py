@@ -73,7 +73,7 @@ def test_files_that_change_after_opening_are_checked_when_they_are_read(damaged)
         dataset[0].read("actions")
 
 
-def test_checkpoints_are_checked_before_they_are_copied_or_play(tmp_path):
+def test_checkpoints_are_checked_before_they_are_copied_or_loaded(tmp_path):
     shutil.copytree(MINI, tmp_path / "release")
     dataset = load_icrl4aht(tmp_path / "release", teammate_family="rl")[:1]
     digest = dataset.recover_teammate(int(dataset.ids[0]))["theta"]["sha256"]

@@ -167,7 +167,7 @@ def test_false_arrays_are_found(tmp_path, change, message):
     assert message in "\n".join(problems(root))
 
 
-def test_a_learner_that_provenance_does_not_have_is_not_written(tmp_path):
+def test_a_learner_number_out_of_range_is_rejected(tmp_path):
     with pytest.raises(OptionError, match="learner: expected 0 to 1, since provenance has 2 learners, found 2"):
         one_history_release(tmp_path / "r", provenance=Provenance(learners=2), learner=2)
     assert not (tmp_path / "r").exists()

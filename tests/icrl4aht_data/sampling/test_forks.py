@@ -1,4 +1,4 @@
-"""Forks while a thread of the parent prepares a batch."""
+"""Forking a process while a thread of the parent prepares a batch."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def test_a_random_context_may_be_longer_than_a_history(lite):
     assert dataset.dpt(batch_size=2, context=121, order="random")[0].context_actions.shape == (2, 121)
 
 
-def test_a_one_step_episode_release_samples(tmp_path):
+def test_sampling_from_episodes_of_one_step(tmp_path):
     random_release(tmp_path / "r", layouts=("cramped_up",), episodes=9, length=1)
     batch = load_icrl4aht(tmp_path / "r").dpt(batch_size=4, context=9)[0]
     assert batch.context_next_obs.shape == (4, 9, 5, 5, 35)

@@ -225,7 +225,7 @@ def add(kind: str, message: str, spoils: Mapping[str, Spoil]) -> None:
 
 
 def add_hashed(message: str, spoils: Mapping[str, Spoil]) -> None:
-    """Add releases whose manifest has the right hashes, which an attacker can write, too."""
+    """Add releases with matching manifests, since an attacker can write the manifest, too."""
 
     def hashed(spoil: Spoil) -> Spoil:
         return lambda root: (spoil(root), write_manifest(root))

@@ -186,7 +186,7 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int
     """The step towards a target. In a cramped layout, agents prefer opposite corners and walk around each other."""
     x, y = jnp.asarray(scene.tables.column), jnp.asarray(scene.tables.row)
     width, height = jnp.asarray(scene.tables.size)
-    # A tenth of a step for each cell: it decides between access cells at equal distance, and nothing else.
+    # A tenth of a step for each cell breaks ties between access cells at equal distance.
     corner = y + x if scene.slot == 0 else (height - y) + (width - x)
     step, _ = scene.approach(target, jnp.where(cramped, np.float32(0.1) * corner, np.float32(0)))
     if scene.slot == 1:
