@@ -97,7 +97,7 @@ class History(FieldArrays):
             OptionError: if `start` or `stop` is not an integer.
             LabelsMissingError: for expert, oracle or teammate actions of a history without them.
             NotStoredError: for states of a release without state records.
-            ShardCorruptError: names the chunk whose checksum is wrong.
+            ShardCorruptError: if the checksum of a chunk is wrong; the message names the chunk.
         """
         field = self._field(name)
         try:

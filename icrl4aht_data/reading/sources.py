@@ -248,7 +248,7 @@ class StreamedSource:
         """Carry out requests in parallel, after downloading the shards they need from a remote release.
 
         Raises:
-            ShardCorruptError: names the chunk whose checksum is wrong.
+            ShardCorruptError: if the checksum of a chunk is wrong; the message names the chunk.
             RemoteError: if a shard cannot be downloaded.
         """
         positions = {position for request in requests for position in request.histories.tolist()}

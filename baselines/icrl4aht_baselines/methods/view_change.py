@@ -127,7 +127,7 @@ def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> Bat
 
 
 class NumberedBatches:
-    """A sampler's batches of state records, with other numbers of the layouts, perhaps mirrored at random.
+    """Batches of state records from a sampler, with renumbered layouts, optionally mirrored at random.
 
     Args:
         sampler: of histories on some of the layouts.

@@ -91,7 +91,7 @@ class TaskGroup:
         hidden: whether the model does not see recipe indicators.
         label: the layouts' name in the log.
         partners: number of each task's teammate, for a model that is told; None for others.
-        ids: ids of the tasks of a release or a manifest whose teammates play, where that is recorded.
+        ids: ids of the tasks that the teammates come from; empty if they are not recorded.
     """
 
     layouts: Sequence[Layout]
