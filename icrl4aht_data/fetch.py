@@ -34,7 +34,7 @@ from icrl4aht_data.errors import OfflineError, OptionError, RemoteError, RootNot
 from icrl4aht_data.format.chunks import chunk_table_name
 from icrl4aht_data.format.index import read_index
 from icrl4aht_data.format.info import read_info
-from icrl4aht_data.format.manifest import check_against_manifest, check_folder, parse_manifest, read_manifest
+from icrl4aht_data.format.manifest import check_against_manifest, parse_manifest, read_manifest
 from icrl4aht_data.format.schema import HISTORIES, INFO, LAYOUTS_FILE, MANIFEST, PARQUET_EPISODES, PROVENANCE, TASKS
 from icrl4aht_data.utils import files as disk
 from icrl4aht_data.utils.progress import counted, progress_bars
@@ -94,8 +94,9 @@ class ReleaseLocation:
             IndexFormatError: if a file is not the one that the manifest lists.
         """
         path = self.path(name)
-        self.fetch(known for known in read_manifest(self.folder) if known.startswith(f"{name}/"))
-        check_folder(self.folder, name)
+        listed = [known for known in read_manifest(self.folder) if known.startswith(f"{name}/")]
+        self.fetch(listed)
+        check_against_manifest(self.folder, [known for known in listed if (self.folder / known).exists()])
         return path
 
 

@@ -153,11 +153,6 @@ def check_meta(root: Path) -> None:
     check_against_manifest(root, sorted(names))
 
 
-def check_folder(root: Path, folder: str) -> None:
-    """Check the existing files of a subfolder of a release; see `check_against_manifest`."""
-    check_against_manifest(root, [n for n in read_manifest(root) if n.startswith(f"{folder}/") and (root / n).exists()])
-
-
 def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
     """Write MANIFEST.sha256 with all other files of a folder.
 
