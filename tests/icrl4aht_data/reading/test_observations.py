@@ -299,7 +299,7 @@ class TestCombine:
         assert verify_release(tmp_path / "out", level="deep").ok
         combined = load_icrl4aht(tmp_path / "out", obs="uint8")
         assert len(combined) == 8
-        assert not combined.knows_tasks
+        assert not combined.has_tasks
         before = {
             (h.entry.task_id, h.entry.env_idx): h
             for r in (converted_release, tmp_path / "more")
