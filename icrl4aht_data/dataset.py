@@ -124,7 +124,7 @@ def load_icrl4aht(
 
 def open_dataset(location: ReleaseLocation, options: ReadOptions) -> Dataset:
     """Return a dataset of all histories of a release; see `load_icrl4aht` for the errors."""
-    if os.path.isfile(location.folder / INFO):  # noqa: PTH113 - isfile never raises; `read_index` reports a missing file
+    if os.path.isfile(location.folder / INFO):  # noqa: PTH113 - never raises; `read_index` reports a missing file
         check_meta(location.folder)
     index = read_index(location.folder)
     return Dataset(location, index, Shards(location, index), options)

@@ -10,7 +10,7 @@ import hashlib
 from typing import Any
 
 from icrl4aht_data.errors import check_choice, unknown
-from icrl4aht_data.overcooked.layouts import further_layout_names
+from icrl4aht_data.overcooked.layouts import added_layout_names
 from icrl4aht_data.utils.plugins import Plugins
 
 _TEAMMATE_LAYOUTS = ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide")
@@ -169,7 +169,7 @@ def track_layouts(track: str, split: str) -> tuple[str, ...]:
     """Return short names of a track's layouts in a split; registered and generated layouts belong to track `layout`."""
     if track == PREFERENCE:
         return PREFERENCE_LAYOUTS["train"] + (PREFERENCE_LAYOUTS["test"] if split == "test" else ())
-    return (*TRACKS[track][split], *(further_layout_names() if track == "layout" else ()))
+    return (*TRACKS[track][split], *(added_layout_names() if track == "layout" else ()))
 
 
 def track_of(layout: str) -> str:
@@ -185,9 +185,9 @@ def track_of(layout: str) -> str:
     for track, splits in TRACKS.items():
         if any(name in layouts for layouts in splits.values()):
             return track
-    if layout in (*further_layout_names(), *PREFERENCE_LAYOUTS["train"], *PREFERENCE_LAYOUTS["test"]):
+    if layout in (*added_layout_names(), *PREFERENCE_LAYOUTS["train"], *PREFERENCE_LAYOUTS["test"]):
         return "layout"
-    raise unknown("layout", layout, (*LAYOUT_NAMES, *further_layout_names()))
+    raise unknown("layout", layout, (*LAYOUT_NAMES, *added_layout_names()))
 
 
 def layout_order(layout: str) -> tuple[int, str]:

@@ -31,7 +31,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.rules import step
-from icrl4aht_data.overcooked.state import columns, faults, start
+from icrl4aht_data.overcooked.state import columns, faults, start_record
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.system import free_memory
@@ -159,7 +159,7 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
         yield "a recipe is not one of the layout's"
     starts = states[np.concatenate([[0], np.flatnonzero(dones)[:-1] + 1])]
     positions = starts[:, columns(layout).positions]
-    fresh = start(layout, positions, starts[:, columns(layout).facings], starts[:, recipe])
+    fresh = start_record(layout, positions, starts[:, columns(layout).facings], starts[:, recipe])
     differs = (fresh != starts).any(axis=-1)
     for agent in (0, 1):
         differs |= ~np.isin(positions[:, agent], layout.rooms[agent])

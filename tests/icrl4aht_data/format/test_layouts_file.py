@@ -131,10 +131,10 @@ class TestRelease:
             (lambda lines: lines * 2, "line 2: layout 'mine-3-5' is listed twice"),
             (
                 lambda lines: [lines[0] | {"name": "coord_simple"} | OTHER],
-                "layout 'coord_simple': differs from the layout",
+                "layout 'coord_simple': differs from the known layout",
             ),
             (lambda lines: [lines[0] | {"map": ["WPWWW", *ROWS[1:3], "WBWWW"]}], "no agent can face a goal"),
-            (lambda lines: [lines[0] | {"map": ["WP2W3", *ROWS[1:]]}], "20 cells and 4 piled ingredient types"),
+            (lambda lines: [lines[0] | {"map": ["WP2W3", *ROWS[1:]]}], "20 cells and piles of 4 ingredient types"),
             (lambda lines: [lines[0] | {"recipes": [[0, 0, 2]]}], r"recipes use ingredients \[2\]"),
             (lambda lines: [lines[0] | {"name": "mine\x1b[31m"}], "name"),
             (
@@ -182,8 +182,8 @@ class TestRecipesOfATask:
     @pytest.mark.parametrize(
         ("recipes", "message"),
         [
-            ([], "expected different recipes, at least one"),
-            ([[0, 0, 1], [0, 1, 0]], "expected different recipes"),
+            ([], "expected at least one recipe"),
+            ([[0, 0, 1], [0, 1, 0]], "expected at least one recipe, and no recipe twice"),
             ([[0, 0, 9]], r"recipes use ingredients \[9\] that have no pile"),
             ("000", "recipes"),
         ],
@@ -218,5 +218,5 @@ class TestRecipesOfATask:
 def test_a_release_cannot_change_a_layout_of_the_packages_own_tasks():
     known = get_layout("rooms-0-46")
     assert add_layouts([known]) == [known]
-    with pytest.raises(OptionError, match="layout 'rooms-0-46': differs from the layout that this name stands for"):
+    with pytest.raises(OptionError, match="layout 'rooms-0-46': differs from the known layout of this name"):
         add_layouts([dataclasses.replace(known, rows=tuple(row.replace("P", "W", 1) for row in known.rows))])
