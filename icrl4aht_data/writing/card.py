@@ -288,7 +288,7 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
                 "seed": task and task.teammate.get("base_seed"),
                 "sources": sorted({one.first.source for one in own}),
                 "references": references and references.returns,
-                "matters": references and references.matters,
+                "matters": references and references.has_headroom,
                 "nearest_test": nearest and msgspec.structs.asdict(nearest),
             }
         )

@@ -89,7 +89,7 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
             partial = is_part and len(histories) < len(dataset.index.query(task_id=task.task_id))
             if partial and made.streams_kept is not None:
                 made = _of_part(made, histories)
-            weak = not made.wants_oracle(float(histories.column("return_end").mean()))
+            weak = not made.is_oracle_useful(float(histories.column("return_end").mean()))
             without = ("oracle_actions",) if weak else ()
             tasks.append(stored_task(histories, task, made, dataset.info.kind, without=without))
     return tasks

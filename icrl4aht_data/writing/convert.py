@@ -48,7 +48,7 @@ def stored_task(
             done()
 
     files: dict[str, Path] = {}
-    for one in provenance.played(task):
+    for one in provenance.played_tasks(task):
         if one.teammate.get("kind") == "rl":
             dataset.origin.below(f"{TEAMMATES}/{one.teammate['theta']['sha256']}")  # fetches and checks the checkpoint
         files |= checkpoint_files(dataset.root / TEAMMATES, one, dataset.root)

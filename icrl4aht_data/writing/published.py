@@ -28,14 +28,14 @@ from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks, write_ta
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError
 from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask, read_provenance
-from icrl4aht_data.format.safe_hdf5 import find, read_dataset
+from icrl4aht_data.format.safe_hdf5 import find_node, read_dataset
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
     FIELDS,
     OBSERVATIONS,
     Kind,
     episode_ends,
-    held_fields,
+    memory_fields,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.fast_observe import fast_observe
@@ -245,8 +245,8 @@ def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenanc
 def _stored_names(file: h5py.File, group: str) -> set[str] | None:
     """Return the names of the known arrays in a group; None if the group is missing."""
     with _wrap_errors(f"{file.filename}, group {group}: cannot be read"):
-        found = find(file, group)
-        return {name for name in FIELDS if find(found, name)} if isinstance(found, h5py.Group) else None
+        found = find_node(file, group)
+        return {name for name in FIELDS if find_node(found, name)} if isinstance(found, h5py.Group) else None
 
 
 def _tasks(histories: list[_PublishedHistory], source: Path, kind: Kind) -> list[tuple[Task, list[_PublishedHistory]]]:
@@ -301,7 +301,7 @@ class _PublishedHistory:
 
     def field_names(self) -> list[str]:
         """Return the names of the arrays to convert."""
-        fields = held_fields(self.kind)
+        fields = memory_fields(self.kind)
         return [f.name for f in fields if self.kind not in f.optional or self.line.get(f"has_{f.name}")]
 
     def check_arrays(self, present: set[str] | None) -> None:
@@ -354,9 +354,9 @@ class _PublishedHistory:
         """Return one array in the field's compact dtype; short views are not padded."""
         field, layout, steps = FIELDS[name], get_layout(self.line["layout"]), self.line["T"]
         rows = steps if field.axis == "T" else steps // self.kept_steps
-        shape = self.line["obs_shape"] if name == "obs" and self.short else field.held(layout).shape
+        shape = self.line["obs_shape"] if name == "obs" and self.short else field.memory_dtype(layout).shape
         with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
-            found = read_dataset(find(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
+            found = read_dataset(find_node(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
         return self._compact(name, found)
 
     def _compact(self, name: str, found: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import KEPT_STEPS
 from icrl4aht_data.benchmark.tasks import NamedTask, Task, write_tasks
 from icrl4aht_data.errors import OptionError, check_choice
-from icrl4aht_data.format.info import LeftOutTask, check_version, describe, layout_statistics
+from icrl4aht_data.format.info import LeftOutTask, check_version, layout_statistics, make_info
 from icrl4aht_data.format.layouts_file import write_layouts_file
 from icrl4aht_data.format.manifest import write_manifest
 from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask
@@ -35,7 +35,7 @@ from icrl4aht_data.format.schema import (
     curve_ends,
     episode_ends,
     episode_returns,
-    held_fields,
+    memory_fields,
     stream_score,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS, EGO
@@ -58,7 +58,7 @@ class NewHistory:
 
     Args:
         env_idx: environment stream within the learner's parallel rollout, or number of a noise history.
-        arrays: field name -> array, for the fields `schema.held_fields` of the release's kind; a full release renders
+        arrays: field name -> array, for the fields `schema.memory_fields` of the release's kind; a full release renders
             `obs` from the states.
         learner: number of the independent learner that made the history, from 0.
     """
@@ -173,7 +173,7 @@ def write_release(
         content = {task_id: of_task.to_json() for task_id, of_task in provenance.items()}
         write_json(root / PROVENANCE, content, indent=None)  # a kilobyte for each task even so
         sizes = {name: (root / name).stat().st_size for name in dict.fromkeys(entry.shard for entry in writer.entries)}
-        info = describe(kind, data_version, kept_steps, writer.entries)
+        info = make_info(kind, data_version, kept_steps, writer.entries)
         statistics = layout_statistics(info, writer.entries, known, provenance, sizes)
         info = replace(info, shards=sizes, statistics=statistics, left_out=list(left_out))
         write_json(root / INFO, info.to_json())
@@ -239,7 +239,7 @@ class _ShardWriter:
                 f"task {task.task_id}: learner: expected 0 to {learners - 1}, since provenance has {learners} "
                 f"learners, found {history.learner}"
             )
-        needed = {field.name for field in held_fields(self.kind) if self.kind not in field.optional}
+        needed = {field.name for field in memory_fields(self.kind) if self.kind not in field.optional}
         if not needed <= arrays.keys():
             raise OptionError(f"task {task.task_id}: a history is missing the arrays {sorted(needed - arrays.keys())}")
         dones = arrays["dones"]

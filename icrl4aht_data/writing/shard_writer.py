@@ -15,8 +15,8 @@ import numpy as np
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.chunks import (
-    BETWEEN,
     DEFLATE_LEVEL,
+    METADATA_ROW_BYTES,
     chunk_hash,
     chunk_locations,
     chunk_table_name,
@@ -91,8 +91,8 @@ def metadata_lines(content: bytes, chunks: np.ndarray) -> np.ndarray:
     stops = [0, *(ordered["offset"] + ordered["size"]).tolist()]
     lines = []
     for stop, start in zip(stops, starts, strict=True):
-        for low in range(stop, start, BETWEEN):
-            data = content[low : min(low + BETWEEN, start)]
+        for low in range(stop, start, METADATA_ROW_BYTES):
+            data = content[low : min(low + METADATA_ROW_BYTES, start)]
             lines.append((low, len(data), 0, *_checksums(data)))
     return np.array(lines, CHUNK_DTYPE)
 

@@ -115,7 +115,7 @@ def train_teammates(
     units, left_out = [], []
     for work in profile.units(learned):
         earned = of_teammate.get(work.task.teammate_key)
-        if earned is None or earned.matters:
+        if earned is None or earned.has_headroom:
             units.append(work)
         elif work.learner == 0:
             reason = f"the ego does not matter: {earned.describe()}"

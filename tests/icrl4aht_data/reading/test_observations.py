@@ -132,7 +132,7 @@ class TestFaults:
             ),
             (
                 replace("/0/actions", np.array([b"x"] * 120)),
-                r"group /0: actions: .*expected numbers, or small arrays of them, found \|S1",
+                r"group /0: actions: .*expected numbers or small arrays of numbers, found \|S1",
             ),
             (edit(2, layout="demo_simple"), None),  # equal channel counts, so the files do not reveal the fault
             (edit(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
@@ -175,7 +175,7 @@ class TestTasks:
         assert (converted_release / "meta" / "tasks.jsonl").read_text() == ""
         assert {entry.seed for entry in dataset.entries} == {-1}
         with pytest.raises(
-            NotStoredError, match=r"tasks\.jsonl: empty: .* family rl and kind some_variant; .* with tasks\.jsonl"
+            NotStoredError, match=r"tasks\.jsonl is empty: .* family rl and kind some_variant are known; .* with tasks\.jsonl"
         ):
             dataset.recover_teammate(0)
         assert dataset.environment_parameters(0)["layout"] == "demo_wide"

@@ -14,7 +14,7 @@ from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
-from icrl4aht_data.format.info import LeftOutTask, describe
+from icrl4aht_data.format.info import LeftOutTask, make_info
 from icrl4aht_data.format.provenance import (
     ExpertLabels,
     NearestTest,
@@ -85,7 +85,7 @@ def write(lite, tmp_path) -> Callable[..., dict[str, Any]]:
                 changes |= of_task.entry_fields(like.episodes) | fields
                 entries.append(msgspec.structs.replace(like, **changes))
         (tmp_path / "meta").mkdir(exist_ok=True)
-        info = replace(describe("lite", "1.0.0", 20, entries), left_out=[LEFT_OUT], shards={"data/x.h5": 1})
+        info = replace(make_info("lite", "1.0.0", 20, entries), left_out=[LEFT_OUT], shards={"data/x.h5": 1})
         write_json(tmp_path / INFO, info.to_json())
         (tmp_path / HISTORIES).write_text("".join(json.dumps(entry.to_json()) + "\n" for entry in entries))
         write_tasks(tmp_path / TASKS, [task for task, _, _ in tasks])

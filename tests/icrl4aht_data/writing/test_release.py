@@ -176,7 +176,7 @@ def list_note(root: Path) -> None:
     [
         (lambda root: root.write_text("mine"), "is not a folder"),
         (add_note, r"is not a release: it has no MANIFEST\.sha256; --overwrite replaces only"),
-        (list_note, "is not a release: .*'note.txt' is not a file that a release has"),
+        (list_note, "is not a release: .*'note.txt' is not a file that a release may contain"),
         (
             lambda root: (add_note(root), (root / "MANIFEST.sha256").touch()),
             "is not a release: .* empty: expected a line",

@@ -103,6 +103,6 @@ def test_a_malformed_teammate_is_refused():
 
 def test_the_oracle_is_wanted_where_it_earns_what_the_end_earns():
     references = ReferenceEgos(stay=0.0, random=0.0, oracle=20.0, episodes=100)
-    assert Provenance(references=references).wants_oracle(20.0)
-    assert not Provenance(references=references).wants_oracle(20.5)
-    assert Provenance().wants_oracle(1000.0)
+    assert Provenance(references=references).is_oracle_useful(20.0)
+    assert not Provenance(references=references).is_oracle_useful(20.5)
+    assert Provenance().is_oracle_useful(1000.0)

@@ -249,8 +249,8 @@ _NAMES = {
     "long": "x" * 300,
 }
 add("release", "leads out of the release", {f"manifest: {name}": listed(path) for name, path in _NAMES.items()})
-add("release", "are one file on some systems", {"manifest: upper case": listed(SHARD.replace("teammate", "TEAMMATE"))})
-add("release", "not a file that a release has", {"manifest: code": listed("sitecustomize.py")})
+add("release", "are the same file on some systems", {"manifest: upper case": listed(SHARD.replace("teammate", "TEAMMATE"))})
+add("release", "not a file that a release may contain", {"manifest: code": listed("sitecustomize.py")})
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
 add("release", "listed in the manifest, but missing", {"manifest: many lines": listed(_many)})
 
@@ -422,7 +422,7 @@ _SHARED: dict[str, dict[str, ChangeFile]] = {
         "link to a file": link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
         "link to a pipe": link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
     },
-    "in other files|a local heap": {"external storage": actions(external), "virtual": actions(virtual)},
+    "in other files|local heap": {"external storage": actions(external), "virtual": actions(virtual)},
     r"filters \[32004\]|found \(\[32004\]": {"a plugin's filter": actions(filtered)},
     "expected numbers": {
         "texts": typed(h5py.string_dtype()),
