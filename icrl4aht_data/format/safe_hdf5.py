@@ -114,8 +114,7 @@ def read_dataset(dataset: Any, shape: tuple[int, ...]) -> np.ndarray:
     used = filter_ids(dataset)
     if used not in ([], [DEFLATE], [SHUFFLE, DEFLATE]):
         raise ValueError(
-            f"{dataset.name}: expected deflate, with or without shuffle, found filters {used}; "
-            f"run `h5repack -f GZIP=6`"
+            f"{dataset.name}: expected deflate, with or without shuffle, found filters {used}; run `h5repack -f GZIP=6`"
         )
     if dataset.shape != shape or dataset.dtype.kind not in "biuf":
         raise ValueError(f"expected numbers of shape {shape}, found {dataset.dtype} of shape {dataset.shape}")

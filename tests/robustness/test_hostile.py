@@ -148,7 +148,7 @@ def test_files_that_no_release_has_are_refused(damaged, name):
         stream.write(line)
     assert MANIFEST in verify_release(damaged).files_at_fault
     (damaged / "sitecustomize.py").write_text("")
-    with pytest.raises(UnsafePathError, match=r"'sitecustomize\.py' is not a file that a release may contain; remove it"):
+    with pytest.raises(UnsafePathError, match=r"'sitecustomize\.py' is not a file that a release may .*; remove it"):
         write_manifest(damaged)
 
 

@@ -64,9 +64,7 @@ def test_expert_fields_are_kept():
 )
 def test_a_malformed_provenance_is_named(tmp_path, note, message):
     (tmp_path / "provenance.json").write_text(json.dumps({"task": note}))
-    with pytest.raises(
-        IndexFormatError, match=rf"provenance\.json: malformed provenance of task 'task': .*{message}"
-    ):
+    with pytest.raises(IndexFormatError, match=rf"provenance\.json: malformed provenance of task 'task': .*{message}"):
         read_provenance(tmp_path / "provenance.json")
 
 

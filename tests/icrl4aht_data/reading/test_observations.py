@@ -175,7 +175,7 @@ class TestTasks:
         assert (converted_release / "meta" / "tasks.jsonl").read_text() == ""
         assert {entry.seed for entry in dataset.entries} == {-1}
         with pytest.raises(
-            NotStoredError, match=r"tasks\.jsonl is empty: .* family rl and kind some_variant are known; .* with tasks\.jsonl"
+            NotStoredError, match=r"tasks\.jsonl is empty: .* family rl and kind some_variant .* with tasks\.jsonl"
         ):
             dataset.recover_teammate(0)
         assert dataset.environment_parameters(0)["layout"] == "demo_wide"
