@@ -13,7 +13,7 @@ from icrl4aht_data.dataset import teammate_ids, teammate_names
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import HISTORIES
-from icrl4aht_data.writing.card import facts, render_card
+from icrl4aht_data.writing.card import card_facts, render_card
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
@@ -30,7 +30,7 @@ def swapped(tmp_path_factory) -> Path:
 
 
 def test_the_card_says_so(swapped):
-    content = facts(swapped)
+    content = card_facts(swapped)
     assert (content["views"], content["swapped"]) == ({"ego": {"ppo": 4}}, 4)
     card = render_card(content)
     assert "In 4 histories the teammate changes" in card and "(`ego`) in 4 histories of `ppo`" in card
