@@ -14,7 +14,7 @@ REFERENCES = ("stay", "random", "oracle")
 HEURISTICS = FAMILIES[1:]
 """The teammate families of the test tasks."""
 
-_NO_HEADROOM = 1.0  # layout and family have headroom if the return of `oracle` exceeds that of `stay` by more
+_NO_HEADROOM = 1.0  # a cell has headroom if the return of `oracle` exceeds that of `stay` by more than one point
 
 Cell = tuple[str, str]
 """Pair of a layout's short name and a teammate family."""

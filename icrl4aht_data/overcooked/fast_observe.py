@@ -71,7 +71,7 @@ class _Renderer:
         self._shape = observation_shape(layout, canonical)
         self._columns = columns(layout)
         fixed = fixed_channels(layout, canonical)
-        self._agent: int = fixed.start // 2  # A: the channels of both agents precede the fixed channels
+        self._agent: int = fixed.start // 2  # the number A; the channels of both agents come first
         self._first: int = fixed.stop  # first channel of items, recipes and timers, which can change
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.append(np.uint8(0), possible_recipes(layout))

@@ -170,7 +170,7 @@ class Layout:
 
     @cached_property
     def rooms(self) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers of the floor cells that the ego and that the teammate can reach, uint8, ascending."""
+        """Floor cells that the ego can reach, and floor cells that the teammate can reach; uint8, ascending."""
         first, second = (self._reachable(cell) for cell in self.agent_cells)
         return first, second
 
@@ -185,7 +185,7 @@ class Layout:
 
     @cached_property
     def shows_recipe(self) -> bool:
-        """Whether the ego can see a recipe indicator or a button from any cell that it can reach."""
+        """Whether the ego can see a recipe indicator or a button from at least one cell that it can reach."""
         shown = ((self.kinds == INDICATOR) | (self.kinds == BUTTON)).nonzero()[0]
         own = self.rooms[EGO].astype(int)
         (rows, columns), (own_rows, own_columns) = (divmod(cells, self.width) for cells in (shown, own))

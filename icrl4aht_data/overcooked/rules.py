@@ -75,7 +75,7 @@ def step(layout: Layout | Tables, record: Array, actions: Array, next_recipe: Ar
     tables = tables_of(layout)
     state = unpack(tables, record)
     state = _move(tables, xp, state, actions)
-    # USEFUL_PLATE depends on the plates that both agents held before agent 0 interacted.
+    # The event USEFUL_PLATE depends on the number of plates in both agents' hands before agent 0 interacts.
     plates_in_hand = xp.sum(state.hands == PLATE, axis=-1, dtype=xp.uint8)
     recipe = state.recipe
     events = []

@@ -38,7 +38,7 @@ def _delivery_fault(layout: Layout) -> str | None:
         """Return bool (2,): which agents can face at least one of the cells `fixtures`, bool (N,)."""
         return np.any(reach & fixtures, axis=1)
 
-    def agents_given(agents: np.ndarray) -> np.ndarray:
+    def after_handover(agents: np.ndarray) -> np.ndarray:
         """Return bool (2,): which agents can hold an item that the given agents, bool (2,), can take or hand over."""
         return agents | (counters and agents.any())
 
@@ -46,17 +46,17 @@ def _delivery_fault(layout: Layout) -> str | None:
         if not agents_at(layout.kinds == kind).any():
             return f"no agent can face {what}"
     pots = reach[:, layout.kinds == POT]  # (2, P), True for pots that each agent can face
-    plates, goals = agents_given(agents_at(layout.kinds == PLATES)), agents_at(layout.kinds == GOAL)
-    served = [pot for pot in pots.T if (agents_given(pot & plates) & goals).any()]
+    plates, goals = after_handover(agents_at(layout.kinds == PLATES)), agents_at(layout.kinds == GOAL)
+    served = [pot for pot in pots.T if (after_handover(pot & plates) & goals).any()]
     if not served:
         return "no soup can reach a goal on a plate"
     for recipe in layout.recipes:
         piles = {one: (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(one)) for one in recipe}
-        available = {ingredient: agents_given(agents_at(piles[ingredient])) for ingredient in sorted(piles)}
+        available = {ingredient: after_handover(agents_at(piles[ingredient])) for ingredient in sorted(piles)}
         for ingredient, agents in available.items():
             if not any((pot & agents).any() for pot in served):
                 return f"ingredient {ingredient} cannot reach a pot whose soup can be delivered"
-        # Different agents may bring the ingredients of a recipe, but to the same pot.
+        # Different agents may put the ingredients of a recipe into the pot, but all into the same pot.
         if not any(all((pot & agents).any() for agents in available.values()) for pot in served):
             return f"the ingredients of recipe {recipe} cannot reach the same pot"
     return None

@@ -262,9 +262,9 @@ def _search(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Return the tables `Tables.distance` and `Tables.first_step`, from a search for shortest paths."""
     far, here = np.int32(NOWHERE), np.arange(layout.cells)
     distance = np.where((here[:, None] == here) & layout.walkable, 0, far)
-    ends = layout.moves[:, SEARCH_ORDER]  # (cells, 4)
+    ends = layout.moves[:, SEARCH_ORDER]  # shape (cells, 4)
     while True:
-        after = distance[ends] + 1  # (cells, 4, cells)
+        after = distance[ends] + 1  # shape (cells, 4, cells)
         shorter = np.minimum(distance, after.min(axis=1))
         if np.array_equal(shorter, distance):
             break

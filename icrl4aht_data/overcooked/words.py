@@ -167,7 +167,7 @@ class CellWords:
             of_kind = np.stack([nonzero[words[words < len(nonzero)]].any(axis=0) for words in self._words[number]])
             for agent in agents:
                 room, other_room = layout.rooms[agent], layout.rooms[1 - agent]
-                kinds = self._kind[number, self._slot[number, room]]  # (reachable cells, 25)
+                kinds = self._kind[number, self._slot[number, room]]  # shape (reachable cells, 25)
                 shown |= (of_kind[kinds] | nonzero[self._fixed[number, room]]).any(axis=0)
                 relative = np.unique(layout.window_position[np.ix_(room, other_room)])
                 shown[np.setdiff1d(relative, [NOWHERE, CENTRE])] |= of_kind[_OTHER]

@@ -244,7 +244,7 @@ def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str,
 def _learning_rows(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return one row on the rise of returns for each layout title, source and split, sorted by these."""
     names = ("layout", "source", "split")
-    order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # unknown sources come last
+    order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # sources not in SOURCES come last
     ordered = sorted(tasks, key=lambda task: [order.index(getattr(task.first, name)) for name in names])
     groups = grouped(ordered, lambda task: (titles[task.first.layout], task.first.source, task.first.split))
     rows = []
