@@ -75,7 +75,7 @@ def test_other_kinds_lengths_versions_and_formats_are_refused(tmp_path):
     a, b, c, d = (tmp_path / name for name in "abcd")
     with pytest.raises(OptionError, match=r"b has kind 'full', but .*a has 'lite'; combine only releases of one"):
         combine_releases(tmp_path / "out", [a, b])
-    with pytest.raises(OptionError, match=r"c: environment .*kept_steps=10.*a has .*kept_steps=20"):
+    with pytest.raises(OptionError, match=r"c has environment .*kept_steps=10.*a has .*kept_steps=20"):
         combine_releases(tmp_path / "out", [a, c])
     with pytest.raises(OptionError, match="a is also read; give another folder"):
         combine_releases(a, [a, d])
