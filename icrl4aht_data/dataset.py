@@ -416,7 +416,7 @@ class Dataset(Selection):
 
 def _check_episode(entry: Entry, episode: int) -> int:
     if check_int("episode", episode, 0) >= entry.episodes:
-        raise OptionError(f"episode = {episode}: history {entry.history_id} has only episodes 0..{entry.episodes - 1}")
+        raise OptionError(f"episode = {episode}: history {entry.history_id} has episodes 0..{entry.episodes - 1}")
     return int(episode)
 
 

@@ -36,7 +36,7 @@ MINE = Layout("mine-3-5", "mine-3-5", ROWS, ((0, 0, 1), (0, 1, 1)))
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
     """Each test begins like a process that has not opened a release with layouts."""
-    monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+    monkeypatch.setattr(known_layouts, "_RELEASE_LAYOUTS", {})
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def root(tmp_path, fresh, monkeypatch) -> Path:
     """Return a release with histories on a layout of its own and on a published one, unknown to this process."""
     add_layouts([MINE])
     random_release(tmp_path / "release", layouts=("coord_simple", "mine-3-5"), teammates=1, streams=2)
-    monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+    monkeypatch.setattr(known_layouts, "_RELEASE_LAYOUTS", {})
     with pytest.raises(UnknownNameError):
         get_layout("mine-3-5")
     return tmp_path / "release"
@@ -116,7 +116,7 @@ class TestRelease:
 
     def test_a_dataset_brings_them_to_another_process(self, root, monkeypatch):
         sent = pickle.dumps(load_icrl4aht(root))
-        monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+        monkeypatch.setattr(known_layouts, "_RELEASE_LAYOUTS", {})
         ds = pickle.loads(sent)
         assert ds[-1].obs.shape == (120, 5, 5, 35) and get_layout("mine-3-5").rows == ROWS
 
@@ -165,7 +165,7 @@ class TestRelease:
     def test_one_name_for_two_maps(self, root, tmp_path):
         load_icrl4aht(root)
         other = [stored(root)[0] | {"map": ["WWPWW", *ROWS[1:]]}]
-        with pytest.raises(IndexFormatError, match="give it another name"):
+        with pytest.raises(IndexFormatError, match="give the new layout another name"):
             load_icrl4aht(rewritten(root, other))
 
 

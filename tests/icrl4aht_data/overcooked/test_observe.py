@@ -125,7 +125,7 @@ def test_an_unknown_layout_lists_the_names_and_the_nearest(wrong, nearest):
         ((), {}, "widths \\[\\]"),
         ("WWWWW", {}, "rows = "),
         (("WWWWW", "WA AW", "WWWWW"), {"recipes": ()}, "at least one"),
-        (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 0, 1), (0, 1, 0))}, "different recipes"),
+        (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 0, 1), (0, 1, 0))}, "no recipe twice"),
         (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 1),)}, "recipes = "),
         (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 0, True),)}, "recipes = "),
         (("W0W1W", "WA AW", "WWWWW"), {"indicates_delivery": 1}, "indicates_delivery = "),

@@ -136,7 +136,7 @@ class TestFaults:
             ),
             (edit(2, layout="demo_simple"), None),  # equal channel counts, so the files do not reveal the fault
             (edit(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
-            (edit(1, teammate_kind="other"), r"index\.jsonl: history 1 is of .*'other'.*, its task 'task_a' of"),
+            (edit(1, teammate_kind="other"), r"index\.jsonl: history 1 has .*'other'.*, but its task 'task_a' has"),
             (edit(1, T="many"), r"index\.jsonl, line 2: Expected `int`, got `str` - at `\$\.T`"),
             (edit(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),
         ],

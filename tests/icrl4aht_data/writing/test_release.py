@@ -206,7 +206,7 @@ def test_folders_created_during_writing_are_not_replaced(tmp_path):
         add_note(root)
         return [NewHistory(0, played())]
 
-    for overwrite, message in ((False, "exists"), (True, r"has note\.txt")):
+    for overwrite, message in ((False, "exists"), (True, r"contains note\.txt")):
         with pytest.raises(OptionError, match=message):
             write_cramped(root, meanwhile, overwrite=overwrite)
         assert (root / "note.txt").read_text() == "mine"
