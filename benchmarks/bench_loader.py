@@ -30,7 +30,7 @@ from icrl4aht_data import ADBatch, ADSampler, Dataset, load_icrl4aht
 from icrl4aht_data.benchmark.tasks import read_tasks
 from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.format.provenance import Provenance
-from icrl4aht_data.format.schema import TASKS, held_fields
+from icrl4aht_data.format.schema import TASKS, memory_fields
 from icrl4aht_data.writing.published import HISTORIES_H5, to_published
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
@@ -113,7 +113,7 @@ def rotated_histories(source: Dataset, count: int) -> Iterator[NewHistory]:
         history, episodes = source[number % len(source)], number // len(source)
         arrays = {
             field.name: np.roll(history.read(field.name), episodes * (kept if field.axis == "T" else 1), axis=0)
-            for field in held_fields("lite")
+            for field in memory_fields("lite")
             if history.entry.has(field)
         }
         yield NewHistory(number, arrays)

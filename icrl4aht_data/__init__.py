@@ -1,9 +1,9 @@
-"""Learning histories of the ICRL4AHT benchmark: read, sample, verify.
+"""Read, sample and verify the learning histories of the ICRL4AHT benchmark.
 
 ds = load_icrl4aht(split="train", layout="coord_simple")
 batch = ds.ad(batch_size=64, length=500, seed=0)[0]
 
-Public names are imported on first use, which keeps the start of commands fast.
+Public names are imported on first use, so that commands start fast.
 """
 
 from __future__ import annotations

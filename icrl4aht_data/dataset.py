@@ -68,40 +68,40 @@ def load_icrl4aht(
 
     Args:
         root: a release folder, or an address: `hf://datasets/<org>/<repo>[@<revision>]`, `s3://...`, `https://...`, or
-            another address that fsspec opens; the bundled mini release by default. Opening a remote release downloads
+            another address that fsspec opens; by default the bundled mini release. Opening a remote release downloads
             only its index; data is downloaded when it is read.
         split: "train", "validation", "test" or "heldout". Each filter is one value, a sequence of values, or None
-            for any. Train models on "train" only; samplers warn about a mixture.
+            for any value. Train models on "train" only; samplers warn about a mixture of splits.
         layout: a short name (coord_simple) or an environment name (grounded_coord_simple).
         layout_family: "published", or a family of layouts that the release carries, such as "templates".
-        track: "teammate" or "layout", the part that is new in test tasks.
+        track: "teammate" or "layout": which of the two is new in the test tasks.
         teammate_family: "rl" (learned) or "H1".."H4" (heuristics).
         teammate_kind: an algorithm or a heuristic, such as "fcp" or "utility_greedy".
         algorithm: alias of `teammate_kind` for learned teammates, such as "fcp" or "comedi".
         source: how the histories were made: "ppo" (an ego learned by PPO), "noise" (the scripted oracle, with
             random actions that become rarer), "agent" (a trained agent), "search" (a script that finds out the wanted
             dish) or "human" (a person); see docs/format.md.
-        label_view: what the policy behind the expert actions could see: "ego", what an ego sees, or "state", the full
-            state. Older releases do not record it.
+        label_view: input of the policy that chose the expert actions: "ego" for the ego's observation, or "state" for
+            the full state. Older releases do not record this field.
         task_id: id of a task; a task is a layout, a teammate and a seed.
-        learner: number of the learner within its task, from 0, or several numbers.
+        learner: number of a learner within its task, counted from 0, or several numbers.
         min_expert_return: only histories whose expert actions come from a policy that earned at least this much per
             episode, acting greedily with the history's teammate: `entry.expert_return`.
         obs: dtype of observations: "float32", "uint8" (the same integers), or "state" for state records instead of
             observations; see `history.OBS`.
         cache: "ram" and "mmap" (files that processes share) decode the selection once for all batches, "stream" reads
-            the chunks that a batch needs, "auto" chooses by size and free memory. The batches are the same. See
-            `sources.CACHE_MODES`.
+            the chunks that a batch needs, "auto" chooses by size and free memory. All modes return the same batches.
+            See `sources.CACHE_MODES`.
         threads: number of threads that decode and render; by default one for each usable core.
         channels: channels of observations: "own", which differ between layouts, or "canonical", the union of all
-            layouts' channels, so any mixture of layouts can be sampled; see `overcooked.channels`. State
-            records (obs="state") are rendered by `observe` with canonical=True.
+            layouts' channels, for batches that mix layouts; see `overcooked.channels`. With obs="state", call
+            `observe` with canonical=True instead.
 
     Raises:
-        UnknownNameError: for a name that does not exist; lists the valid ones and the nearest.
-        EmptySelectionError: if nothing matches; lists existing values.
+        UnknownNameError: for a name that does not exist; the message lists the valid names and suggests the nearest.
+        EmptySelectionError: if no history matches the filters; the message lists existing values.
         OptionError: for impossible options, such as obs="state" for a release of observations.
-        NotStoredError: for `min_expert_return`, if the release does not have the returns.
+        NotStoredError: if `min_expert_return` is given but the release does not store returns of experts.
         ReleaseError: if the release cannot be read.
     """
     options = ReadOptions(obs, cache, usable_cores() if threads is None else threads, channels)
@@ -124,41 +124,41 @@ def load_icrl4aht(
 
 def open_dataset(location: ReleaseLocation, options: ReadOptions) -> Dataset:
     """Return a dataset of all histories of a release; see `load_icrl4aht` for the errors."""
-    if os.path.isfile(location.folder / INFO):  # noqa: PTH113 - never raises; without it `read_index` explains more
+    if os.path.isfile(location.folder / INFO):  # noqa: PTH113 - never raises; `read_index` reports a missing file
         check_meta(location.folder)
     index = read_index(location.folder)
     return Dataset(location, index, Shards(location, index), options)
 
 
 class Dataset(Selection):
-    """A selection of learning histories that can be sampled; `load_icrl4aht` opens one.
+    """A selection of learning histories that can be sampled; `load_icrl4aht` returns a `Dataset`.
 
     `len(dataset)` is the number of histories, `dataset[i]` the i-th `History`, `dataset[a:b]` a smaller selection;
-    iteration yields histories in order. `filter`, `select` and `split` narrow a selection, `sort` orders it, `ad` and
-    `dpt` sample batches, `sample_episodes` samples episodes.
+    iteration yields histories in order. `filter`, `select` and `split` return smaller selections, `sort` orders the
+    histories, `ad` and `dpt` sample batches, and `sample_episodes` samples episodes.
     """
 
     @property
-    def knows_tasks(self) -> bool:
-        """Whether the release contains its tasks; a release of observations may not."""
+    def has_tasks(self) -> bool:
+        """Whether the release stores its tasks; a release of observations may not store them."""
         return self.has_states or bool(self.tasks)
 
     def sort(self, *names: str, reverse: bool = False) -> Self:
         """Return this selection sorted by index fields; the sort is stable.
 
         Args:
-            names: fields of `Entry`, such as "return_end"; the first one is the main key. Text is sorted
+            names: fields of `Entry`, such as "return_end"; the first field is the main key. Text is sorted
                 alphabetically.
-            reverse: from the largest value to the smallest. Histories without a value are last in either order.
+            reverse: sort from the largest value to the smallest. Histories without a value are last in either order.
 
         Raises:
             OptionError: if no field is given, or an argument is not a string.
-            UnknownNameError: for a field that does not exist; names the nearest one.
+            UnknownNameError: for a field that does not exist; the message suggests the nearest.
         """
         if not names or not all(isinstance(name, str) for name in names):
             raise OptionError(
                 f'sort: expected names of index fields, such as ds.sort("layout", "return_end"), found {names!r}; for '
-                f"another order give its ids to ds.select"
+                f"another order pass the history ids to ds.select"
             )
         keys = []
         for name in names:
@@ -172,17 +172,17 @@ class Dataset(Selection):
     def split(self, validation: float = 0.1, seed: int = 0, by: SplitBy = "teammate") -> tuple[Self, Self]:
         """Split this selection into training and validation histories.
 
-        The choice is a function of names and the seed, not of the selection's order. `icrl4aht-data train` makes the
-        same choice for releases without a validation split.
+        The split depends on names and the seed, not on the order of the selection. `icrl4aht-data train` splits
+        releases without a validation split in the same way.
 
         Args:
-            validation: share of the teammates, or of the histories, to hold out; at least one is held out.
+            validation: fraction of the teammates, or of the histories, to hold out; at least one is held out.
             seed: seed of the choice.
             by: "teammate" holds out teammates with all their histories, separately on each layout, so no validation
                 teammate is in training; "history" holds out histories, and keeps at least one per task in training.
 
         Returns:
-            The training histories and the validation histories; together they are the selection.
+            The training histories and the validation histories; each selected history is in exactly one of the two.
 
         Raises:
             UnknownNameError: if `by` is neither "teammate" nor "history".
@@ -200,7 +200,7 @@ class Dataset(Selection):
             held = choose_teammates(teammate_names(self), share, seed)
             if not held.any():
                 raise OptionError(
-                    f'by = "teammate": {self!r} has one teammate, so none can be held out; take by="history", or '
+                    f'by = "teammate": {self!r} has one teammate, so none can be held out; use by="history", or '
                     f"select more tasks"
                 )
         return self.select(~held), self.select(held)
@@ -213,15 +213,15 @@ class Dataset(Selection):
             seed: seed of the draw; equal seed, selection and `n` give equal episodes.
 
         Returns:
-            The episodes, in the order of the selection and of their histories.
+            The drawn episodes, in the order of the selection and, within a history, by number.
 
         Raises:
-            OptionError: if `n` is not an integer from 1, or larger than the number of episodes.
+            OptionError: if `n` is not a positive integer, or is larger than the number of episodes.
         """
         count, ends = check_int("n", n, 1), np.cumsum(self.column("episodes"))
         if count > ends[-1]:
             raise OptionError(
-                f"n = {count}: the selection has {ends[-1]:,} episodes; take fewer, or select more histories"
+                f"n = {count}: the selection has {ends[-1]:,} episodes; draw fewer, or select more histories"
             )
         drawn = draw_subset(check_int("seed", seed, 0), int(ends[-1]), count)
         rows = np.searchsorted(ends, drawn, side="right")
@@ -233,9 +233,9 @@ class Dataset(Selection):
         return chosen
 
     def plot(self) -> Picture:
-        """Return returns by episode, source and layout as a picture, which notebooks show.
+        """Return a plot of returns by episode, source and layout, which notebooks display.
 
-        Reads the rewards of all selected histories.
+        This reads the rewards of all selected histories.
 
         Raises:
             OptionError: if matplotlib is not installed.
@@ -244,20 +244,20 @@ class Dataset(Selection):
 
     @cached_property
     def tasks(self) -> dict[str, Task]:
-        """The tasks of the release by id; a release of observations may have none."""
+        """Tasks of the release by id; empty if a release of observations was made without tasks."""
         return {task.task_id: task for task in read_tasks(self.origin.file(TASKS))}
 
     def recover_environment(self, history_id: int, episode: int = 0, **options: Any) -> gymnasium.Env:
-        """Return the Gymnasium environment of a history: the ego's side of its task, with the teammate inside.
+        """Return the Gymnasium environment of a history: the caller acts as the ego, the environment as the teammate.
 
         Episodes have the length used to make the history, 400 steps in the benchmark; the release keeps the first 100.
-        `reset(options=dataset.reset_options(history_id, episode))` starts it as a recorded episode.
+        `reset(options=dataset.reset_options(history_id, episode))` starts the environment as a recorded episode.
 
         Args:
             history_id: a history of the release, whether selected or not.
-            episode: number of the episode whose teammate plays; it matters only where teammates change.
+            episode: number of the episode whose teammate plays, for histories in which teammates change.
             options: options of `gymnasium.make`, such as `max_episode_steps` or `render_mode`, and of
-                `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`. The channels of the dataset are the default.
+                `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`. By default `channels` is that of the dataset.
 
         Raises:
             NotStoredError: if the release was made without its tasks.
@@ -279,8 +279,8 @@ class Dataset(Selection):
             name = f"{TEAMMATES}/{task.teammate['theta']['sha256']}"
             if not self.origin.below(name).is_dir():
                 raise OptionError(
-                    f"{self.root / name}: missing, the checkpoint of the teammate of history {history_id}: this "
-                    f"release was made without it; copy it from the release that it was made of"
+                    f"{self.root / name}: the checkpoint of history {history_id}'s teammate is missing, because this "
+                    f"release was made without checkpoints; copy it from the release that this one was made from"
                 )
             known["suite"] = str(self.root / TEAMMATES)
         return make_environment(**known | options)
@@ -288,16 +288,16 @@ class Dataset(Selection):
     def reset_options(self, history_id: int, episode: int = 0) -> dict[str, np.ndarray]:
         """Return the options of `reset` that start a recovered environment as a recorded episode.
 
-        The environment then starts at the recorded state, its teammate repeats the recorded actions and a delivery is
-        followed by the recorded recipe. With the ego's recorded actions, states, observations and rewards are
-        the recorded ones; no random keys are needed. After the recorded steps, the teammate's policy acts.
+        The environment then starts at the recorded state, the teammate repeats its recorded actions, and the recorded
+        recipe follows each delivery. If the ego repeats its recorded actions too, the states, observations and rewards
+        equal the recorded ones without random keys. After the recorded steps, the teammate's policy acts.
 
         Args:
             history_id: a history of the release, whether selected or not.
-            episode: number of the episode in the history, from 0.
+            episode: number of the episode in the history, counted from 0.
 
         Returns:
-            `state` uint8 (S,), `teammate_actions` int8 (n,) and `recipes` uint8 (n,), for the episode's n kept steps.
+            `state` uint8 (S,), `teammate_actions` int8 (n,) and `recipes` uint8 (n,), for the episode's n stored steps.
 
         Raises:
             NotStoredError: for a release of observations.
@@ -335,7 +335,7 @@ class Dataset(Selection):
 
         Args:
             history_id: a history of the release, whether selected or not.
-            episode: number of the episode whose teammate is wanted; it matters only where teammates change.
+            episode: number of the episode whose teammate is returned, for histories in which teammates change.
 
         Returns:
             The task's teammate entry (`kind`, `family`, `theta` and others), the teammate's agent number (`slot`) and
@@ -359,11 +359,11 @@ class Dataset(Selection):
             NotStoredError: if the release was made without its tasks.
         """
         entry = self.index.entry(history_id)
-        if not self.knows_tasks:
+        if not self.has_tasks:
             raise NotStoredError(
-                f"{self.root / TASKS}: empty: this release was converted without its tasks and knows of this teammate "
-                f"only family {entry.teammate_family} and kind {entry.teammate_kind}; convert again with tasks.jsonl "
-                f"in the folder"
+                f"{self.root / TASKS} is empty: this release was converted without its tasks, so only the teammate's "
+                f"family {entry.teammate_family} and kind {entry.teammate_kind} are known; convert again with "
+                f"tasks.jsonl in the folder"
             )
         if entry.task_id not in self.tasks:
             raise unknown(f"task of history {history_id} in {self.root / TASKS}", entry.task_id, self.tasks)
@@ -382,7 +382,7 @@ class Dataset(Selection):
         """Return a sampler of windows of `length` steps for Algorithm Distillation; see `ADSampler` for the options.
 
         Warns:
-            MixedSplitsWarning: if histories of split "train" and of others are selected.
+            MixedSplitsWarning: if histories of split "train" and of other splits are selected.
             WeakLabelsWarning: see `ADSampler`.
         """
         warn_of_mixed_splits(self)
@@ -405,7 +405,7 @@ class Dataset(Selection):
         See `DPTSampler` for the options.
 
         Warns:
-            MixedSplitsWarning: if histories of split "train" and of others are selected.
+            MixedSplitsWarning: if histories of split "train" and of other splits are selected.
             WeakLabelsWarning: see `DPTSampler`.
         """
         warn_of_mixed_splits(self)
@@ -436,10 +436,10 @@ def teammate_ids(dataset: Dataset, history_ids: Iterable[int]) -> list[str] | No
 
 
 def teammate_names(dataset: Dataset) -> np.ndarray:
-    """Return a name of each history's teammate, strings (H,), equal for the same policy on the same layout.
+    """Return a name for each history's teammate, strings (H,); the same policy on the same layout has one name.
 
-    The name consists of layout and teammate id; if the release does not describe the teammate, it is the task id.
-    Teammates that play in one history, where they change, have one name.
+    A name consists of layout and teammate id, or is the task id if the release does not describe the teammate.
+    Teammates that take turns within a history share one name.
     """
     codes, first, number = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
     values, of_task = dataset.index.values("task_id"), list[str]()

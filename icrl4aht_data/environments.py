@@ -1,9 +1,9 @@
 """Gymnasium ids of the benchmark's tasks.
 
-`gymnasium.make("icrl4aht/demo_wide-H4-t0-v0")` makes the environment of a published test task,
-`gymnasium.make("icrl4aht/task-v0", task=...)` of any task. `import icrl4aht_data` registers the ids, because
-Gymnasium 1.0 and later load no plugins; `gymnasium.make("icrl4aht_data:icrl4aht/demo_wide-H4-t0-v0")` imports it.
-The environment itself is `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`, which needs JAX.
+`gymnasium.make("icrl4aht/demo_wide-H4-t0-v0")` makes the environment of a published test task;
+`gymnasium.make("icrl4aht/task-v0", task=...)` makes the environment of any task. `import icrl4aht_data` registers the
+ids, because Gymnasium 1.0 and later load no plugins. `gymnasium.make("icrl4aht_data:icrl4aht/demo_wide-H4-t0-v0")`
+imports the package first. The environment class is `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`; it needs JAX.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
 TASK_ENVIRONMENT = "icrl4aht/task-v0"
-"""Gymnasium id of the environment of the task given as argument `task`."""
+"""Gymnasium id of an environment whose task is given as argument `task`."""
 
 _MODULE = "icrl4aht_generation.adapters.gymnasium_env"
 _TRACKS = ("teammate", "layout")
@@ -31,8 +31,8 @@ def register_environments() -> None:
     """Register the Gymnasium ids: `TASK_ENVIRONMENT`, and one for each of the 160 published test tasks.
 
     The id of a test task is `icrl4aht/<layout>-<family>-t<number>-v0`, such as icrl4aht/demo_wide-H4-t0-v0. Episodes
-    have 100 steps, as in the evaluation, unless `gymnasium.make` is given another `max_episode_steps`. Existing
-    ids are kept. Does nothing if Gymnasium is not installed.
+    have 100 steps, as in the evaluation, unless `gymnasium.make` gets another `max_episode_steps`. Ids that are
+    already registered stay unchanged. The function does nothing if Gymnasium is not installed.
     """
     try:
         from gymnasium.envs.registration import register, registry
@@ -53,7 +53,7 @@ def environment_spec(max_steps: int, arguments: dict[str, Any]) -> EnvSpec:
     """Return the Gymnasium `EnvSpec` of a task, without making the environment.
 
     Args:
-        max_steps: steps of an episode.
+        max_steps: number of steps of an episode.
         arguments: arguments of `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`.
 
     Raises:
@@ -69,7 +69,7 @@ def make_environment(**options: Any) -> gymnasium.Env:
     """Return the Gymnasium environment of a task.
 
     Args:
-        options: options of `gymnasium.make` and of `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`, among them
+        options: options of `gymnasium.make` and of `icrl4aht_generation.adapters.gymnasium_env.TaskEnv`, including
             `task`.
 
     Raises:
@@ -81,4 +81,4 @@ def make_environment(**options: Any) -> gymnasium.Env:
         register_environments()
         return gymnasium.make(TASK_ENVIRONMENT, **options)
     except ImportError as error:
-        raise OptionError(f"an environment needs {error.name or error}: {install_command('gym')}") from error
+        raise OptionError(f"an environment needs {error.name or error}; run {install_command('gym')}") from error

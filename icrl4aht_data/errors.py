@@ -1,6 +1,6 @@
-"""Exceptions of this package, with one base class, and warnings.
+"""Exceptions of this package, which share one base class, and its warnings.
 
-Messages name the file or value, what was expected, what was found, and what to do next.
+An error's message names the file or value, what was expected, what was found, and what to do next.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ class Icrl4ahtError(Exception):
 
 
 class UnknownNameError(Icrl4ahtError, ValueError):
-    """A layout, split, track, family, field or option that does not exist."""
+    """The name of a layout, split, track, family, field or option does not exist."""
 
 
 class EmptySelectionError(Icrl4ahtError, ValueError):
@@ -74,7 +74,7 @@ class ShardTruncatedError(ShardCorruptError):
 
 
 class ShardMismatchError(ReleaseError):
-    """The index, the chunk table and the shard contradict one another."""
+    """The index, the chunk table and the shard contradict each other."""
 
 
 class PublishedFormatError(ReleaseError):
@@ -93,8 +93,8 @@ class RemoteError(ReleaseError, OSError):
     """A remote failed after all retries, or returned content that differs from its manifest.
 
     Args:
-        message: the error message, with the address.
-        missing: whether the file does not exist on the remote.
+        message: the error message, which includes the address.
+        missing: True if the file does not exist on the remote.
     """
 
     def __init__(self, message: str, missing: bool = False) -> None:
@@ -103,7 +103,7 @@ class RemoteError(ReleaseError, OSError):
 
 
 class OfflineError(ReleaseError):
-    """A file is not on this machine, and HF_HUB_OFFLINE or ICRL4AHT_OFFLINE forbids fetching it."""
+    """A file is not on this machine, and HF_HUB_OFFLINE or ICRL4AHT_OFFLINE forbids fetching the file."""
 
 
 class UnsafePathError(ReleaseError):
@@ -131,7 +131,7 @@ class TaskFormatError(Icrl4ahtError, ValueError):
 
 
 class WeakLabelsWarning(UserWarning):
-    """The expert of some tasks earns far less than the ego does at the end of its histories."""
+    """The policy behind some tasks' labels earns less than half of the ego's return at the end of their histories."""
 
 
 class MixedSplitsWarning(UserWarning):
@@ -142,13 +142,13 @@ def check_choice(what: str, found: object, valid: Iterable[str]) -> None:
     """Check that a value is one of the valid names.
 
     Raises:
-        UnknownNameError: if it is not; lists the valid names and suggests the nearest.
+        UnknownNameError: if the value is not valid; the message lists the valid names and suggests the nearest.
     """
     if found not in tuple(valid):
         raise unknown(what, found, valid)
 
 
-_LISTED, _COMPARED = 50, 1000  # numbers of valid names that an error lists, and that are searched for the nearest
+_LISTED, _COMPARED = 50, 1000  # most valid names that a message lists, and most that are compared with the wrong one
 
 
 def unknown(what: str, found: object, valid: Iterable[str]) -> UnknownNameError:

@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.actions import DOWN
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.render import draw_frame, encode_episode
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
-from icrl4aht_data.overcooked.state import start
+from icrl4aht_data.overcooked.state import start_record
 from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.install_hints import import_optional, install_command
 from icrl4aht_data.utils.text import counted_histories
@@ -252,7 +252,7 @@ def plot_layouts(layouts: Sequence[Layout], titles: Sequence[str] | None = None)
     titles = titles or [f"{layout.name} ({layout.alias})" for layout in layouts]
     for axes, layout, title in zip(grid, layouts, titles, strict=True):
         positions = np.array([layout.agent_cells], np.uint8)
-        (record,) = start(layout, positions, np.full((1, 2), DOWN, np.uint8), layout.recipe_items[:1])
+        (record,) = start_record(layout, positions, np.full((1, 2), DOWN, np.uint8), layout.recipe_items[:1])
         axes.imshow(draw_frame(layout, record, view=False))
         axes.set_title(title, fontsize=9)
         axes.set_axis_off()

@@ -20,7 +20,7 @@ from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
-from icrl4aht_data.overcooked.state import start
+from icrl4aht_data.overcooked.state import start_record
 from icrl4aht_data.overcooked.tables import Tables, stack_tables
 from icrl4aht_generation.policy import Policy, Situation
 
@@ -262,7 +262,7 @@ def _first_record(tables: Tables, draw: Key[Array, "*N 5"]) -> UInt8[Array, "*N 
     mate_number += one_room & (mate_number >= ego_number)
     positions = jnp.stack([ego_room[ego_number], mate_room[mate_number]], axis=-1)
     facings = jnp.stack([_below(draw[..., k], np.uint32(4)) for k in (2, 3)], axis=-1).astype(jnp.uint8)
-    return start(tables, positions, facings, _drawn_recipe(tables, draw[..., 4]))
+    return start_record(tables, positions, facings, _drawn_recipe(tables, draw[..., 4]))
 
 
 def _drawn_recipe(tables: Tables, keys: Key[Array, "*N"]) -> UInt8[Array, "*N"]:

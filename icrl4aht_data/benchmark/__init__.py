@@ -1,1 +1,1 @@
-"""The benchmark: facts from the paper, tasks and their manifests, returns of reference egos."""
+"""Data about the benchmark: constants from the paper, tasks and their manifests, returns of reference egos."""

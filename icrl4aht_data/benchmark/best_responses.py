@@ -1,7 +1,7 @@
-"""Best responses: the best return that an ego with the ego's own view is known to earn with a teammate.
+"""Best responses: for each teammate, the highest known return of an ego that sees only its own observations.
 
-`cards/best_responses.json` holds them. They were measured with recurrent egos that were trained against one teammate
-each, or are the return of a model that earns more. Tasks whose teammates behave alike share a best response.
+The file `cards/best_responses.json` stores the best responses. Each is the return of a recurrent ego trained with one
+teammate, or of another model that earns more. Tasks whose teammates behave the same share a best response.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from icrl4aht_data.utils.templates import card_file
 
 
 class TrainedResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One training of an ego against one teammate.
+    """One training of an ego with one teammate.
 
     Attributes:
         seed: seed of the training.
         steps: environment steps of the training.
-        width: width of its features and its recurrent state.
-        mean_return: mean return of an episode after it, `return` in the file.
-        choice: mean return on the episodes by which the best training is chosen.
-        acting: whether it takes its most probable actions ("greedy") or draws them ("sampled"), by the same episodes.
-        slope: rise of the return while it learned, from the third to the last quarter of the steps.
-        init: bundled model that it started from; empty for random parameters.
+        width: number of features and of recurrent units of the ego's network.
+        mean_return: mean return per episode of the trained ego; stored as `return` in the file.
+        choice: mean return in the episodes that decide which training is the best.
+        acting: "greedy" or "sampled" actions, whichever earned more in the episodes of `choice`.
+        slope: rise of the mean return during the training, from the third to the last quarter of its steps.
+        init: name of the bundled model that the training started from; empty for random parameters.
     """
 
     seed: int
@@ -47,13 +47,13 @@ class BestResponse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The best response to one behaviour of a teammate.
 
     Attributes:
-        layout: short name.
+        layout: short name of the layout.
         family: family of the teammate.
         split: split of the tasks.
-        tasks: ids of the tasks whose teammate behaves like this.
-        seeds: the trainings against it.
-        best: best mean return of any ego with the ego's view.
-        agent: which ego earns it, such as "best response, seed 1".
+        tasks: ids of the tasks whose teammates show this behaviour.
+        seeds: trainings of egos with a teammate of this behaviour.
+        best: highest mean return of any ego that sees only its own observations.
+        agent: name of the ego that earns the highest return, such as "best response, seed 1".
     """
 
     layout: str
@@ -69,10 +69,10 @@ class BestResponseCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Content of `cards/best_responses.json`.
 
     Attributes:
-        version: changes whenever a best response does.
+        version: hash that changes whenever a best response changes.
         protocol: name of the protocol under which the returns were measured.
-        about: how they were measured, as a sentence.
-        behaviours: the best responses.
+        about: sentences that say how the returns were measured.
+        behaviours: the best responses, one for each behaviour of a teammate.
     """
 
     version: str
@@ -82,17 +82,17 @@ class BestResponseCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def chosen_training(trainings: Iterable[TrainedResponse]) -> TrainedResponse:
-    """Return the training that earns most on the episodes to choose by."""
+    """Return the training with the highest `choice` return."""
     return max(trainings, key=lambda one: -math.inf if one.choice is None else one.choice)
 
 
 def best_responses_file() -> Path:
-    """Return the path of the package's best responses."""
+    """Return the path of the bundled file of best responses."""
     return card_file("best_responses.json")
 
 
 def read_best_responses(path: Path | None = None) -> BestResponseCard:
-    """Return the content of a file of best responses, by default the package's.
+    """Return the content of a file of best responses, by default of the bundled one.
 
     Raises:
         OptionError: if the file does not exist or is damaged, or a task has two best responses.
@@ -103,18 +103,18 @@ def read_best_responses(path: Path | None = None) -> BestResponseCard:
     try:
         card = msgspec.json.decode(path.read_bytes(), type=BestResponseCard)
     except msgspec.MsgspecError as error:
-        raise OptionError(f"{path}: not a file of best responses: {error}; restore it: `{RESTORE}`") from error
+        raise OptionError(f"{path}: invalid file of best responses: {error}; restore it: `{RESTORE}`") from error
     counts = Counter(task for behaviour in card.behaviours for task in behaviour.tasks)
     if twice := sorted(task for task, number in counts.items() if number > 1):
-        raise OptionError(f"{path}: two best responses to task {twice[0]}, expected one; remove the other")
+        raise OptionError(f"{path}: expected one best response to task {twice[0]}, found two; remove one of them")
     return card
 
 
 def best_responses(protocol: str | None = None) -> dict[str, BestResponse]:
-    """Return task id -> best response, of the tasks with one.
+    """Return the best responses by task id; tasks without a best response are missing.
 
     Args:
-        protocol: name of a protocol; there are none if they were measured under another one.
+        protocol: name of a protocol. The result is empty if the returns were measured under another protocol.
     """
     card = read_best_responses()
     if protocol not in (None, card.protocol):
@@ -123,7 +123,7 @@ def best_responses(protocol: str | None = None) -> dict[str, BestResponse]:
 
 
 def write_best_responses(path: Path, card: BestResponseCard) -> None:
-    """Write a file of best responses, one line per behaviour, returns rounded to three digits."""
+    """Write a file of best responses: one line per behaviour, with returns rounded to three digits."""
     content = msgspec.to_builtins(card)
     for behaviour in content["behaviours"]:
         behaviour["best"] = round(behaviour["best"], 3)

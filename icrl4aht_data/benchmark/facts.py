@@ -1,6 +1,6 @@
 """Constants of the benchmark: tracks, splits and their layouts, teammate families, episode lengths.
 
-The constants are those of the published benchmark. The functions also accept layouts and heuristic teammates
+The constants have the values of the published benchmark. The functions also accept layouts and heuristic teammates
 registered by other installed packages, see docs/extending.md.
 """
 
@@ -10,7 +10,7 @@ import hashlib
 from typing import Any
 
 from icrl4aht_data.errors import check_choice, unknown
-from icrl4aht_data.overcooked.layouts import further_layout_names
+from icrl4aht_data.overcooked.layouts import added_layout_names
 from icrl4aht_data.utils.plugins import Plugins
 
 _TEAMMATE_LAYOUTS = ("coord_simple", "coord_ring", "test_simple", "test_wide", "demo_simple", "demo_wide")
@@ -33,8 +33,8 @@ TRACKS: dict[str, dict[str, tuple[str, ...]]] = {
 """Short layout names of each track and split: track -> split -> layouts (paper, App. A)."""
 
 PREFERENCE = "preference"
-"""A track of this project, not of the paper: each task wants one dish, which no observation shows (see
-docs/preference.md)."""
+"""Track of this project, not of the paper: all episodes of a task want the same dish, but no observation shows which
+dish (see docs/preference.md)."""
 
 PREFERENCE_LAYOUTS: dict[str, tuple[str, ...]] = {
     "train": (
@@ -60,15 +60,16 @@ PREFERENCE_LAYOUTS: dict[str, tuple[str, ...]] = {
         "templates-0-194",
     ),
 }
-"""Layouts of the track `PREFERENCE`: those of training, validation and of half of the test tasks, and those of the
-other half. "plain": a published layout without indicators and buttons. The others are generated layouts without them,
-those among 90 on which the returns of the scripted searcher rise most with drawn training teammates."""
+"""Layouts of the track `PREFERENCE`. Training and validation tasks and half of the test tasks use the layouts "train",
+the other test tasks use the layouts "test". No layout has indicators or buttons. A name that ends in "_plain" is a
+published layout without them. The others are chosen from 90 generated layouts: on these, the returns of the scripted
+searcher rise most with randomly drawn training teammates."""
 
 PLAIN = "_plain"
-"""End of the name of a published layout without its indicators and buttons."""
+"""Suffix of the name of a published layout whose indicators and buttons were removed."""
 
 ALL_TRACKS = (*TRACKS, PREFERENCE)
-"""The benchmark's tracks and the project's own."""
+"""Names of the benchmark's tracks and of the track that this project adds."""
 
 TESTED_ON = {
     **{layout: layout for layout in _TEAMMATE_LAYOUTS},
@@ -81,12 +82,12 @@ LAYOUT_NAMES = tuple(dict.fromkeys(name for splits in TRACKS.values() for names 
 """Every layout of the benchmark, in the paper's order."""
 
 FOUR_RECIPES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
-"""Recipes of the published numbers on the layout track; a layout's own are the first and the last."""
+"""Recipes used for the published results on the layout track; the layouts themselves have the first and the last."""
 
-_OTHER_NUMBERS = 10_000  # number of possible `layout_number` values of registered layouts
+_OTHER_NUMBERS = 10_000  # how many values `layout_number` can take for registered layouts
 
 SPLITS = ("train", "validation", "test", "heldout")
-"""Splits of the tasks. Both of the following use training layouts: `validation`, for choosing models, has
+"""Splits of the tasks. `validation` and `heldout` use training layouts. `validation`, for choosing models, has
 heuristic teammates in neither `train` nor `test`; `heldout` has learned teammates not in `train` (paper, App. F)."""
 
 FAMILIES = ("rl", "H1", "H2", "H3", "H4")
@@ -110,16 +111,16 @@ TEAMMATE_PLUGINS = Plugins("icrl4aht.teammates", (*FAMILIES, *KIND_FAMILIES))
 """Heuristic teammates registered by other packages. Each is a separate family with the same name."""
 
 SOURCES = ("ppo", "noise", "agent", "search", "human")
-"""How histories are made. "ppo": an ego learns with PPO. "noise": a script plays, and its random actions become rarer
+"""Ways to make histories. "ppo": an ego learns with PPO. "noise": a script plays, and its random actions become rarer
 (noise distillation, Zisman et al. 2024). "agent": a trained agent plays, perhaps with random actions that become
 rarer. "search": a script finds out which dish its teammate wants. "human": a person plays. Releases may name other
 sources."""
 
 SCRIPTED_SOURCES = ("noise", "search")
-"""Sources of histories that a script plays; its actions without noise label them."""
+"""Sources of histories played by a script; the script's actions without noise are the expert actions."""
 
 LABEL_VIEWS = ("ego", "state")
-"""What the policy behind `expert_actions` could see: "ego", what an ego sees, or "state", the full state."""
+"""Input of the policy that chose `expert_actions`: "ego" for the ego's observation, "state" for the full state."""
 
 REBUILT_SOURCES = ("ppo", *SCRIPTED_SOURCES)
 """Sources of histories that `generate` can make without a trained agent."""
@@ -143,38 +144,39 @@ PAPER_TEAMMATES = 20
 """Training teammates of each algorithm and layout (paper, App. B.1)."""
 
 LEAST_HEADROOM = 5.0
-"""Least difference between a best response and `stay` with a teammate that is kept."""
+"""Minimum difference between the returns of a best response and of `stay`; teammates with less are left out."""
 
 SAME_BEHAVIOUR = 0.02
-"""Hamming distance below which two teammates count as one behaviour."""
+"""Hamming distance between the actions of two teammates below which they count as one behaviour."""
 
 
 def all_families() -> tuple[str, ...]:
-    """Return all families of teammates: the benchmark's, then registered ones."""
+    """Return all families of teammates: first those of the benchmark, then the registered ones."""
     return (*FAMILIES, *TEAMMATE_PLUGINS.names)
 
 
 def family_order(family: str) -> tuple[int, str]:
-    """Return the sort key of a family: the benchmark's families in order, then others by name."""
+    """Return the sort key of a family: the benchmark's families come first in its order, then others by name."""
     return (FAMILIES.index(family), "") if family in FAMILIES else (len(FAMILIES), family)
 
 
 def kind_family(kind: str) -> str | None:
-    """Return the family of a teammate kind; None for an unknown kind."""
+    """Return the teammate family that a teammate kind belongs to; None for an unknown kind."""
     return KIND_FAMILIES.get(kind) or (kind if kind in TEAMMATE_PLUGINS.names else None)
 
 
 def track_layouts(track: str, split: str) -> tuple[str, ...]:
-    """Return the short names of a track's layouts in a split; further ones are in every split of `layout`."""
+    """Return short names of a track's layouts in a split; registered and generated layouts belong to track `layout`."""
     if track == PREFERENCE:
         return PREFERENCE_LAYOUTS["train"] + (PREFERENCE_LAYOUTS["test"] if split == "test" else ())
-    return (*TRACKS[track][split], *(further_layout_names() if track == "layout" else ()))
+    return (*TRACKS[track][split], *(added_layout_names() if track == "layout" else ()))
 
 
 def track_of(layout: str) -> str:
     """Return the benchmark's track whose layouts include `layout` (short name).
 
-    A published layout without indicators counts like the published one, generated and registered layouts as "layout".
+    A published layout without indicators has the track of the published one; the track of generated and registered
+    layouts is "layout".
 
     Raises:
         UnknownNameError: if no track includes it.
@@ -183,20 +185,20 @@ def track_of(layout: str) -> str:
     for track, splits in TRACKS.items():
         if any(name in layouts for layouts in splits.values()):
             return track
-    if layout in (*further_layout_names(), *PREFERENCE_LAYOUTS["train"], *PREFERENCE_LAYOUTS["test"]):
+    if layout in (*added_layout_names(), *PREFERENCE_LAYOUTS["train"], *PREFERENCE_LAYOUTS["test"]):
         return "layout"
-    raise unknown("layout", layout, (*LAYOUT_NAMES, *further_layout_names()))
+    raise unknown("layout", layout, (*LAYOUT_NAMES, *added_layout_names()))
 
 
 def layout_order(layout: str) -> tuple[int, str]:
-    """Return the sort key of a layout (short name): the benchmark's layouts in order, then others by name."""
+    """Return the sort key of a layout (short name): the benchmark's come first in its order, then others by name."""
     return (LAYOUT_NAMES.index(layout), "") if layout in LAYOUT_NAMES else (len(LAYOUT_NAMES), layout)
 
 
 def layout_number(layout: str) -> int:
-    """Return the number of a layout (short name), for seeds: its position in `LAYOUT_NAMES`.
+    """Return the number of a layout (short name) to derive seeds from: its position in `LAYOUT_NAMES`.
 
-    The number of a registered layout is a hash of its name, so it does not depend on the packages installed.
+    A registered layout's number is a hash of its name, so the number does not depend on the installed packages.
     """
     if layout in LAYOUT_NAMES:
         return LAYOUT_NAMES.index(layout)
@@ -208,7 +210,7 @@ def check_family(family: object) -> None:
     """Check that a family of teammates exists.
 
     Raises:
-        UnknownNameError: lists the valid names and the nearest.
+        UnknownNameError: for an unknown family; the message lists the valid names and suggests the nearest.
     """
     if family not in FAMILIES and family not in (families := all_families()):
         raise unknown("teammate_family", family, families)
@@ -218,7 +220,7 @@ def check_membership(track: Any, split: Any, layout: Any) -> None:
     """Check that a layout (short name) belongs to a split of a track.
 
     Raises:
-        UnknownNameError: lists the valid names and the nearest.
+        UnknownNameError: if one of the names is wrong; the message lists the valid names and suggests the nearest.
     """
     check_choice("track", track, ALL_TRACKS)
     check_choice("split", split, SPLITS)

@@ -1,9 +1,9 @@
-"""A task: a layout, a teammate, a seed. One JSON line each in manifests and in a release's meta/tasks.jsonl.
+"""Tasks: a task is a layout, a teammate and a seed, stored as one JSON line of a manifest or of meta/tasks.jsonl.
 
     {"task_id": ..., "track": "teammate", "split": "train", "layout_name": "demo_cook_wide", "seed": 0,
      "teammate": {"kind": "heuristic", "family": "utility_greedy", "theta_id": 0, "base_seed": 0, "theta": {...}}}
 
-The id ends in a hash of the other fields, so a changed task has another id.
+A task's id ends in a hash of its other fields, so a changed task has another id.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _HASHED = ("kind", "family", "theta_id", "base_seed", "theta")
 
 @dataclass(frozen=True)
 class Task:
-    """One task.
+    """One task of the benchmark: a layout, a teammate and a seed.
 
     Args:
         task_id: name of the task, made from the other fields by `task_id`.
@@ -53,8 +53,8 @@ class Task:
         seed: seed of the ego's training.
         teammate: kind, family, theta_id, base_seed and theta. For kind "heuristic", theta contains the parameters; for
             kind "rl", the checkpoint's folder within its suite and the sha256 of its weights.
-        recipes: recipes that replace the layout's in this task, triples of ingredient ids; None for the layout's. With
-            a single one, all episodes of the task want the same dish.
+        recipes: recipes that replace the layout's recipes, as triples of ingredient ids; None keeps the layout's. With
+            a single recipe, all episodes of the task want the same dish.
     """
 
     task_id: str
@@ -67,33 +67,32 @@ class Task:
 
     @property
     def layout(self) -> Layout:
-        """The layout that is played, with the recipes of the task."""
+        """Layout of the task's environment, with the recipes of the task."""
         layout = get_layout(self.layout_name)
         return layout if self.recipes is None else with_recipes(layout, self.recipes)
 
     @property
     def teammate_key(self) -> tuple[str, str]:
-        """Key shared by all tasks with the same teammate on the same layout, such as tasks of another source: the
-        layout's name and a hash of the teammate."""
+        """Layout name and hash of the teammate: a key shared by all tasks with the same teammate on the same layout."""
         return self.layout.name, json_hash(self.teammate if self.recipes is None else [self.teammate, self.recipes])
 
     @property
     def teammate_kind(self) -> str:
-        """Field `teammate_kind` of the index: name of the heuristic or the algorithm."""
+        """Value of the index field `teammate_kind`: name of the heuristic or the algorithm."""
         return self.teammate["family"]
 
     @property
     def teammate_family(self) -> str:
-        """Field `teammate_family` of the index: rl, H1..H4, or the name of a registered heuristic."""
+        """Value of the index field `teammate_family`: rl, H1..H4, or the name of a registered heuristic."""
         return "rl" if self.teammate["kind"] == "rl" else HEURISTIC_KINDS.get(self.teammate_kind, self.teammate_kind)
 
 
 @dataclass(frozen=True)
 class NamedTask(Task):
-    """A task known only from index lines; its teammate has no parameters and its seed is -1.
+    """A task known only from index lines, so the teammate's parameters are unknown and the seed is -1.
 
     Args:
-        teammate: the line's teammate_kind and teammate_family.
+        teammate: the fields teammate_kind and teammate_family of the index line.
     """
 
     @property
@@ -106,7 +105,7 @@ class NamedTask(Task):
 
 
 def named_task(line: Mapping[str, Any]) -> NamedTask:
-    """Return the task of an index line with the paper's fields.
+    """Return the task named by an index line that has only the fields of the published format.
 
     Raises:
         UnknownNameError: for names that the benchmark does not know.
@@ -119,11 +118,11 @@ def named_task(line: Mapping[str, Any]) -> NamedTask:
 
 
 def teammate_id(teammate: Mapping[str, Any]) -> str:
-    """Return 16 hexadecimal digits, equal for teammates with the same kind and policy.
+    """Return an id of 16 hexadecimal digits, equal for teammates with the same kind and policy.
 
     Args:
-        teammate: kind and theta, as in a task. The numbers of a heuristic are compared in single precision, since some
-            manifests round them.
+        teammate: kind and theta, as in a task. A heuristic's numbers are rounded to single precision first, since
+            some manifests round them.
     """
     theta = teammate["theta"]
     if teammate["kind"] == "rl":
@@ -139,11 +138,11 @@ def make_task(
     seed: int,
     recipes: Sequence[Dish] | None = None,
 ) -> Task:
-    """Return a task with its id.
+    """Return the task with the given fields, and compute its id.
 
     Raises:
-        UnknownNameError: if the layout does not belong to that split of that track.
-        TaskFormatError: if the recipes are not different ones that the layout's piles allow.
+        UnknownNameError: if the layout does not belong to this split of the track.
+        TaskFormatError: if a recipe occurs twice, or needs an ingredient that the layout does not have.
     """
     known = get_layout(layout)
     check_membership(track, split, known.name)
@@ -154,10 +153,10 @@ def make_task(
 
 
 def task_id(task: Task) -> str:
-    """`{track}_{split}_{layout}_{family}_t{theta_id}_s{seed}_{hash8}`, as in the published manifests.
+    """Return a task's id: `{track}_{split}_{layout}_{family}_t{theta_id}_s{seed}_{hash8}`, as in published manifests.
 
-    hash8 is the first 8 hexadecimal digits of SHA-256 of `track:split:layout:<repr of the teammate>:seed`, followed by
-    `:` and the recipes, such as `000,001`, if the task has its own.
+    hash8 is the first 8 hexadecimal digits of the SHA-256 of `track:split:layout:<repr of the teammate>:seed`. If the
+    task replaces the layout's recipes, the hashed text also has `:` and the recipes at its end, such as `:000,001`.
     """
     teammate, where = task.teammate, (task.track, task.split, task.layout_name)
     spec = {name: teammate[name] for name in _HASHED if name in teammate}
@@ -172,9 +171,9 @@ def manifest_path(track: str, split: str, teammates: Literal["", "diverse"] = ""
     """Return the path of the bundled manifest of a track's tasks.
 
     Args:
-        track: the track.
+        track: name of the track, such as "teammate".
         split: "test" or "validation", or "train" for diverse teammates.
-        teammates: "diverse" for tasks with teammates that vary more than the published ranges, for training by playing.
+        teammates: "diverse" for training tasks whose teammates' parameters vary more than the published ranges.
 
     Raises:
         UnknownNameError: for an unknown track or split.
@@ -188,14 +187,14 @@ def read_tasks(path: Path) -> list[Task]:
     """Return the tasks of a JSONL file.
 
     Raises:
-        TaskFormatError: names the file and the line.
+        TaskFormatError: if a line is malformed or repeats a task id; the message names the file and the line.
     """
     tasks: dict[str, Task] = {}
     for number, line in enumerate(read_lines(path), start=1):
         try:
             task = parse_task(parse_json(line))
             if task.task_id in tasks:
-                raise TaskFormatError(f"duplicate task_id {task.task_id!r}")
+                raise TaskFormatError(f"task_id {task.task_id!r} occurs twice; remove one of the lines")
         except Icrl4ahtError as error:
             raise TaskFormatError(f"{path}, line {number}: {error}") from error
         tasks[task.task_id] = task
@@ -203,32 +202,32 @@ def read_tasks(path: Path) -> list[Task]:
 
 
 def write_tasks(path: Path, tasks: Iterable[Task]) -> None:
-    """Write one JSON line per task."""
+    """Write tasks to a JSONL file, one line per task."""
     path.write_text("".join(json.dumps(task_fields(task)) + "\n" for task in tasks), encoding="utf-8")
 
 
 def task_fields(task: Task) -> dict[str, Any]:
-    """Return the fields of a manifest line; `recipes` only if the task has its own."""
+    """Return the fields of a task's manifest line, without `recipes` if the task uses the layout's recipes."""
     fields = asdict(task)
     return fields if task.recipes is not None else {name: fields[name] for name in fields if name != "recipes"}
 
 
 class _RlTheta(msgspec.Struct, forbid_unknown_fields=True):
-    """Field theta of a learned teammate."""
+    """Fields of the entry `theta` of a learned teammate."""
 
     checkpoint: str
     sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
 
 
 class _Teammate(msgspec.Struct, forbid_unknown_fields=True):
-    """Field teammate of a task, see `Task`; manifests of the published code may have its agent slot, too."""
+    """Fields of a task's entry `teammate`; manifests of the published code may also have the agent's slot."""
 
     kind: Literal["heuristic", "rl"]
     family: str
     theta_id: Any
     base_seed: Any
     theta: dict[str, Any]
-    slot: Literal[1] = 1  # `actions.TEAMMATE`
+    slot: Literal[1] = 1  # the teammate's agent number, `actions.TEAMMATE`
 
 
 class _TaskFields(msgspec.Struct, forbid_unknown_fields=True):
@@ -242,7 +241,7 @@ class _TaskFields(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def parse_task(fields: Any) -> Task:
-    """Parse the fields of a manifest line as a task; the inverse of `task_fields`.
+    """Parse the fields of a manifest line as a task; this is the inverse of `task_fields`.
 
     Raises:
         TaskFormatError: for missing or unknown fields, or impossible values.
@@ -261,7 +260,7 @@ def _check_recipes(task: Task) -> None:
     """Check that the recipes of a task can be cooked on its layout.
 
     Raises:
-        TaskFormatError: if there is none, one twice or in another order of its pieces, or one without a pile.
+        TaskFormatError: if the recipes are empty, if two have the same ingredients, or if an ingredient has no pile.
     """
     if task.recipes is None:
         return
@@ -272,7 +271,7 @@ def _check_recipes(task: Task) -> None:
 
 
 def check_teammate(teammate: dict[str, Any]) -> None:
-    """Check the fields of a task's teammate entry; not the parameters of a heuristic.
+    """Check the fields of a task's teammate entry, except the parameters of a heuristic.
 
     Raises:
         TaskFormatError: for missing or unknown fields, or impossible values.
@@ -295,7 +294,7 @@ def _convert(fields: Any, kind: type[_S], where: str) -> _S:
     """Convert a JSON value to a struct.
 
     Raises:
-        TaskFormatError: if a field is missing, unknown or has an impossible value; with the place in the task's line.
+        TaskFormatError: if a field is missing, unknown or has an impossible value; the message names the field.
     """
     try:
         return msgspec.convert(fields, kind)

@@ -246,7 +246,7 @@ def _teammate(dataset: Dataset, history_id: int) -> str:
     """Return the family and kind of a history's teammate, with its number if the release has tasks."""
     entry = dataset.index.entry(history_id)
     name = f"{entry.teammate_family}/{entry.teammate_kind}"
-    return f"{name} t{dataset.recover_teammate(history_id)['theta_id']}" if dataset.knows_tasks else name
+    return f"{name} t{dataset.recover_teammate(history_id)['theta_id']}" if dataset.has_tasks else name
 
 
 def _release_name(dataset: Dataset) -> str:

@@ -17,7 +17,7 @@ from icrl4aht_data.benchmark.facts import SCRIPTED_SOURCES, kind_family
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.format.index import Index
-from icrl4aht_data.format.info import ReleaseInfo, describe, layout_statistics
+from icrl4aht_data.format.info import ReleaseInfo, layout_statistics, make_info
 from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask
 from icrl4aht_data.format.schema import HISTORIES, INFO, KINDS, PROVENANCE, TASKS, Entry
 from icrl4aht_data.utils.files import json_hash, parse_json, read_text, resolve_inside
@@ -108,7 +108,7 @@ def _check_info(index: Index, tasks: list[Task], provenance: ProvenanceByTask | 
     """Check the totals and statistics in meta/info.json against the index."""
     root, info, shards = index.root, index.info, index.values("shard")
     entries = list(index.entries)
-    described = describe(info.kind, info.data_version, info.environment.kept_steps, entries, info.format_version)
+    described = make_info(info.kind, info.data_version, info.environment.kept_steps, entries, info.format_version)
     described = replace(described, left_out=info.left_out)
     if info.shards.keys() != set(shards):
         report.add(INFO, f"shards: expected {sorted(shards)}, found {sorted(info.shards)}")

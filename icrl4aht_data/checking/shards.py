@@ -13,7 +13,7 @@ import numpy as np
 from icrl4aht_data.checking.report import Report
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, ShardCorruptError
 from icrl4aht_data.format import safe_hdf5
-from icrl4aht_data.format.chunks import BETWEEN, chunk_locations
+from icrl4aht_data.format.chunks import METADATA_ROW_BYTES, chunk_locations
 from icrl4aht_data.format.info import ReleaseInfo
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
@@ -31,7 +31,7 @@ from icrl4aht_data.overcooked.actions import ACTIONS, EGO
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.rules import step
-from icrl4aht_data.overcooked.state import columns, faults, start
+from icrl4aht_data.overcooked.state import columns, faults, start_record
 from icrl4aht_data.reading.history import History
 from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.system import free_memory
@@ -159,7 +159,7 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
         yield "a recipe is not one of the layout's"
     starts = states[np.concatenate([[0], np.flatnonzero(dones)[:-1] + 1])]
     positions = starts[:, columns(layout).positions]
-    fresh = start(layout, positions, starts[:, columns(layout).facings], starts[:, recipe])
+    fresh = start_record(layout, positions, starts[:, columns(layout).facings], starts[:, recipe])
     differs = (fresh != starts).any(axis=-1)
     for agent in (0, 1):
         differs |= ~np.isin(positions[:, agent], layout.rooms[agent])
@@ -177,7 +177,7 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
     ordered = np.sort(shard.table, order="offset")
     stops, starts = (ordered["offset"] + ordered["size"]).tolist(), ordered["offset"].tolist()
     size = shard.path.stat().st_size
-    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // BETWEEN  # the same rows as the writer makes
+    most = 2 * np.count_nonzero(ordered["rows"]) + 1 + size // METADATA_ROW_BYTES  # the same rows as the writer makes
     faults, between = [], np.flatnonzero(shard.table["rows"] == 0).tolist()
     if len(ordered) > most or [0, *stops] != [*starts, size]:
         faults, between = [f"the chunk table does not cover the file's {size} bytes, each once"], []
@@ -199,7 +199,7 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
 
 def _structure_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
     expected = {"format_version": shard.format_version, "layout": str}
-    if (found := safe_hdf5.attributes(file)) != expected:
+    if (found := safe_hdf5.read_attributes(file)) != expected:
         yield f"attributes: expected {expected}, found {found}"
     entries = list(shard.entries.values())
     groups = Counter(entry.h5_group for entry in entries)
@@ -207,7 +207,7 @@ def _structure_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
         yield f"groups: expected {sorted(groups)}, found {sorted(f'/{name}' for name in file)}"
         return
     for group, entry in {entry.h5_group: entry for entry in entries}.items():
-        names, stored = {field.name for field in entry.stored_fields(shard.kind)}, set(safe_hdf5.find(file, group))
+        names, stored = {field.name for field in entry.stored_fields(shard.kind)}, set(safe_hdf5.find_node(file, group))
         if stored != names:
             yield f"{group}: expected {sorted(names)}, found {sorted(stored)}"
             return
@@ -228,12 +228,12 @@ def _structure_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
 
 def _dataset_fault(shard: Shard, file: h5py.File, entry: Entry, field: Field, stacked: int) -> str | None:
     """Return a fault in the storage of a dataset in a group with `stacked` histories; None if there is none."""
-    dataset, rows = safe_hdf5.find(file, f"{entry.h5_group}/{field.name}"), entry.rows(field)
+    dataset, rows = safe_hdf5.find_node(file, f"{entry.h5_group}/{field.name}"), entry.rows(field)
     element = field.element(shard.layout, shard.kind)
     filters = [safe_hdf5.SHUFFLE] * (element.itemsize > 1) + [safe_hdf5.DEFLATE]
     chunk = min(field.chunk, rows)
     shapes = ((rows,), (chunk,)) if entry.h5_row is None else ((stacked, rows), (1, chunk))
-    found = safe_hdf5.filters(dataset), dataset.dtype, dataset.shape, dataset.chunks
+    found = safe_hdf5.filter_ids(dataset), dataset.dtype, dataset.shape, dataset.chunks
     if found == (filters, element, *shapes):
         return None
     return f"{dataset.name}: expected filters, type, shape and chunks {(filters, element, *shapes)}, found {found}"

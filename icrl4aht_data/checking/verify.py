@@ -119,7 +119,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         if PROVENANCE not in report.files_at_fault:
             report.add(PROVENANCE, str(error))
     made = provenance or ProvenanceByTask()
-    played = [one for task in tasks for one in made.of(task.task_id).played(task)]
+    played = [one for task in tasks for one in made.of(task.task_id).played_tasks(task)]
     check_references(listed, index, played, provenance, report)
     if report.level == "deep":
         report.notes += _unchecked_values(index, made)

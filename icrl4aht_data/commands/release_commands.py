@@ -127,7 +127,7 @@ def show(
     else:
         dataset = dataset.select([history_id])
         facts = dataset[0].entry.to_json() | {"environment": dataset.environment_parameters(history_id)}
-        if dataset.knows_tasks:
+        if dataset.has_tasks:
             facts["teammate"] = dataset.recover_teammate(history_id)
     if plot is not None:
         plot_learning_curves(dataset, plot)

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.fetch import Remote
-from icrl4aht_data.format.info import describe
+from icrl4aht_data.format.info import make_info
 from icrl4aht_data.format.schema import FIELDS, Entry
 from icrl4aht_data.reading.history import LABELS
 from icrl4aht_data.utils.groups import grouped
@@ -129,7 +129,7 @@ def tab_separated(rows: Iterable[Iterable[Any]]) -> str:
 def summarize_selection(dataset: Dataset) -> dict[str, Any]:
     """Return a JSON object with the location, kind, versions and counts of a selection."""
     info, origin = dataset.info, dataset.origin
-    content = describe(
+    content = make_info(
         info.kind, info.data_version, info.environment.kept_steps, dataset.entries, info.format_version
     ).to_json()
     return {

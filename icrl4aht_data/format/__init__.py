@@ -1,1 +1,1 @@
-"""The release folder's format: fields, index, chunk tables, manifest, provenance, checkpoints."""
+"""Format of release folders: fields, index, chunk tables, manifest, provenance, checkpoints."""

@@ -1,7 +1,7 @@
 """Cache of arrays as .npy files, shared by processes and limited in size.
 
-A set of arrays is a folder whose name contains a hash of its inputs. The folder is written under a temporary name and
-renamed when complete. Only sizes and headers are checked when it is read: delete the cache after a disk failure.
+A set of arrays is a folder named by a hash of the set's inputs. The folder is written under a temporary name and
+renamed when complete. Reading checks only sizes and headers, so delete the cache folder after a disk failure.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from icrl4aht_data.errors import CacheError, Icrl4ahtError, OptionError
 from icrl4aht_data.utils.files import NO_ROOM, add_filename, allocate, describe_disk
 from icrl4aht_data.utils.system import CACHE_VARIABLE, cache_folder, cache_limit
 
-_CONTENTS = "contents.json"  # name -> [dtype, shape] of every array
-_KEY = re.compile(r"[a-z]+-[0-9a-f]{32,64}")  # only folders that match are evicted
-_ABANDONED = 24 * 3600  # seconds after which an unfinished set counts as left by a killed process
+_CONTENTS = "contents.json"  # lists dtype and shape of every array by name
+_KEY = re.compile(r"[a-z]+-[0-9a-f]{32,64}")  # only folders with such a name are removed to free space
+_ABANDONED = 24 * 3600  # seconds after which an unfinished set is removed as left by a killed process
 
 Arrays = dict[str, np.ndarray]
 
 
-def cache_room() -> int:
+def cacheable_bytes() -> int:
     """Return the maximum size in bytes of a new set of arrays; 0 if the cache folder is not writable."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):  # permissions alone do not show whether a folder is writable
+        with tempfile.TemporaryFile(dir=folder):  # a read-only disk is not visible in the folder's permissions
             pass
         reusable = sum(size for _, size in _cached_sets(folder))
         return min(cache_limit(), shutil.disk_usage(folder).free + reusable)
@@ -44,18 +44,18 @@ def cache_room() -> int:
 
 
 def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
-    """Return the cached arrays of a key, memory-mapped and read-only; build them first if needed.
+    """Return the cached arrays of a key, memory-mapped and read-only; build missing arrays first.
 
-    Removes the least recently used sets if the cache would exceed its limit or fill the disk. Processes that have
-    mapped a removed set can still read it.
+    The least recently used sets are removed if the cache would exceed its limit or fill the disk. Processes that have
+    mapped a removed set can still read the set.
 
     Args:
-        key: identifies the content; a file name of the form `<letters>-<hash>`.
+        key: name of the set, of the form `<letters>-<hash>`, with a hash of everything that determines the content.
         size: approximate size of the arrays in bytes.
-        build: called with a new folder, into which it writes `<name>.npy` files.
+        build: function of a new folder that writes the arrays to this folder as `<name>.npy` files.
 
     Raises:
-        OptionError: if the arrays alone exceed the limit.
+        OptionError: if the arrays are larger than the limit of the cache.
         CacheError: if the folder is not writable or the disk is full; unfinished files are removed.
     """
     assert _KEY.fullmatch(key), key
@@ -65,8 +65,8 @@ def cached_arrays(key: str, size: int, build: Callable[[Path], None]) -> Arrays:
         return arrays
     if size > cache_limit():
         raise OptionError(
-            f"{folder.parent}: the arrays have {size:,} bytes, the cache may hold {cache_limit():,}: raise "
-            f'ICRL4AHT_CACHE_BYTES, select fewer histories, or take cache="stream"'
+            f"{folder.parent}: the arrays have {size:,} bytes, but the cache may have {cache_limit():,}: raise "
+            f'ICRL4AHT_CACHE_BYTES, select fewer histories, or use cache="stream"'
         )
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -83,7 +83,7 @@ def new_mapped_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.
     """Create a .npy file with its disk space allocated, and return it as a writable memory map of zeros.
 
     Raises:
-        OSError: if the disk is full or not writable; names the file.
+        OSError: if the disk is full or not writable; the error names the file.
     """
     header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     with add_filename(path), path.open("wb") as stream:
@@ -93,9 +93,9 @@ def new_mapped_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.
 
 
 def _open(folder: Path) -> Arrays | None:
-    """Return the arrays of a folder and mark it as used; None if it is missing or a size or header is wrong."""
+    """Return the arrays of a folder, and mark the folder as used; None if a file is missing, cut off or damaged."""
     arrays = {}
-    if not all(path.is_file() for path in (folder / _CONTENTS, *folder.glob("*.npy"))):  # opening a pipe would hang
+    if not all(path.is_file() for path in (folder / _CONTENTS, *folder.glob("*.npy"))):  # opening a FIFO would hang
         return None
     try:
         for name, described in json.loads((folder / _CONTENTS).read_text(encoding="utf-8")).items():
@@ -106,7 +106,7 @@ def _open(folder: Path) -> Arrays | None:
             arrays[name] = np.asarray(array)
     except (OSError, ValueError, AttributeError):
         return None
-    with suppress(OSError):  # the folder belongs to another user or was just removed; the mapping stays valid
+    with suppress(OSError):  # if the folder is another user's or was just removed, the arrays are still readable
         os.utime(folder)
     return arrays
 
@@ -116,7 +116,7 @@ def _describe(array: np.ndarray) -> list:
 
 
 def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> Arrays:
-    """Build a set of arrays in `scratch`, rename it unless another process was faster, and return the arrays."""
+    """Build a set of arrays in `scratch`, move the set to `folder` unless another process was faster, and return it."""
     new = scratch / "new"
     new.mkdir()
     build(new)
@@ -127,9 +127,9 @@ def _build(folder: Path, scratch: Path, build: Callable[[Path], None]) -> Arrays
         arrays = _open(folder)
         if arrays is not None:
             return arrays
-        with suppress(OSError):  # a damaged set, or another file or folder of that name
+        with suppress(OSError):  # moves away a damaged set, or another file or folder with this name
             folder.rename(scratch / "damaged")
-        with suppress(OSError):  # another process has just renamed its own set
+        with suppress(OSError):  # fails if another process has just moved a set to this folder
             new.rename(folder)
     raise CacheError(f"{folder}: arrays just written cannot be read: check the disk")
 
@@ -143,26 +143,26 @@ def _unusable(folder: Path, size: int, error: OSError) -> CacheError:
         reason = f"cannot be used: {error.strerror or error} ({error.filename}); check its permissions and content"
     return CacheError(
         f"{folder}: the cache folder {reason}, set {CACHE_VARIABLE} to another folder, or "
-        f'take cache="ram" or cache="stream"'
+        f'use cache="ram" or cache="stream"'
     )
 
 
 def _cached_sets(folder: Path) -> list[tuple[Path, int]]:
-    """Return the finished sets and their bytes, the least recently used first."""
+    """Return paths and sizes in bytes of the finished sets of arrays, the least recently used set first."""
     found = []
     for path in folder.iterdir():
         if _KEY.fullmatch(path.name) and path.is_dir():
-            with suppress(OSError):  # just removed by another process
+            with suppress(OSError):  # fails if another process has just removed the set
                 size = sum(file.stat().st_size for file in path.glob("*.npy"))
                 found.append((path.stat().st_mtime_ns, path, size))
     return [(path, size) for _, path, size in sorted(found)]
 
 
 def _make_room(folder: Path, size: int) -> None:
-    """Remove files of killed processes, then the least recently used sets until `size` more bytes fit.
+    """Remove files left by killed processes, then the least recently used sets until `size` more bytes fit.
 
     Raises:
-        OSError: if the disk has too little space even after that.
+        OSError: if the disk has too little space even without any cached set.
     """
     for left in folder.glob(".*.partial-*"):
         with suppress(OSError):
@@ -177,5 +177,5 @@ def _make_room(folder: Path, size: int) -> None:
         if excess <= 0:
             return
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.partial-", dir=folder) as scratch, suppress(OSError):
-            path.rename(Path(scratch) / "removed")  # renaming is atomic: no process opens a partly removed set
+            path.rename(Path(scratch) / "removed")  # a rename is atomic, so no process opens a partly removed set
             excess -= bytes_

@@ -15,11 +15,11 @@ CHECKPOINT_BYTES = 64 * 2**20
 
 
 def checkpoint_folder(folder: Path, teammate: Mapping[str, Any]) -> Path:
-    """Return the checkpoint folder of a learned teammate; named by hash in a release, by path in a suite.
+    """Return the checkpoint folder of a learned teammate, which a release names by hash and a suite by path.
 
     Args:
-        folder: TEAMMATES of a release, or a suite.
-        teammate: the task's entry, of kind "rl".
+        folder: the folder `TEAMMATES` of a release, or the folder of a suite.
+        teammate: the task's entry `teammate`, of kind "rl".
     """
     theta = teammate["theta"]
     return folder / (theta["sha256"] if (folder / theta["sha256"]).is_dir() else theta["checkpoint"])
@@ -29,12 +29,12 @@ def checkpoint_files(folder: Path, task: Task, root: Path | None = None) -> dict
     """Return the checkpoint files of a task's learned teammate.
 
     Args:
-        folder: see `checkpoint_folder`.
+        folder: the folder `TEAMMATES` of a release, or the folder of a suite.
         task: the task; a heuristic teammate has no files.
-        root: the release that the folder is in; symbolic links must not lead out of it.
+        root: the release folder that contains `folder`; symbolic links must not lead out of the release.
 
     Returns:
-        Path in a release -> file; empty if the folder has no checkpoint.
+        Files by path in a release; empty if the folder has no checkpoint.
 
     Raises:
         UnsafePathError: if a file is outside the release.
@@ -55,12 +55,12 @@ def expert_files(folder: Path, sha256: str, root: Path | None = None) -> dict[st
     """Return the checkpoint files of the ego whose policy labelled a task's histories with expert actions.
 
     Args:
-        folder: the checkpoint's folder, in a release `expert_folder`.
-        sha256: SHA-256 of its weights.
-        root: the release that the folder is in; symbolic links must not lead out of it.
+        folder: folder of the checkpoint; in a release, this is `expert_folder`.
+        sha256: SHA-256 of the policy's weights.
+        root: the release folder that contains `folder`; symbolic links must not lead out of the release.
 
     Returns:
-        Path in a release -> file; empty if there is no checkpoint.
+        Files by path in a release; empty if the folder has no checkpoint.
 
     Raises:
         UnsafePathError: if a file is outside the release.

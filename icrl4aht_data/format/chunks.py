@@ -1,6 +1,6 @@
-"""Chunk tables, which locate a shard's chunks, and the encoding of chunks.
+"""Chunk tables, which locate a shard's chunks, and the encoding and decoding of chunks.
 
-A shard is an HDF5 file, but is read without libhdf5: the chunk table has the position, size and hash of every chunk,
+A shard is an HDF5 file but is read without libhdf5: the chunk table has the position, size and hash of every chunk,
 and this module reverses HDF5's shuffle and deflate filters.
 """
 
@@ -18,10 +18,10 @@ from icrl4aht_data.errors import ChunkTableError
 from icrl4aht_data.format.schema import CHUNK_DTYPE, Entry, Kind
 
 if TYPE_CHECKING:
-    import h5py  # takes 50 ms to import, and reading does not need it
+    import h5py  # only for type hints: the import takes 50 ms, and reading does not need h5py
 
-BETWEEN = 2048
-"""Maximum bytes of HDF5 metadata per row of the chunk table, fetched again as one piece if damaged."""
+METADATA_ROW_BYTES = 2048
+"""Maximum bytes of HDF5 metadata per row of the chunk table; a damaged row is fetched again as one piece."""
 
 DEFLATE_RATIO = 1100
 """Upper bound of the compression ratio of deflate."""
@@ -29,22 +29,22 @@ DEFLATE_RATIO = 1100
 DEFLATE_LEVEL = 8
 """Compression level of chunks."""
 
-_POSITION = struct.Struct("<QIII")  # the start of a row; its hash follows
-_TABLE_BYTES = 256 * 2**20  # a thousand times the size of a usual chunk table
-_ROW_BYTES = 16 * 2**20  # maximum bytes of a stored chunk, thirty times our largest one
+_POSITION = struct.Struct("<QIII")  # the fields offset, size, rows and crc32, which precede the hash in a row
+_TABLE_BYTES = 256 * 2**20  # maximum size of a chunk table, a thousand times the usual size
+_ROW_BYTES = 16 * 2**20  # maximum bytes of a stored chunk, thirty times the largest chunk of our releases
 
 
 def chunk_table_name(shard: str) -> str:
     """Return the path of a shard's chunk table, relative to the release folder.
 
     Args:
-        shard: path in the release, `data/...h5`.
+        shard: path of the shard in the release, such as `data/teammate/coord_simple/train-00000-of-00001.h5`.
     """
     return f"meta/chunks/{shard.removeprefix('data/').removesuffix('.h5')}.npy"
 
 
 def read_table(path: Path) -> np.ndarray:
-    """Return a chunk table (rows,) of `CHUNK_DTYPE`, memory-mapped because it may be large.
+    """Return a chunk table (rows,) of `CHUNK_DTYPE`, memory-mapped because a table may be large.
 
     Raises:
         ChunkTableError: if the file is missing or not a chunk table.
@@ -52,9 +52,9 @@ def read_table(path: Path) -> np.ndarray:
     try:
         if path.stat().st_size > _TABLE_BYTES:
             raise ValueError(f"more than {_TABLE_BYTES:,} bytes")
-        table = np.lib.format.open_memmap(path, mode="r")  # unlike `np.load` it rejects archives
+        table = np.lib.format.open_memmap(path, mode="r")  # rejects archives, which `np.load` opens
     except FileNotFoundError as error:
-        raise ChunkTableError(f"{path}: the chunk table is missing") from error
+        raise ChunkTableError(f"{path}: the chunk table is missing; fetch the release again") from error
     except Exception as error:  # NumPy's parser raises errors of any type for a damaged header
         raise ChunkTableError(f"{path}: not a chunk table: {error!r}") from error
     if table.dtype != CHUNK_DTYPE or table.ndim != 1:
@@ -65,7 +65,7 @@ def read_table(path: Path) -> np.ndarray:
 
 
 def chunk_locations(file: h5py.File, kind: Kind, entry: Entry) -> list[tuple[int, int, int]]:
-    """Return (offset, size, rows) of each chunk of a history as HDF5 reports it, in the order of the chunk table."""
+    """Return (offset, size, rows) of each chunk of a history, as reported by HDF5, in the order of the chunk table."""
     locations = []
     for field in entry.stored_fields(kind):
         dataset: Any = file[f"{entry.h5_group}/{field.name}"]
@@ -85,13 +85,13 @@ def check_chunk(data: bytes, row: np.void) -> None:
     """Check the size, CRC-32 and hash of a stored chunk against its row in the chunk table.
 
     Args:
-        data: the bytes at `row["offset"]` in the shard.
-        row: a row of `CHUNK_DTYPE`.
+        data: the bytes stored at `row["offset"]` in the shard.
+        row: row of the chunk table, of `CHUNK_DTYPE`.
 
     Raises:
-        ValueError: if the size, CRC-32 or hash differs; with the expected and the found value.
+        ValueError: if the size, CRC-32 or hash differs; the message has the expected and the found value.
     """
-    stored = row.tobytes()  # twice as fast as access by field names
+    stored = row.tobytes()  # unpacking bytes is twice as fast as access by field names
     _, size, _, crc32 = _POSITION.unpack_from(stored)
     if len(data) != size:
         raise ValueError(f"expected {size} bytes, found {len(data)}")
@@ -105,26 +105,26 @@ def encode_chunk(rows: np.ndarray, length: int, itemsize: int) -> bytes:
     """Encode a chunk with HDF5's shuffle and deflate filters.
 
     Args:
-        rows: the chunk's rows, C-contiguous; padded with zeros if fewer than `length`.
-        length: rows of the chunk.
-        itemsize: bytes of one element.
+        rows: the chunk's rows, C-contiguous; fewer than `length` rows are padded with zeros.
+        length: number of rows of a full chunk.
+        itemsize: number of bytes of one element.
     """
     raw = rows.tobytes().ljust(length * (rows.nbytes // max(len(rows), 1)), b"\0")
     if itemsize > 1:
         raw = np.frombuffer(raw, np.uint8).reshape(-1, itemsize).T.tobytes()
-    # Short matches among actions, which are drawn at random, cost more than they save.
+    # Actions look random, so Z_FILTERED, which skips short matches, compresses them better.
     strategy = zlib.Z_FILTERED if rows.ndim == 1 else zlib.Z_DEFAULT_STRATEGY
     deflater = zlib.compressobj(DEFLATE_LEVEL, strategy=strategy)
     return deflater.compress(raw) + deflater.flush()
 
 
 def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
-    """Decode a stored chunk: inflate it and reverse the shuffle filter.
+    """Decode a stored chunk: inflate the bytes and reverse the shuffle filter.
 
     Args:
-        data: stored bytes.
-        size: expected bytes after inflating.
-        itemsize: bytes of one element; 1 where the shuffle filter was not used.
+        data: the stored bytes.
+        size: expected number of bytes after inflating.
+        itemsize: number of bytes of one element; 1 if the shuffle filter was not used.
 
     Raises:
         ValueError: if the data does not inflate to exactly `size` bytes, or continues after the end of the stream.
@@ -136,8 +136,8 @@ def decode_chunk(data: bytes, size: int, itemsize: int) -> bytes:
         raise ValueError(str(error)) from error
     if len(raw) != size or inflater.decompress(inflater.unconsumed_tail, 1) or not inflater.eof:
         raise ValueError(f"does not inflate to {size} bytes")
-    if inflater.unused_data:  # extra bytes could be chosen to forge the checksum
-        raise ValueError(f"{len(inflater.unused_data)} bytes after the end of the deflate stream")
+    if inflater.unused_data:  # an attacker could choose extra bytes that give the expected checksum
+        raise ValueError(f"expected no bytes after the deflate stream, found {len(inflater.unused_data)}")
     if itemsize > 1:
         raw = np.frombuffer(raw, np.uint8).reshape(itemsize, -1).T.tobytes()
     return raw

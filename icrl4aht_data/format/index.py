@@ -1,6 +1,6 @@
 """Reading and querying the index of a release: meta/info.json and meta/histories.jsonl.
 
-The lines of histories are decoded and checked block by block, as columns: 82,000 lines take less than a second.
+The lines of histories.jsonl are decoded and checked in blocks and stored as columns: 82,000 lines take under a second.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from icrl4aht_data.errors import (
     unknown,
 )
 from icrl4aht_data.format.info import ReleaseInfo, read_info
-from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_layouts_carried, read_layouts
-from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, check_name, encode
+from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_layouts_stored, read_layouts
+from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, as_json, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.files import LARGEST, plain_size, read_lines, resolve_inside, wrap_read_errors
@@ -48,12 +48,12 @@ from icrl4aht_data.utils.text import counted_histories, listed_names
 QUERY_FIELDS = ("layout", "split", "track", "teammate_family", "teammate_kind", "task_id", "source", "label_view")
 """Entry fields that histories can be filtered by."""
 
-_BLOCK = 2**12  # entries in memory at a time
+_BLOCK = 2**12  # number of entries in memory at a time
 
-_DERIVED = ("history_id", "obs_shape")  # checked but not stored, since the row number and the layout determine them
+_DERIVED = ("history_id", "obs_shape")  # fields not stored in columns: the row and the layout determine their values
 _DTYPES = {int: np.int64, bool: np.bool_, float: np.float64, int | None: np.int64, float | None: np.float64}
 _NUMBERS = {name: _DTYPES[hint] for name, hint in ENTRY_HINTS.items() if hint in _DTYPES and name not in _DERIVED}
-_ABSENT = {name: -1 for name, hint in ENTRY_HINTS.items() if hint == int | None}  # what a column has for None
+_ABSENT = {name: -1 for name, hint in ENTRY_HINTS.items() if hint == int | None}  # stands for None in a column
 _ABSENT |= {name: np.nan for name, hint in ENTRY_HINTS.items() if hint == float | None}
 _STRINGS = tuple(name for name, hint in ENTRY_HINTS.items() if hint in TEXTS or name in ENCODED)
 _ABSENT |= {name: "" for name in _STRINGS if ENTRY_HINTS[name] is not str}
@@ -61,14 +61,14 @@ _names = attrgetter(*_STRINGS)
 
 
 class Columns:
-    """Index of a release as columns with one row per history; iteration and positions give `Entry`s, made on access.
+    """Index of a release as columns with one row per history; indexing and iteration create an `Entry` per row.
 
     A string column has int32 codes of its distinct values. None is stored as -1 in integer columns, as NaN in float
     columns and as "" in string columns. Fields in `schema.ENCODED` are string columns of JSON text.
 
     Args:
-        arrays: every column by name.
-        values: the distinct values of each string column, in the order of their codes.
+        arrays: all columns by name.
+        values: distinct values of each string column, in the order of their codes.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], values: dict[str, list[str]]) -> None:
@@ -78,7 +78,7 @@ class Columns:
         return len(self._arrays["T"])
 
     def column(self, name: str) -> np.ndarray:
-        """Return a column (H,): the values of a number column, the codes of a string column."""
+        """Return a column (H,): values for a number column, codes for a string column."""
         return self._arrays[name]
 
     def values(self, name: str) -> list[str]:
@@ -86,7 +86,7 @@ class Columns:
         return self._values[name]
 
     def matches(self, name: str, wanted: Collection[str]) -> np.ndarray:
-        """Return bool (H,), True for histories with one of the wanted values in a string column."""
+        """Return bool (H,), True for histories with any of the wanted values in a string column."""
         return np.isin(self._arrays[name], [code for code, value in enumerate(self.values(name)) if value in wanted])
 
     def __iter__(self) -> Iterator[Entry]:
@@ -108,11 +108,11 @@ def read_columns(path: Path) -> Columns:
     """Return the columns of an index file.
 
     Raises:
-        IndexFormatError: if a line is malformed; with the file and the line number.
+        IndexFormatError: if a line is malformed; the message has the file and the line number.
     """
     with wrap_read_errors(path):
         plain_size(path, LARGEST)
-    # A new value gets the next code when it is looked up.
+    # The default of these dictionaries gives each new value the next code.
     codes = {name: defaultdict[str, int](count().__next__) for name in _STRINGS}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}
     entries = _entries(path)
@@ -120,7 +120,7 @@ def read_columns(path: Path) -> Columns:
         columns = zip(*map(msgspec.structs.astuple, block), strict=True)
         values: dict[str, Sequence[Any]] = dict(zip(ENTRY_HINTS, columns, strict=True))
         for name in ENCODED:
-            values[name] = [encode(value) for value in values[name]]
+            values[name] = [as_json(value) for value in values[name]]
         for name, absent in _ABSENT.items():
             values[name] = [absent if value is None else value for value in values[name]]
         for name, dtype in _NUMBERS.items():
@@ -134,35 +134,35 @@ def read_columns(path: Path) -> Columns:
 
 
 def _entries(path: Path) -> Iterator[Entry]:
-    """Yield the entries of an index file, each checked."""
+    """Yield the entries of an index file after checking each."""
     decoder, checked = msgspec.json.Decoder(Entry), set[tuple[Any, ...]]()
     for number, line in enumerate(read_lines(path)):
         try:
             entry = decoder.decode(line)
-            _check(entry, number, checked)
+            _check_entry(entry, number, checked)
         except (msgspec.MsgspecError, Icrl4ahtError) as error:
             raise IndexFormatError(f"{path}, line {number + 1}: {error}") from error
         yield entry
 
 
-def _check(entry: Entry, number: int, checked: set[tuple[Any, ...]]) -> None:
-    """Check that the fields of an entry agree and that its names are printable.
+def _check_entry(entry: Entry, number: int, checked: set[tuple[Any, ...]]) -> None:
+    """Check that the fields of an entry are consistent and that its names are printable.
 
     Args:
         entry: an entry with valid types and bounds.
-        number: the number of its line, counted from 0.
-        checked: combinations of names and shapes that were found valid, to which this one is added; the histories of a
-            task agree in them.
+        number: number of the entry's line, counted from 0.
+        checked: valid combinations of names and shapes found so far; the entry's combination is added. The histories
+            of a task share one combination, which is checked once.
 
     Raises:
-        IndexFormatError, UnknownNameError: without file and line, which the caller adds.
+        IndexFormatError, UnknownNameError: if a value is wrong; the caller adds the file and the line to the message.
     """
     if entry.history_id != number:
-        raise IndexFormatError(f"history_id {entry.history_id}: ids count up from 0, expected {number}")
+        raise IndexFormatError(f"expected history_id {number}, since ids count up from 0, found {entry.history_id}")
     if entry.action_dim != len(ACTIONS):
         raise IndexFormatError(f"expected action_dim {len(ACTIONS)}, found {entry.action_dim}")
     if entry.episodes > entry.T:
-        raise IndexFormatError(f"{entry.episodes} episodes in {entry.T} steps")
+        raise IndexFormatError(f"expected at most one episode per step, found {entry.episodes} in {entry.T} steps")
     key = *_names(entry), entry.obs_shape
     if key in checked:
         return
@@ -174,17 +174,17 @@ def _check(entry: Entry, number: int, checked: set[tuple[Any, ...]]) -> None:
     check_family(entry.teammate_family)
     expected = get_layout(entry.layout).obs_shape
     if entry.obs_shape != expected:
-        raise IndexFormatError(f"obs_shape {list(entry.obs_shape)}, expected {list(expected)} for {entry.layout}")
+        raise IndexFormatError(f"expected obs_shape {list(expected)} for {entry.layout}, found {list(entry.obs_shape)}")
     folder = f"data/{entry.track}/{entry.layout}/{entry.split}"
     if not re.fullmatch(rf"{folder}-[0-9]{{5}}-of-[0-9]{{5}}\.h5", entry.shard):
         raise IndexFormatError(f"shard {entry.shard!r}: expected {folder}-NNNNN-of-NNNNN.h5")
 
 
 ALIASES = {"algorithm": "teammate_kind"}
-"""Other names of filters: the kind of a learned teammate is its training algorithm."""
+"""Alternative names of filters: the kind of a learned teammate is the algorithm that trained the teammate."""
 
 LAYOUT_FAMILY = "layout_family"
-"""Filter by the family of the layout: "published", or one of those that the release carries."""
+"""Name of the filter by layout family: "published", or a family of layouts that the release stores."""
 
 _KNOWN_VALUES: dict[str, Callable[[], Sequence[str]]] = {
     "split": lambda: SPLITS,
@@ -202,8 +202,8 @@ class Index:
     Args:
         root: the release folder.
         info: content of meta/info.json.
-        entries: the histories; a history's id is its position in this sequence.
-        layouts: the layouts that the release carries.
+        entries: entries of the histories; a history's id is its position in this sequence.
+        layouts: the layouts that the release stores because the benchmark does not have them.
     """
 
     root: Path
@@ -215,7 +215,7 @@ class Index:
         return f"Index({counted_histories(len(self.entries))} at {self.root})"
 
     def entry(self, history_id: int) -> Entry:
-        """Return the entry of one history.
+        """Return the index entry of one history.
 
         Raises:
             UnknownNameError: if no history has this id.
@@ -234,11 +234,11 @@ class Index:
         """Return the ids of the histories with the wanted field values, int64 (N,), ascending.
 
         Args:
-            wanted: field of `QUERY_FIELDS` or `ALIASES` -> one value or several; None accepts any.
+            wanted: a value or a sequence of values for fields in `QUERY_FIELDS` or `ALIASES`; None accepts any value.
 
         Raises:
-            UnknownNameError: if a field or value does not exist in the benchmark; lists the valid ones.
-            EmptySelectionError: if no history of this release has these values; lists what exists.
+            UnknownNameError: if a field or value does not exist in the benchmark; the message lists the valid names.
+            EmptySelectionError: if no history of this release has these values; the message lists existing values.
             OptionError: if a value is a mapping.
         """
         filters = {name: value for name, value in wanted.items() if value is not None}
@@ -251,7 +251,7 @@ class Index:
                 raise OptionError(f"{given} = {value!r}: expected a name or a sequence of names")
             names = [value] if isinstance(value, str) or not isinstance(value, Iterable) else value
             if name == LAYOUT_FAMILY:
-                name, names = "layout", self._of_families(names)
+                name, names = "layout", self._family_layouts(names)
             matching &= self.entries.matches(name, {self._known_value(name, one, given) for one in names})
         if not matching.any():
             what = ", ".join(f"{name}={value!r}" for name, value in filters.items()) or "any"
@@ -261,25 +261,25 @@ class Index:
             raise EmptySelectionError(f"{self.root}: no history has {what}. This release has {found}")
         return np.flatnonzero(matching)
 
-    def _of_families(self, families: Iterable[str]) -> list[str]:
-        """Return the layouts of the release that belong to families."""
+    def _family_layouts(self, families: Iterable[str]) -> list[str]:
+        """Return the layouts of the release that belong to any of the families."""
         by_family = {PUBLISHED: []} | grouped(self.values("layout"), self.layouts.family)
         for family in families:
             check_choice(LAYOUT_FAMILY, family, by_family)
         return [layout for family in families for layout in by_family[family]]
 
     def _known_value(self, name: str, value: str, given: str) -> str:
-        """Return a valid value of a field, for a layout its name; the release may not have the value.
+        """Check that a value of a field exists in the benchmark, and return it; for a layout, return its short name.
 
         Args:
-            name: the field, one of `QUERY_FIELDS`.
-            value: the wanted value.
+            name: name of the field, one of `QUERY_FIELDS`.
+            value: the wanted value, which the release may not have.
             given: name of the field in messages.
         """
         if name == "layout":
             return get_layout(str(value)).name
         if value in (own := [one for one in self.values(name) if one]):
-            return value  # without reading which other packages are installed
+            return value  # saves time, since `all_families` searches the installed packages
         known = (*_KNOWN_VALUES.get(name, tuple)(), *own)
         check_choice(given, value, known)
         return value
@@ -291,7 +291,7 @@ def read_index(root: Path) -> Index:
     Raises:
         RootNotFoundError: if the folder is not a release.
         FormatTooNewError, FormatTooOldError: if the release has another format version.
-        IndexFormatError: if a file is malformed; with the file and the line number.
+        IndexFormatError: if a file is malformed; the message has the file and the line number.
     """
     info, layouts = read_info(root), read_layouts(root)
     path = resolve_inside(root, HISTORIES)
@@ -303,6 +303,6 @@ def read_index(root: Path) -> Index:
         raise IndexFormatError(
             f"{path}, line {without[0] + 1}: expected has_teammate_actions true in a {info.kind} release"
         )
-    check_layouts_carried(entries.values("layout"), layouts, path)
-    check_layouts_carried((get_layout(task.layout).name for task in info.left_out), layouts, root / INFO)
+    check_layouts_stored(entries.values("layout"), layouts, path)
+    check_layouts_stored((get_layout(task.layout).name for task in info.left_out), layouts, root / INFO)
     return Index(root, info, entries, layouts)

@@ -49,18 +49,18 @@ _SEMVER = re.compile(
     rf"{_NUMBER}\.{_NUMBER}\.{_NUMBER}(-{_PRERELEASE}(\.{_PRERELEASE})*)?(\+[0-9A-Za-z-]+(\.[0-9A-Za-z-]+)*)?", re.ASCII
 )
 
-_VERSION_LENGTH = 100  # characters
+_VERSION_LENGTH = 100  # maximum number of characters
 
 _Steps = Annotated[int, Meta(gt=0, lt=2**31)]
 _Bytes = Annotated[int, Meta(ge=0, lt=2**62)]
 
 
 class EpisodeLengths(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Steps per episode.
+    """Numbers of steps per episode.
 
     Args:
-        max_steps: steps of an episode while the ego learns.
-        kept_steps: number of leading steps of each episode that the histories contain.
+        max_steps: number of steps of an episode while the ego learns.
+        kept_steps: number of first steps of each episode that the histories contain.
     """
 
     max_steps: _Steps
@@ -69,13 +69,13 @@ class EpisodeLengths(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class LayoutSummary:
-    """One layout of a release.
+    """Summary of the histories of a release on one layout.
 
     Args:
         environment_name: the layout's name in the paper's code.
         map: cells of the layout, one string per row.
-        recipes: recipes of the layout, three ingredients each.
-        obs_shape: (5, 5, C) of one observation.
+        recipes: recipes of the layout, three ingredient ids each.
+        obs_shape: shape (5, 5, C) of one observation.
         histories: number of histories on this layout.
         tasks: number of tasks on this layout.
         transitions: number of steps on this layout.
@@ -97,17 +97,17 @@ class LayoutStatistics:
     """One column of the paper's table "Dataset statistics per layout".
 
     Args:
-        original_transitions: steps of all recorded streams before filtering; None if unknown.
-        filtered_transitions: steps of the histories in the release.
-        history_length: steps of the shortest and of the longest history.
+        original_transitions: number of steps of all recorded streams before filtering; None if unknown.
+        filtered_transitions: number of steps of the histories in the release.
+        history_length: numbers of steps of the shortest and of the longest history.
         teammates: number of different teammates; None if the tasks are unknown.
-        steps_per_episode: kept steps of an episode.
-        obs_shape: (5, 5, C) of one observation.
+        steps_per_episode: number of steps of an episode that the histories contain.
+        obs_shape: shape (5, 5, C) of one observation.
         actions: number of actions.
         mean_final_return: mean of `Entry.return_end` over the histories.
-        disk_bytes: size of the shards.
-        independent_teammates: number of different teammates, with several checkpoints of one policy counted once; None
-            if the tasks are unknown.
+        disk_bytes: total size of the layout's shards in bytes.
+        independent_teammates: number of different teammates, where several checkpoints of one policy count as one;
+            None if the tasks are unknown.
     """
 
     original_transitions: int | None
@@ -130,11 +130,11 @@ class LeftOutTask:
         task_id: the task's id.
         layout: the layout's short name.
         teammate: name of the teammate, such as "H3/t12" or "fcp/m1".
-        source: intended source of its histories, see `Entry.source`.
+        source: intended source of the task's histories, see `Entry.source`.
         learners: number of independent learners; 0 if none was trained.
         streams: number of recorded streams of all learners.
         return_start: mean return of the streams' first episodes, see `schema.curve_ends`; None if nothing was recorded.
-        return_end: mean return of the streams' last episodes.
+        return_end: mean return of the streams' last episodes; None if nothing was recorded.
         reason: a sentence that says why the task was left out.
     """
 
@@ -155,15 +155,15 @@ class ReleaseInfo:
 
     Args:
         format_version: version of the file format, one of `schema.READABLE_VERSIONS`.
-        data_version: version of the data, SemVer.
+        data_version: version of the data, in the form of SemVer.
         kind: which arrays the shards store, see `schema.Kind`.
         actions: names of the actions, by action id.
         environment: numbers of steps per episode.
         histories: number of histories.
         transitions: total number of steps.
-        layouts: layout name -> summary, in order of first appearance in the index.
-        shards: path of a shard in the release -> size in bytes.
-        statistics: layout name -> statistics as in the paper; empty in older releases.
+        layouts: summaries by layout name, in order of first appearance in the index.
+        shards: sizes of the shards in bytes, by path in the release.
+        statistics: statistics as in the paper, by layout name; empty in older releases.
         left_out: tasks without histories in the release, for example because the learner did not improve.
     """
 
@@ -188,7 +188,7 @@ class ReleaseInfo:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return the JSON object of info.json, without `shards`, `statistics` and `left_out` if they are empty."""
+        """Return the content of info.json as a JSON object, without empty `shards`, `statistics` and `left_out`."""
         content = json.loads(msgspec.json.encode(self))
         return {name: value for name, value in content.items() if value not in ({}, [])}
 
@@ -197,11 +197,11 @@ class ReleaseInfo:
         """Parse the JSON object of an info.json.
 
         Raises:
-            IndexFormatError: without the file, which the caller adds.
+            IndexFormatError: if a value is wrong or missing; the caller adds the file's path to the message.
         """
         try:
             info = msgspec.convert(content, cls)
-            check_version(info.data_version)  # the version becomes part of tags and folder names
+            check_version(info.data_version)  # a bad version would end up in tags and folder names
             for task in info.left_out:
                 get_layout(task.layout)
                 for text in (task.task_id, task.teammate, task.source, task.reason):
@@ -223,9 +223,9 @@ def read_info(root: Path) -> ReleaseInfo:
     if not path.is_file():
         raise RootNotFoundError(
             f"{root}: no release here, expected {INFO} in it; give the folder of a release, fetch one with "
-            f"`icrl4aht-data download`, or give none for the bundled one"
+            f"`icrl4aht-data download`, or give no folder for the bundled release"
         )
-    read_layouts(root)  # left-out tasks may be on layouts that the release carries
+    read_layouts(root)  # left-out tasks may have layouts that only this release stores
     try:
         content = parse_json(read_text(path))
         version = content.get("format_version") if isinstance(content, dict) else None
@@ -237,25 +237,25 @@ def read_info(root: Path) -> ReleaseInfo:
         raise IndexFormatError(f"{path}: malformed: {error}") from error
     found = f"{path}: format version {version}, this package reads {', '.join(map(str, READABLE_VERSIONS))}"
     if version > FORMAT_VERSION:
-        raise FormatTooNewError(f"{found}: `pip install -U {PACKAGE}`")
+        raise FormatTooNewError(f"{found}: update the package with `pip install -U {PACKAGE}`")
     raise FormatTooOldError(f"{found}: fetch a newer version of the release")
 
 
 def check_version(version: str) -> str:
-    """Check that a data version is valid SemVer, and return it.
+    """Check that a data version is valid SemVer, and return the version.
 
     Raises:
-        OptionError: if it is not.
+        OptionError: if the version is not valid, or longer than 100 characters.
     """
     if not isinstance(version, str) or len(version) > _VERSION_LENGTH or not _SEMVER.fullmatch(version):
-        raise OptionError(f"data version {version!r:.100}: expected one such as 1.0.0 or 1.0.0-rc.1 (SemVer)")
+        raise OptionError(f"data version {version!r:.100}: expected a SemVer version such as 1.0.0 or 1.0.0-rc.1")
     return version
 
 
-def describe(
+def make_info(
     kind: Kind, data_version: str, kept_steps: int, entries: list[Entry], format_version: int = FORMAT_VERSION
 ) -> ReleaseInfo:
-    """Return the info of a release with these histories, without shard sizes and statistics."""
+    """Return the `ReleaseInfo` of a release with the given entries, without shard sizes and statistics."""
     layouts = {}
     for name, members in grouped(entries, lambda entry: entry.layout).items():
         layout = get_layout(name)
@@ -292,11 +292,11 @@ def layout_statistics(
     """Return the statistics of every layout, in order of first appearance.
 
     Args:
-        described: the result of `describe` for these entries.
-        entries: the index.
+        described: result of `make_info` for the entries.
+        entries: entries of the release's index.
         tasks: the release's tasks.
-        provenance: task id -> how its histories were made.
-        sizes: shard -> size in bytes.
+        provenance: how the histories of each task were made, by task id.
+        sizes: sizes of the shards in bytes, by path.
     """
     statistics = {}
     for layout, members in grouped(entries, lambda entry: entry.layout).items():
@@ -316,14 +316,14 @@ def layout_statistics(
             obs_shape=summary.obs_shape,
             actions=len(ACTIONS),
             mean_final_return=summary.mean_final_return,
-            independent_teammates=len(set(map(_policy, own))) or None,
+            independent_teammates=len(set(map(_policy_key, own))) or None,
             disk_bytes=sum(sizes[shard] for shard in {entry.shard for entry in members}),
         )
     return statistics
 
 
-def _policy(task: Task) -> str:
-    """Return a key that is equal only for checkpoints of the same policy."""
+def _policy_key(task: Task) -> str:
+    """Return a key of a task's teammate that is equal for all checkpoints of one policy."""
     checkpoint = task.teammate.get("theta", {}).get("checkpoint")
     if task.teammate_family != "rl" or checkpoint is None:
         return json.dumps(task.teammate, sort_keys=True)

@@ -1,9 +1,9 @@
-"""The layouts that a release carries: meta/layouts.jsonl, one line for each layout that this package does not have.
+"""Layouts stored in a release: meta/layouts.jsonl has one line per layout that the benchmark does not have.
 
     {"name": "templates-0-17", "map": ["WWPWW", ...], "recipes": [[0, 0, 1], ...], "indicates_delivery": false,
      "family": "templates", "seed": 0, "number": 17}
 
-Reading a release makes its layouts known to `get_layout` by their names.
+Reading a release makes its layouts available to `get_layout` by name.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from icrl4aht_data.overcooked.solvable import check_solvable
 from icrl4aht_data.utils.files import read_lines, resolve_inside
 
 LAYOUTS_NAME = LAYOUTS_FILE.rpartition("/")[2]
-"""Name of a file of layouts, next to a file of tasks on them."""
+"""Name of the file of layouts, which is in the same folder as the file of tasks that use the layouts."""
 
 PUBLISHED = "published"
-"""Family of the layouts of the benchmark, which every copy of this package has."""
+"""Family of the benchmark's layouts, which are part of this package."""
 
 OTHER = "other"
 """Family of layouts that were not generated."""
@@ -38,10 +38,10 @@ _GENERATED = re.compile(r"(\w+)-(\d+)-(\d+)", re.ASCII).fullmatch
 
 @dataclass(frozen=True)
 class ReleaseLayouts:
-    """The layouts that a release carries.
+    """Layouts stored in a release because the benchmark does not have them.
 
     Args:
-        families: name -> family.
+        families: family of each layout, by the layout's name.
         layouts: the layouts, in the order of the file.
     """
 
@@ -49,7 +49,7 @@ class ReleaseLayouts:
     layouts: tuple[Layout, ...] = ()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # A process that unpickles a dataset has not read the release.
+        # A process that unpickles a dataset has not read the release, so `get_layout` does not know the layouts yet.
         self.__dict__.update(state)
         add_layouts(self.layouts)
 
@@ -59,25 +59,25 @@ class ReleaseLayouts:
 
 
 def read_layouts(root: Path) -> ReleaseLayouts:
-    """Read the layouts of a release, and make them known to `get_layout`.
+    """Read the layouts stored in a release, and make the layouts available to `get_layout`.
 
     Raises:
-        IndexFormatError: if a line is malformed, if a name occurs twice or is already known for another map, if a
-            recipe cannot be delivered, or if family, seed and number are not those in the name. The error has the
-            file and the number of the line.
+        IndexFormatError: if a line is malformed, if a name occurs twice or already belongs to another map, if a recipe
+            cannot be delivered, or if family, seed and number differ from those in the name. The message has the file
+            and the line number.
     """
     return _read_layouts_file(resolve_inside(root, LAYOUTS_FILE))
 
 
 def _read_layouts_file(path: Path) -> ReleaseLayouts:
-    """Read a file of layouts, see `read_layouts`; there are none without the file."""
+    """Return the layouts of a file, see `read_layouts`; no layouts if the file does not exist."""
     families: dict[str, str] = {}
     layouts = []
     for number, line in enumerate(read_lines(path) if path.is_file() else (), start=1):
         try:
-            layout, family = _parse(line)
+            layout, family = _parse_line(line)
             if layout.name in families:
-                raise IndexFormatError(f"layout {layout.name!r} is listed twice")
+                raise IndexFormatError(f"layout {layout.name!r} is listed twice; remove one of the lines")
             families[layout.name] = family
             layouts += add_layouts([layout])
         except (msgspec.MsgspecError, Icrl4ahtError) as error:
@@ -85,9 +85,9 @@ def _read_layouts_file(path: Path) -> ReleaseLayouts:
     return ReleaseLayouts(families, tuple(layouts))
 
 
-@lru_cache(maxsize=1024)  # a check of solvability takes 0.5 ms, and opening a release reads the file twice
-def _parse(line: str) -> tuple[Layout, str]:
-    """Return the layout of a line, and its family; see `read_layouts` for the errors."""
+@lru_cache(maxsize=1024)  # opening a release parses each line twice, and `check_solvable` takes 0.5 ms
+def _parse_line(line: str) -> tuple[Layout, str]:
+    """Return the layout that a line describes, and the layout's family; see `read_layouts` for the errors."""
     fields = msgspec.json.decode(line, type=LayoutLine)
     check_name(fields.name)
     check_name(fields.family)
@@ -101,12 +101,12 @@ def _parse(line: str) -> tuple[Layout, str]:
 
 
 def read_tasks_and_layouts(path: Path) -> list[Task]:
-    """Return the tasks of a JSONL file; the layouts in a file `layouts.jsonl` next to it become known to `get_layout`.
+    """Return the tasks of a JSONL file, after reading the layouts from `layouts.jsonl` in the same folder.
 
-    So `meta/tasks.jsonl` of a release is read without opening the release.
+    This reads `meta/tasks.jsonl` of a release without opening the release.
 
     Raises:
-        TaskFormatError: names the file and the line.
+        TaskFormatError: if a task is malformed; the message names the file and the line.
         IndexFormatError: if the file of layouts is malformed, see `read_layouts`.
     """
     _read_layouts_file(path.with_name(LAYOUTS_NAME))
@@ -114,10 +114,10 @@ def read_tasks_and_layouts(path: Path) -> list[Task]:
 
 
 def write_layouts_file(path: Path, layouts: Iterable[Layout]) -> None:
-    """Write the layouts that the benchmark does not have to a file; no file if there are none.
+    """Write those of the layouts that the benchmark does not have to a file; write no file if it has all of them.
 
     Raises:
-        OptionError: if a recipe of one of them cannot be delivered, which readers would refuse.
+        OptionError: if a recipe of a layout cannot be delivered, since readers would reject such a layout.
     """
     own = [layout for layout in dict.fromkeys(layouts) if layout.name not in LAYOUTS]
     for layout in own:
@@ -127,7 +127,7 @@ def write_layouts_file(path: Path, layouts: Iterable[Layout]) -> None:
 
 
 def layout_title(name: str) -> str:
-    """Return the name under which tables and figures show a layout: generated ones have that of their family."""
+    """Return the name of a layout for tables and figures: for a generated layout, the name of the layout's family."""
     generated = _GENERATED(name)
     return name if generated is None else generated[1]
 
@@ -137,16 +137,16 @@ def _line(layout: Layout) -> LayoutLine:
 
 
 def _origin(name: str) -> tuple[str, int | None, int | None]:
-    """Return family, seed and number of a layout, which the name of a generated one consists of."""
+    """Return the family, seed and number that a generated layout's name contains; (OTHER, None, None) otherwise."""
     generated = _GENERATED(name)
     return (OTHER, None, None) if generated is None else (generated[1], int(generated[2]), int(generated[3]))
 
 
-def check_layouts_carried(names: Iterable[str], layouts: ReleaseLayouts, path: Path) -> None:
-    """Check that the layouts of an index are published, or carried by the release.
+def check_layouts_stored(names: Iterable[str], layouts: ReleaseLayouts, path: Path) -> None:
+    """Check that each layout of an index belongs to the benchmark or is stored in the release.
 
     Raises:
-        IndexFormatError: if one is not; other releases opened in this process, and installed packages, do not count.
+        IndexFormatError: if a layout is neither, even if an opened release or an installed package has the layout.
     """
     for name in names:
         if name not in LAYOUTS and name not in layouts.families:

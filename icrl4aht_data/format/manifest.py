@@ -1,7 +1,7 @@
-"""MANIFEST.sha256: paths and SHA-256 of all files of a release, in the format of `sha256sum`.
+"""MANIFEST.sha256: path and SHA-256 of every file of a release, in the format of `sha256sum`.
 
-The manifest covers the chunk tables in `meta/chunks/`, and they cover the shards, so every byte of a release can be
-checked.
+The manifest has hashes of the chunk tables in `meta/chunks/`, and the chunk tables have hashes of all parts of the
+shards, so every byte of a release can be checked.
 """
 
 from __future__ import annotations
@@ -52,36 +52,36 @@ _KNOWN = re.compile(
         )
     )
 )
-"""Patterns of the paths that a release may contain. All other paths are refused, because a downloaded file such as
-.git/config, sitecustomize.py or x.pth could make other programs run its content."""
+"""Pattern of the paths that a release may contain. All other paths are rejected, because other programs could run the
+content of a downloaded file such as .git/config, sitecustomize.py or x.pth."""
 
 
-_SOURCE_CARD = "meta/source_card.md"  # only in releases of earlier versions
+_SOURCE_CARD = "meta/source_card.md"  # written only by earlier versions of this package
 
 
 def is_known_file(name: str) -> bool:
-    """Return whether a release may contain a file with this path; False for the manifest itself."""
+    """Return whether a release may contain a file with the given path; False for the path of the manifest."""
     return _KNOWN.fullmatch(name) is not None
 
 
 @lru_cache(maxsize=16)
 def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
-    """Parse a manifest, once for the same text: path in the release -> SHA-256.
+    """Parse a manifest, and return the SHA-256 of each file by path in the release; results are cached.
 
     Args:
         text: content of the manifest.
         path: path or address of the manifest, for error messages.
 
     Raises:
-        IndexFormatError: if the manifest is empty or a line is malformed; with the line number.
-        UnsafePathError: if a path leads out of the release, or a release may not contain it.
+        IndexFormatError: if the manifest is empty or a line is malformed; the message has the line number.
+        UnsafePathError: if a path leads out of the release, or is not the path of a release's file.
     """
     if not text:
-        raise IndexFormatError(f"{path}: empty: expected a line for each file of the release; fetch it again")
+        raise IndexFormatError(f"{path} is empty: expected a line for each file of the release; fetch it again")
     if not text.endswith("\n"):
-        raise IndexFormatError(f"{path}: cut off: its last line has no end; fetch it again")
+        raise IndexFormatError(f"{path} is cut off: the last line does not end with a newline; fetch it again")
     listed: dict[str, str] = {}
-    folded: dict[str, str] = {}  # lower-case name -> name, for disks that ignore case
+    folded: dict[str, str] = {}  # names by lower-case name, to find names that are equal on disks that ignore case
     for number, line in enumerate(text.splitlines(), start=1):
         match = _LINE.fullmatch(line)
         if match is None:
@@ -89,24 +89,24 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
         digest, name = match.groups()
         if not is_inside(name):
             raise UnsafePathError(
-                f"{path}, line {number}: {name!r} leads out of the release: do not use it, and warn its publisher"
+                f"{path}, line {number}: {name!r} leads out of the release: do not use it, and warn the publisher"
             )
         if not is_known_file(name):
             raise UnsafePathError(
-                f"{path}, line {number}: {name[:200]!r} is not a file that a release has: do not use it, and warn its "
-                f"publisher; if a later version of this package wrote it, update the package"
+                f"{path}, line {number}: {name[:200]!r} is not a file that a release may contain: do not use it, and "
+                f"warn the publisher; if a later version of this package wrote the release, update the package"
             )
         if name in listed:
-            raise IndexFormatError(f"{path}, line {number}: {name!r} is listed twice")
+            raise IndexFormatError(f"{path}, line {number}: {name!r} is listed twice; fetch the release again")
         twin = folded.setdefault(name.casefold(), name)
         if twin != name:
-            raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are one file on some systems")
+            raise IndexFormatError(f"{path}, line {number}: {name!r} and {twin!r} are the same file on some systems")
         listed[name] = digest
     return MappingProxyType(listed)
 
 
 def read_manifest(folder: Path) -> Mapping[str, str]:
-    """Read the manifest of a release folder, see `parse_manifest`."""
+    """Read the manifest of a release folder; `parse_manifest` describes the result and the errors."""
     path = resolve_inside(folder, MANIFEST)
     return parse_manifest(read_text(path), path)
 
@@ -119,8 +119,8 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
         names: paths of the files, relative to `root`.
 
     Raises:
-        IndexFormatError, ChunkTableError: if a file is missing, not listed or differs, or if the manifest is missing or
-            invalid; with the expected and the found hash.
+        IndexFormatError, ChunkTableError: if a file is missing, not listed or has another hash, or if the manifest is
+            missing or invalid; the message has the expected and the found hash.
     """
     manifest, listed = root / MANIFEST, read_manifest(root)
     for name in names:
@@ -136,15 +136,15 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
             raise kind(f"{path}: {manifest} does not list this file; fetch the release again")
         if found != listed[name]:
             raise kind(
-                f"{path}: expected sha256 {listed[name]} as {MANIFEST} says, found {found}: the file is damaged or was "
-                f"edited; `icrl4aht-data download` replaces it"
+                f"{path}: expected sha256 {listed[name]} from {MANIFEST}, found {found}: the file is damaged or was "
+                f"edited; `icrl4aht-data download` replaces the file"
             )
 
 
 def check_meta(root: Path) -> None:
-    """Check the files of meta/ except chunk tables; see `check_against_manifest`.
+    """Check the files in meta/, except chunk tables, with `check_against_manifest`.
 
-    meta/source_card.md, which earlier versions of this package wrote, may be missing: no code reads or fetches it.
+    meta/source_card.md, which earlier versions of this package wrote, may be missing, since no code reads this file.
     """
     names = {name for name in read_manifest(root) if re.fullmatch(r"meta/[^/]+", name)}
     if not (root / _SOURCE_CARD).exists():
@@ -154,11 +154,11 @@ def check_meta(root: Path) -> None:
 
 
 def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
-    """Write MANIFEST.sha256 with all other files of a folder.
+    """Write MANIFEST.sha256 with the hashes of all other files of a folder.
 
     Args:
         root: the folder.
-        known: path -> SHA-256, for files that need not be hashed again.
+        known: SHA-256 by path, for files that need not be hashed again.
 
     Raises:
         UnsafePathError: if the folder has a file that a release may not contain.
@@ -167,7 +167,7 @@ def write_manifest(root: Path, known: Mapping[str, str] | None = None) -> None:
     names = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
     foreign = [name for name in names if name != MANIFEST and not is_known_file(name)]
     if foreign:
-        raise UnsafePathError(f"{root}: {foreign[0]!r} is not a file that a release has; remove it")
+        raise UnsafePathError(f"{root}: {foreign[0]!r} is not a file that a release may contain; remove it")
     lines = [f"{known.get(name) or file_hash(root / name)}  {name}\n" for name in names if name != MANIFEST]
     with atomic_write(root / MANIFEST) as partial:
         partial.write_text("".join(lines), encoding="utf-8")

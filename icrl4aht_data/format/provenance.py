@@ -21,7 +21,7 @@ _Positive = Annotated[int, Meta(ge=1, le=2**63 - 1)]
 _Exponent = Annotated[float, Meta(gt=0, lt=1e15)]
 
 LabelView = Literal["ego", "state"]
-"""One of `facts.LABEL_VIEWS`."""
+"""Input of the policy that chose the expert actions, see `facts.LABEL_VIEWS`."""
 
 
 class StreamReturns(Struct, frozen=True, omit_defaults=True):
@@ -29,8 +29,8 @@ class StreamReturns(Struct, frozen=True, omit_defaults=True):
 
     Args:
         streams: number of streams.
-        return_start: mean over the first episodes, see `schema.curve_ends`.
-        return_end: mean over the last episodes.
+        return_start: mean return of the first episodes, see `schema.curve_ends`.
+        return_end: mean return of the last episodes, see `schema.curve_ends`.
     """
 
     streams: StreamCount
@@ -42,9 +42,9 @@ class StreamFilter(Struct, frozen=True, omit_defaults=True):
     """Mean returns before and after filtering a task's streams.
 
     Args:
-        before: all recorded streams.
-        after: the streams that the release keeps.
-        least_improvement: minimum improvement of a kept stream's return; None without such a filter.
+        before: returns of all recorded streams.
+        after: returns of the streams that are in the release.
+        least_improvement: minimum improvement of the return of a stream in the release; None if there was no minimum.
     """
 
     before: StreamReturns
@@ -57,13 +57,13 @@ class ExpertLabels(Struct, frozen=True, omit_defaults=True):
 
     Args:
         policy_sha256: SHA-256 of the policy's weights; None for a script.
-        action: how the policy chose actions.
-        step: environment steps that the policy was trained for; None for a script.
+        action: how the policy chose actions, such as "greedy".
+        step: number of environment steps that the policy was trained for; None for a script.
         return_greedy: mean return of the policy's greedy actions over `episodes` episodes with the task's teammate.
-        return_sampled: mean return of its sampled actions.
+        return_sampled: mean return of the policy's sampled actions with the task's teammate.
         episodes: number of episodes of each measurement.
-        last_return_greedy: greedy return of the learner's last checkpoint, the paper's source of labels.
-        view: what the policy could see: a name in `facts.LABEL_VIEWS`; None if not recorded.
+        last_return_greedy: greedy return of the learner's last checkpoint, which is the expert in the paper.
+        view: input of the policy, a name in `facts.LABEL_VIEWS`; None if not recorded.
     """
 
     policy_sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")] | None
@@ -81,19 +81,19 @@ class TeammateSwaps(Struct, frozen=True, omit_defaults=True):
 
     Args:
         every: number of episodes after which the next teammate plays.
-        teammates: entries of the teammates, as in `Task.teammate`, in order of play; after the last one the first one,
-            the task's own, plays again.
+        teammates: entries of the teammates, as in `Task.teammate`, in order of play. The first one is the task's
+            teammate; after the last one, the first one plays again.
     """
 
     every: _Positive
     teammates: Annotated[list[dict[str, Any]], Meta(min_length=2)]
 
     def teammate(self, episode: int) -> dict[str, Any]:
-        """Return the entry of the teammate that plays an episode, counted from 0."""
+        """Return the entry of the teammate that plays the episode with the given number, counted from 0."""
         return self.teammates[episode // self.every % len(self.teammates)]
 
     def spans(self, episodes: int) -> tuple[tuple[int, str], ...]:
-        """Return `Entry.teammate_of_episode` of a history with a number of episodes."""
+        """Return the value of `Entry.teammate_of_episode` for a history with the given number of episodes."""
         return tuple((first, teammate_id(self.teammate(first))) for first in range(0, episodes, self.every))
 
 
@@ -101,12 +101,13 @@ class TeammateSuite(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Settings of the populations that a learned teammate was selected from.
 
     Args:
-        algorithms: layout -> algorithms.
-        members: policies in each population.
-        train: training teammates wanted per population.
-        total_steps: environment steps of each member's training.
+        algorithms: names of the training algorithms, by layout.
+        members: number of policies in each population.
+        train: wanted number of training teammates per population.
+        total_steps: number of environment steps of each policy's training.
         threshold: minimum self-play return of a checkpoint.
-        xla_threads: XLA's threads per operation on the CPU that trained them; None on other platforms or if unknown.
+        xla_threads: number of XLA's threads per operation on the CPU that trained the populations; None on other
+            platforms or if unknown.
     """
 
     algorithms: dict[str, list[str]]
@@ -121,12 +122,12 @@ class ReferenceEgos(Struct, frozen=True, omit_defaults=True):
     """Mean returns of reference egos with the task's teammate, in episodes of `facts.KEPT_STEPS` steps.
 
     Args:
-        stay: an ego that never moves.
-        random: an ego with uniformly random actions.
-        oracle: the scripted oracle, which sees the full state.
+        stay: return of an ego that never moves.
+        random: return of an ego with uniformly random actions.
+        oracle: return of the scripted oracle, which sees the full state.
         episodes: number of episodes of each measurement.
-        self_play: the training partner of a learned teammate (its last best response, or itself) with sampled actions;
-            None for heuristics or if not measured.
+        self_play: return of the training partner of a learned teammate (the last best response to the teammate, or the
+            teammate itself) with sampled actions; None for heuristics or if not measured.
     """
 
     stay: FiniteNumber
@@ -137,28 +138,28 @@ class ReferenceEgos(Struct, frozen=True, omit_defaults=True):
 
     @property
     def returns(self) -> dict[str, float]:
-        """Name of the ego -> mean return, for all measured egos."""
+        """Mean returns of all measured egos, by name of the ego."""
         found = {"stay": self.stay, "random": self.random, "oracle": self.oracle, "self-play": self.self_play}
         return {name: value for name, value in found.items() if value is not None}
 
     @property
-    def matters(self) -> bool:
-        """Whether the best ego earns at least `LEAST_HEADROOM` more than the worst."""
+    def has_headroom(self) -> bool:
+        """Whether the returns of the best and the worst reference ego differ by at least `LEAST_HEADROOM`."""
         return max(self.returns.values()) - min(self.returns.values()) >= LEAST_HEADROOM
 
     def describe(self) -> str:
-        """Return the returns as text."""
+        """Return text with the name and the mean return of each measured ego."""
         return ", ".join(f"{name} {value:.1f}" for name, value in self.returns.items())
 
 
 class NearestTest(Struct, frozen=True, omit_defaults=True):
-    """The test teammate on the same layout that acts most like the task's teammate.
+    """The test teammate on the same layout with the most similar behaviour to the task's teammate.
 
     Args:
         teammate: family and number of the test teammate, such as "H3/t1".
-        distance: share of states in which the two choose different actions.
-        behaviour: id of the teammate's behaviour; teammates of the same layout and family with equal ids act alike.
-            None if unknown.
+        distance: fraction of states in which the two teammates choose different actions.
+        behaviour: id of the behaviour of the task's teammate; teammates of one layout and family with equal ids behave
+            the same. None if unknown.
     """
 
     teammate: str
@@ -167,35 +168,37 @@ class NearestTest(Struct, frozen=True, omit_defaults=True):
 
 
 class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How the histories of one task were generated. None means not recorded.
+    """Description of how the histories of one task were generated; None stands for a value that was not recorded.
 
     Args:
         profile: name of the generation profile.
-        profile_hash: hash of that profile's content.
+        profile_hash: hash of the profile's content.
         ego: the ego's hyper-parameters, including the integers `total_steps` and `environments`.
-        ego_hash: hash of these hyper-parameters.
+        ego_hash: hash of the ego's hyper-parameters.
         code_version: version of this package.
         jax_version: version of JAX.
         platform: JAX backend, such as "cpu".
-        xla_threads: XLA's threads per operation on a CPU, which affect the results' bits; None on other platforms.
+        xla_threads: number of XLA's threads per operation on a CPU, which affects the bits of results; None on other
+            platforms.
         seed: the learner's seed.
         source: how the histories were made, see `Entry.source`.
         learners: number of independent learners, each with `ego["environments"]` streams; None for a script.
-        noise: settings of noise histories: numbers of `histories` and `episodes`, and ranges [least, most] that each
-            history draws from: the chance of a random action at the `start` and the `end`, the shares of the history at
-            which its fall begins and ends (`begin`, `finish`), the exponent of the fall (`power`).
+        noise: settings of noise histories: numbers of `histories` and `episodes`, and ranges [least, most] from which
+            each history draws the probability of a random action at the `start` and the `end`, the fractions of the
+            history at which the probability begins and stops to fall (`begin`, `finish`), and the exponent of the fall
+            (`power`).
         references: returns of reference egos.
-        nearest_test: the test teammate that acts most like this one.
-        teammate: the teammate's agent `slot` and the source of its `noise`.
+        nearest_test: the test teammate with the most similar behaviour to the task's teammate.
+        teammate: the teammate's agent number (`slot`) and the source of its randomness (`noise`).
         streams_recorded: number of environment streams of all learners.
         streams_kept: number of streams that became histories.
         filter: returns of the streams before and after filtering.
         expert: the policy that produced the expert actions.
-        suite: the populations that a learned teammate was selected from.
+        suite: settings of the populations that a learned teammate was selected from.
         swaps: changes of the teammate within each history; None if the task's teammate plays all episodes.
-        other: further fields, kept unchanged. Histories of people have `person`: `pseudonym`; `views`, what was shown
-            in each episode ("ego", the cells that an ego sees, or "whole", the map with the recipe);
-            `steps_per_second`.
+        other: unknown fields, which stay unchanged. Histories of people have `person` with `pseudonym`,
+            `steps_per_second`, and `views`: the view shown in each episode, "ego" (only the cells that an ego sees) or
+            "whole" (the map with the recipe).
     """
 
     profile: str | None = None
@@ -221,29 +224,29 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
     swaps: TeammateSwaps | None = None
     other: dict[str, Any] = {}
 
-    def played(self, task: Task) -> list[Task]:
-        """Return the task, and after it a copy with each further teammate that plays in its histories."""
+    def played_tasks(self, task: Task) -> list[Task]:
+        """Return the task, followed by one copy for each other teammate that plays in the task's histories."""
         return [task, *(replace(task, teammate=one) for one in (self.swaps.teammates[1:] if self.swaps else ()))]
 
-    def wants_oracle(self, return_end: float) -> bool:
-        """Return whether the oracle's actions are worth learning: whether it earns what the histories' end earns.
+    def is_oracle_useful(self, return_end: float) -> bool:
+        """Return whether the oracle is a useful expert, that is, earns at least the return at the histories' end.
 
         Args:
             return_end: mean return of the last episodes of the task's histories, see `schema.curve_ends`.
 
         Returns:
-            True as well if the oracle's return is unknown, if teammates change, since it is with the task's own, and
-            for source `noise`, whose expert is the oracle.
+            Whether the oracle earns at least `return_end`. Also True if the oracle's return is unknown, if teammates
+            change (the known return is with the task's teammate), or for source `noise` (the expert is the oracle).
         """
         if self.references is None or self.swaps is not None or self.source == "noise":
             return True
         return self.references.oracle >= return_end
 
     def entry_fields(self, episodes: int) -> dict[str, Any]:
-        """Return the fields of an index entry that describe its expert and its teammates.
+        """Return the fields of an index entry that describe the history's expert and teammates.
 
         Args:
-            episodes: number of the history's episodes.
+            episodes: number of episodes of the history.
         """
         expert = self.expert or ExpertLabels(None, "")
         return {
@@ -255,20 +258,20 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
         }
 
     def to_json(self) -> dict[str, Any]:
-        """Return the JSON object of a task, without fields that are None."""
+        """Return the task's provenance as a JSON object, without fields that are None."""
         content = msgspec.to_builtins(self)
         other = content.pop("other", {})
         return content | other
 
     @classmethod
     def from_json(cls, content: Any) -> Provenance:
-        """Parse the JSON object of a task.
+        """Parse the JSON object with the provenance of a task.
 
         Raises:
-            IndexFormatError: without the file, which the caller adds.
+            IndexFormatError: if a value is wrong; the caller adds the file's path to the message.
         """
         if not isinstance(content, dict):
-            raise IndexFormatError("expected an object of objects, one for each task")
+            raise IndexFormatError("expected a JSON object that has one object for each task")
         known = set(cls.__struct_fields__) - {"other"}
         try:
             found = msgspec.convert({name: value for name, value in content.items() if name in known}, cls)
@@ -290,14 +293,14 @@ class Provenance(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class _EgoScale(Struct):
-    """Hyper-parameters of the ego that this package reads."""
+    """Those hyper-parameters of the ego that this package reads."""
 
     total_steps: int
     environments: int
 
 
 class _NoiseSetting(Struct):
-    """Known settings of noise schedules; unknown ones are kept unchanged."""
+    """Known settings of noise schedules, which are validated; other settings stay unchanged."""
 
     histories: _Positive | None = None
     episodes: _Positive | None = None
@@ -309,7 +312,7 @@ class _NoiseSetting(Struct):
 
 
 class _TeammateSetting(Struct, forbid_unknown_fields=True):
-    """Agent slot and noise source of a teammate. The task defines the teammate itself, so other fields are refused."""
+    """Agent slot and noise source of a teammate; other fields are invalid, since the task defines the teammate."""
 
     slot: Literal[1]
     noise: str | None = None
@@ -319,7 +322,7 @@ class ProvenanceByTask(dict[str, Provenance]):
     """Mapping of task ids to their `Provenance`, with a short repr."""
 
     def of(self, task_id: str) -> Provenance:
-        """Return the provenance of a task; one without any fields if it is not recorded."""
+        """Return the provenance of a task; an empty `Provenance` if none is recorded."""
         return self.get(task_id, Provenance())
 
     def __repr__(self) -> str:
@@ -327,7 +330,7 @@ class ProvenanceByTask(dict[str, Provenance]):
 
 
 def read_provenance(path: Path) -> ProvenanceByTask:
-    """Read meta/provenance.json: task_id -> provenance.
+    """Read meta/provenance.json, and return the provenance of each task by task id.
 
     Raises:
         IndexFormatError: if the file or the object of a task is malformed.
@@ -336,7 +339,7 @@ def read_provenance(path: Path) -> ProvenanceByTask:
     try:
         content = parse_json(text)
         for task_id, of_task in (content if isinstance(content, dict) else {"": content}).items():
-            where = f"not as `generation` writes it: {task_id[:100]!r}: "
+            where = f"malformed provenance of task {task_id[:100]!r}: "
             found[task_id] = Provenance.from_json(of_task)
     except IndexFormatError as error:
         raise IndexFormatError(f"{path}: {where}{error}") from error

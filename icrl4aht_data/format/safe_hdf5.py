@@ -1,7 +1,7 @@
 """Safe reading of untrusted HDF5 files, because libhdf5 follows links to other files, loads plugins and trusts sizes.
 
 Each check runs before the libhdf5 call that it protects. Rejected content raises ValueError; damaged content may raise
-any error of h5py. Callers add the file's name.
+any error of h5py. Callers add the file's name to the message.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import numpy as np
 from icrl4aht_data.format.chunks import DEFLATE_RATIO, decode_chunk
 from icrl4aht_data.utils.system import new_array
 
-_low: Any = h5py  # h5py's type stubs lack the low-level interface
+_low: Any = h5py  # `Any`, since h5py's type stubs do not have the low-level interface
 h5d, h5l, h5t, h5z = _low.h5d, _low.h5l, _low.h5t, _low.h5z
 
 SHUFFLE, DEFLATE = h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE
 
-_SUPERBLOCKS = tuple(b"\x89HDF\r\n\x1a\n" + bytes([version, 8, 8]) for version in (2, 3))  # with addresses of 8 bytes
-_LOCAL_HEAP = re.compile(rb"HEAP\0.{8}\0{3}", re.DOTALL)  # with a size below a terabyte, others are refused by libhdf5
+_SUPERBLOCKS = tuple(b"\x89HDF\r\n\x1a\n" + bytes([version, 8, 8]) for version in (2, 3))  # for addresses of 8 bytes
+_LOCAL_HEAP = re.compile(rb"HEAP\0.{8}\0{3}", re.DOTALL)  # with a size below a terabyte; libhdf5 rejects larger sizes
 
 _CHUNK_BYTES = 256 * 2**20
 _ELEMENT_BYTES = 2**16
@@ -33,22 +33,22 @@ _ATTRIBUTES = 16
 
 
 def check_no_local_heap(path: Path) -> None:
-    """Check that libhdf5 can open a shard without a local heap, whose free list may be forged to be endless.
+    """Check that a shard has no local heap: a forged heap can have an endless free list, which libhdf5 would follow.
 
-    The writer's shards have no local heap, since groups do not need one from HDF5 1.8 on.
+    Shards written by this package have no local heap, since groups do not need local heaps from HDF5 1.8 on.
 
     Raises:
         ValueError: if the file has a local heap, or is of an older HDF5 version.
     """
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         if not data[:11].startswith(_SUPERBLOCKS):
-            raise ValueError("expected a superblock of version 2 or 3")
+            raise ValueError("expected an HDF5 superblock of version 2 or 3")
         if found := _LOCAL_HEAP.search(data):
-            raise ValueError(f"a local heap at byte {found.start()}, which shards do not have")
+            raise ValueError(f"expected no local heap, found one at byte {found.start()}")
 
 
-def find(group: Any, path: str) -> Any:
-    """Return the group or dataset at a path; None if there is none.
+def find_node(group: Any, path: str) -> Any:
+    """Return the group or dataset at a path in a group; None if the path does not exist.
 
     Raises:
         ValueError: if a link on the path may lead out of the file.
@@ -58,69 +58,69 @@ def find(group: Any, path: str) -> Any:
         if part in ("", ".") or not isinstance(group, h5py.Group) or not group.id.links.exists(name):
             return None
         if group.id.links.get_info(name).type != h5l.TYPE_HARD:
-            raise ValueError(f"{path}: a soft, external or other link, which may lead out of the file")
+            raise ValueError(f"{path}: expected a hard link, found a link that may lead out of the file")
         group = group[part]
     return group
 
 
-def attributes(file: h5py.File) -> dict[str, Any]:
-    """Return the file's attributes: a number itself, for a text `str`.
+def read_attributes(file: h5py.File) -> dict[str, Any]:
+    """Return the file's attributes by name; the value of a text attribute is the type `str` instead of the text.
 
-    Texts are not read, because they are in a global heap, which may be forged to be endless.
+    Texts are not read, because HDF5 stores texts in a global heap, which may be forged to be endless.
 
     Raises:
-        ValueError: if there are too many, or one is not a single number or text.
+        ValueError: if there are too many attributes, or an attribute is not a single number or text.
     """
     found = {}
     for number, name in enumerate(file.attrs):
         attribute = file.attrs.get_id(name)
         if number == _ATTRIBUTES or attribute.shape or _type_class(attribute) not in (h5t.INTEGER, h5t.STRING):
-            raise ValueError(f"attribute {name!r}: expected few attributes, single numbers and texts")
+            raise ValueError(f"attribute {name!r}: expected at most {_ATTRIBUTES} attributes, each a number or a text")
         found[name] = file.attrs[name] if _type_class(attribute) == h5t.INTEGER else str
     return found
 
 
-def filters(dataset: Any) -> list[int]:
+def filter_ids(dataset: Any) -> list[int]:
     """Return the ids of a dataset's filters.
 
     Raises:
-        ValueError: if it is not a dataset of numbers, or of small arrays of numbers, stored in this file.
+        ValueError: if the object is not a dataset of numbers, or of small arrays of numbers, stored in this file.
     """
     if not isinstance(dataset, h5py.Dataset):
-        raise ValueError(f"{dataset.name}: not a dataset")
+        raise ValueError(f"{dataset.name}: expected a dataset, found another object")
     properties = dataset.id.get_create_plist()
     if properties.get_layout() == h5d.VIRTUAL or properties.get_external_count():
-        raise ValueError(f"{dataset.name}: keeps its values in other files")
+        raise ValueError(f"{dataset.name}: expected values in this file, found values in other files")
     is_number = _type_class(dataset.id) in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM)
     if not is_number or dataset.id.get_type().get_size() > _ELEMENT_BYTES:
-        raise ValueError(f"{dataset.name}: expected numbers, or small arrays of them, found {dataset.dtype}")
+        raise ValueError(f"{dataset.name}: expected numbers or small arrays of numbers, found {dataset.dtype}")
     return [properties.get_filter(number)[0] for number in range(properties.get_nfilters())]
 
 
 def _type_class(what: Any) -> int:
-    """Return the HDF5 type class of an object, or of its elements if it has an array type."""
+    """Return the HDF5 type class of a dataset or attribute, or of the elements if its type is an array."""
     kind = what.get_type()
     return kind.get_super().get_class() if kind.get_class() == h5t.ARRAY else kind.get_class()
 
 
 def read_dataset(dataset: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a dataset's values, inflated without libhdf5, which would inflate a chunk to any length.
+    """Return a dataset's values; chunks are inflated without libhdf5, which does not limit the inflated size.
 
     Raises:
-        ValueError: if the dataset has another shape than `shape`, filters other than shuffle and deflate, or more
-            values than its stored bytes can contain.
+        ValueError: if the dataset does not have the shape `shape`, has filters other than shuffle and deflate, or has
+            more values than the stored bytes can contain.
         OptionError: if the values do not fit into memory.
     """
-    used = filters(dataset)
+    used = filter_ids(dataset)
     if used not in ([], [DEFLATE], [SHUFFLE, DEFLATE]):
         raise ValueError(
-            f"{dataset.name}: filters {used}: expected deflate, with or without shuffle; `h5repack -f GZIP=6`"
+            f"{dataset.name}: expected deflate, with or without shuffle, found filters {used}; run `h5repack -f GZIP=6`"
         )
     if dataset.shape != shape or dataset.dtype.kind not in "biuf":
         raise ValueError(f"expected numbers of shape {shape}, found {dataset.dtype} of shape {dataset.shape}")
     size, stored = math.prod(shape) * dataset.dtype.itemsize, dataset.id.get_storage_size()
     if size > (DEFLATE_RATIO if used else 1) * min(stored, dataset.file.id.get_filesize()):
-        raise ValueError(f"{dataset.name}: promises {size:,} bytes, its {stored:,} bytes cannot hold them")
+        raise ValueError(f"{dataset.name}: its {stored:,} stored bytes cannot contain the declared {size:,} bytes")
     out = new_array(shape, dataset.dtype, dataset.name)
     if not used:
         dataset.read_direct(out)
@@ -132,7 +132,7 @@ def read_dataset(dataset: Any, shape: tuple[int, ...]) -> np.ndarray:
     for corner in product(*(range(0, rows, step) for rows, step in zip(shape, chunk, strict=True))):
         info = dataset.id.get_chunk_info_by_coord(corner)
         if info.byte_offset is None or info.filter_mask or info.size > 2 * length + 64:
-            raise ValueError(f"{dataset.name}: the chunk at {corner} is missing, or not stored as the dataset says")
+            raise ValueError(f"{dataset.name}: the chunk at {corner} is missing, or contradicts the dataset's filters")
         data = dataset.id.read_direct_chunk(corner)[1]
         raw = decode_chunk(data, length, dataset.dtype.itemsize if SHUFFLE in used else 1)
         part = out[tuple(slice(low, low + step) for low, step in zip(corner, chunk, strict=True))]

@@ -3,17 +3,17 @@
     meta/info.json          versions, kind, environment, totals
     meta/histories.jsonl    one line per learning history: `Entry`
     meta/tasks.jsonl        one line per task, see `benchmark.tasks`; may be empty in releases of observations
-    meta/layouts.jsonl      layouts that are not published ones, see `format.layouts_file`
-    meta/provenance.json    task_id -> how its histories were made
+    meta/layouts.jsonl      layouts that the benchmark does not have, see `format.layouts_file`
+    meta/provenance.json    for each task id: how the task's histories were made
     meta/chunks/**.npy      for each shard: offset, size, rows, crc32, hash of every chunk
     data/<track>/<layout>/<split>-00000-of-00001.h5
     teammates/<sha256>/     checkpoints of learned teammates, in folders named by the SHA-256 of their weights
-    experts/<sha256>/       checkpoints of the egos that the expert actions come from; optional
-    MANIFEST.sha256         every file above, in sha256sum's format
+    experts/<sha256>/       checkpoints of the egos that chose the expert actions; optional
+    MANIFEST.sha256         hashes of all files above, in sha256sum's format
 
-A `full` shard has one group per history with the paper's fields (App. D.1) and the state records. A `lite` shard leaves
-`obs` out (it is a function of the state) and stacks the histories of equal length in one group, [history, T] arrays. A
-shard of `observations` is a `full` one without state records, which files of the published code do not have.
+A `full` shard has one group per history with the paper's fields (App. D.1) and the state records. A `lite` shard does
+not store `obs`, a function of the state, and has one group of [history, T] arrays for all histories of equal length. A
+shard of `observations` is a `full` shard without state records, since files of the published code do not have them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FORMAT_VERSION = 5
 """Format version that this package writes."""
 
 READABLE_VERSIONS = (4, FORMAT_VERSION)
-"""Format versions that this package reads; others raise `FormatTooOldError` or `FormatTooNewError`."""
+"""Format versions that this package reads; other versions raise `FormatTooOldError` or `FormatTooNewError`."""
 
 MANIFEST = "MANIFEST.sha256"
 INFO, HISTORIES, TASKS, PROVENANCE = (
@@ -42,16 +42,16 @@ INFO, HISTORIES, TASKS, PROVENANCE = (
 )
 
 LAYOUTS_FILE = "meta/layouts.jsonl"
-"""Path of the layouts that the release carries, see `layouts_file`; absent if all are published ones."""
+"""Path of the layouts stored in a release, see `layouts_file`; absent if the benchmark has all of its layouts."""
 
 TEAMMATES = "teammates"
 """Folder of the checkpoints of learned teammates."""
 
 EXPERTS = "experts"
-"""Folder of the checkpoints of experts, whose greedy actions are the labels; optional."""
+"""Folder of the checkpoints of experts; their greedy actions are the expert actions. The folder is optional."""
 
 RELEASE_CARD, CARD_TABLES = "README.md", "card.json"
-"""Paths of the dataset card and of its long tables."""
+"""Paths of the dataset card and of the card's long tables in a release."""
 
 PARQUET_INDEX = "index"
 """Folder of the index as Parquet files, `index/<layout>/<split>.parquet`, in a release built for publication."""
@@ -65,15 +65,15 @@ KINDS: tuple[Kind, ...] = ("full", "lite")
 """Kinds of release with state records."""
 
 OBSERVATIONS: Kind = "observations"
-"""Kind of release without state records, whose steps can be neither replayed nor drawn."""
+"""Kind of release without state records; its steps can be neither replayed nor drawn as pictures."""
 
 ALL_KINDS: tuple[Kind, ...] = (*KINDS, OBSERVATIONS)
 
 CHUNK_DTYPE = np.dtype([("offset", "<u8"), ("size", "<u4"), ("rows", "<u4"), ("crc32", "<u4"), ("hash", "u1", (16,))])
-"""One row of a chunk table: offset and size of the stored bytes, number of rows that belong to the history (the last
-chunk is padded), CRC-32 and hash of the stored bytes, see `chunks.check_chunk`. Rows are ordered by history, field
-and chunk; rows for the HDF5 metadata between the chunks follow, with `rows` = 0, so the table covers every byte of the
-shard once. In the shard, the chunks of a history are ordered by time, so a window of steps is one byte range, see
+"""Row of a chunk table: offset and size of the stored bytes, number of rows that belong to the history (the last chunk
+is padded), CRC-32 and hash of the stored bytes, see `chunks.check_chunk`. Table rows are ordered by history, field and
+chunk. Table rows for the HDF5 metadata between the chunks follow, with `rows` = 0, so the table covers every byte of
+the shard once. In the shard, the chunks of a history are ordered by time, so a window of steps is one byte range, see
 `shard_writer.file_order`."""
 
 
@@ -84,13 +84,13 @@ class Field:
     Args:
         name: the HDF5 dataset's name.
         dtype: dtype that the reader returns and a `full` shard stores (paper, App. D.1).
-        compact: dtype that a `lite` shard stores; the writer checks that it is lossless.
+        compact: dtype that a `lite` shard stores; the writer checks that the conversion is lossless.
         axis: "T" for one row per step, "E" for one row per episode.
         row: content of a row: "scalar", "state" (S bytes) or "obs" (5 x 5 x C bytes). A state or an observation is one
-            HDF5 element of array type, so that the shuffle filter groups equal positions over time; h5py shows them as
-            (T, S) and (T, 5, 5, C).
-        chunk: rows per chunk.
-        optional: kinds of release in which a history may lack the field, as its index entry says.
+            HDF5 element of array type, so the shuffle filter groups equal positions over time; in h5py the arrays have
+            shapes (T, S) and (T, 5, 5, C).
+        chunk: number of rows per chunk.
+        optional: kinds of release in which histories may be without the field; the index entry says whether they are.
         absent: kinds of release that never contain the field.
     """
 
@@ -109,8 +109,8 @@ class Field:
             return np.dtype(self.compact if kind == "lite" else self.dtype)
         return np.dtype(("u1", (record_size(layout),) if self.row == "state" else layout.obs_shape))
 
-    def held(self, layout: Layout) -> np.dtype:
-        """Return the dtype of an element in a sampler's memory: the compact one for every kind of release."""
+    def memory_dtype(self, layout: Layout) -> np.dtype:
+        """Return the dtype of an element in a sampler's memory: the compact dtype for every kind of release."""
         return self.element(layout, "lite")
 
 
@@ -128,27 +128,27 @@ FIELDS: dict[str, Field] = {
         Field("obs", "uint8", "uint8", "T", "obs", 200, absent=("lite",)),
     )
 }
-"""All fields by name, in file order. `episode_end_state` is the state after an episode's last kept step."""
+"""All fields by name, in file order. `episode_end_state` is the state after the last stored step of an episode."""
 
 ACTION_FIELDS = ("actions", "teammate_actions", "expert_actions", "oracle_actions")
 
 
-def held_fields(kind: Kind) -> tuple[Field, ...]:
-    """Return the stored fields of a kind of release, without `obs` if it can be rendered from state records."""
+def memory_fields(kind: Kind) -> tuple[Field, ...]:
+    """Return the fields that samplers hold in memory: without `obs` if a release of this kind has state records."""
     stored = kind if kind == OBSERVATIONS else "lite"
     return tuple(field for field in FIELDS.values() if stored not in field.absent)
 
 
 def record_field(kind: Kind) -> Field:
-    """Return the field with the state records, or with the observations if a release has no states."""
+    """Return the field `state`, or the field `obs` for a kind of release without state records."""
     return FIELDS["state" if kind in KINDS else "obs"]
 
 
-LONGEST = 2**40
-"""Upper limit of the steps of a history, so that sums of steps fit into 64 bits."""
+MAX_STEPS = 2**40
+"""Upper limit of the number of steps of a history, so that sums of steps fit into 64 bits."""
 
-_NAME_LENGTH = 512  # characters
-_FINITE = 1e15  # sums of numbers below this stay finite
+_NAME_LENGTH = 512  # maximum number of characters
+_FINITE = 1e15  # upper limit of numbers, so that sums stay finite
 
 _Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 StoredCount = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -159,14 +159,14 @@ FiniteNumber = Annotated[float, Meta(gt=-_FINITE, lt=_FINITE)]
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
-    """One line of meta/histories.jsonl: the paper's 14 fields (App. D.3), then ours.
+    """One line of meta/histories.jsonl: the paper's 14 fields (App. D.3), then fields that only this project has.
 
     Args:
-        history_id: position of the line in the index.
+        history_id: position of the line in the index, counted from 0.
         task_id: id of the history's task, see `benchmark.tasks`.
-        env_idx: environment stream within the learner's parallel rollout, or number of a noise history.
+        env_idx: number of the environment stream within the learner's parallel rollout, or of a noise history.
         T: number of steps.
-        obs_shape: (5, 5, C) of one observation.
+        obs_shape: shape (5, 5, C) of one observation.
         action_dim: number of actions.
         track: "teammate" or "layout".
         split: a name in `facts.SPLITS`.
@@ -176,33 +176,33 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         h5_group: HDF5 group of the arrays.
         has_teammate_actions: whether the history has `teammate_actions`.
         has_expert_actions: whether the history has `expert_actions`.
-        h5_row: row in the group's stacked arrays; None if the group contains only this history.
+        h5_row: row of the history in the group's stacked arrays; None if the group contains only this history.
         shard: path of the shard in the release.
         seed: the learner's seed; -1 if the task is unknown.
         episodes: number of finished episodes.
         score: end + (end - start), see `curve_ends` (paper, App. F.1).
         return_start: mean return of the first episodes, see `curve_ends`.
-        return_end: mean return of as many last episodes.
+        return_end: mean return of the last episodes, see `curve_ends`.
         return_mean: mean return of all episodes.
         source: how the history was made: "ppo" (an ego learned), "noise" (a script played, and its random actions
             became rarer), "agent" (a trained agent played), "search" (a script found out which dish earns a reward),
             "human" (a person played), or another name.
         expert_return: mean return of the expert's greedy actions with the task's teammate, over 200 episodes of 100
-            steps (a script: `ExpertLabels.episodes`); None if not measured. Equal for all histories of a task.
+            steps (for a script, over `ExpertLabels.episodes`); None if not measured. Equal for all histories of a task.
         expert_return_sampled: mean return of the expert's sampled actions.
-        expert_step: environment steps that the expert was trained for; None for a script or if unknown.
-        learner: number of the independent learner that made the history, from 0; with `env_idx` it names a stream.
+        expert_step: number of environment steps that the expert was trained for; None for a script or if unknown.
+        learner: number of the independent learner that made the history; `learner` and `env_idx` identify a stream.
         has_oracle_actions: whether the release stores `oracle_actions` of the history; see `stored_field`.
-        label_view: what the policy behind `expert_actions` could see: "ego" (what an ego sees) or "state" (the full
-            state; a searcher: all but the wanted dish); None if unknown.
-        teammate_of_episode: pairs (episode, id) in ascending order: from this episode on, the teammate with this
-            `tasks.teammate_id` played, until the next pair's. None if the task's teammate played all episodes.
+        label_view: input of the policy that chose `expert_actions`: "ego" (the ego's observation) or "state" (the full
+            state, but without the wanted dish for source "search"); None if unknown.
+        teammate_of_episode: pairs (episode, id), ascending: the teammate with this `tasks.teammate_id` played from this
+            episode until the episode of the next pair. None if the task's teammate played all episodes.
     """
 
     history_id: _Int
     task_id: _Name
     env_idx: StoredCount
-    T: Annotated[int, Meta(gt=0, lt=LONGEST)]
+    T: Annotated[int, Meta(gt=0, lt=MAX_STEPS)]
     obs_shape: tuple[int, int, int]
     action_dim: _Int
     track: _Name
@@ -216,7 +216,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     h5_row: StoredCount | None
     shard: _Name
     seed: _Int
-    episodes: Annotated[int, Meta(gt=0, lt=LONGEST)]
+    episodes: Annotated[int, Meta(gt=0, lt=MAX_STEPS)]
     score: FiniteNumber
     return_start: FiniteNumber
     return_end: FiniteNumber
@@ -231,7 +231,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     teammate_of_episode: _Spans | None = None
 
     def stored_fields(self, kind: Kind) -> tuple[Field, ...]:
-        """Return the fields that are stored for this history in a release of a kind."""
+        """Return the fields that a release of the given kind stores for this history."""
         return tuple(field for field in FIELDS.values() if kind not in field.absent and self._stores(field))
 
     def has(self, field: Field) -> bool:
@@ -239,9 +239,10 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return self._stores(self.stored_field(field))
 
     def stored_field(self, field: Field) -> Field:
-        """Return the field that stores a field's values: itself, or `expert_actions` for `oracle_actions`.
+        """Return the field that stores the values of a field.
 
-        The expert of a noise history is the oracle, so its release may leave out the second copy of its actions.
+        For `oracle_actions` of a noise history this may be `expert_actions`: the expert is the oracle, so a release may
+        store the actions only once. For other fields it is the field itself.
         """
         same = field.name == "oracle_actions" and self.source == "noise" and not self.has_oracle_actions
         return FIELDS["expert_actions"] if same else field
@@ -250,37 +251,37 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, gc=False):
         return getattr(self, f"has_{field.name}", True)
 
     def rows(self, field: Field) -> int:
-        """Return the number of rows of a field: T or E."""
+        """Return the number of rows of a field, which is the number of steps or of episodes."""
         return self.T if field.axis == "T" else self.episodes
 
     def chunks(self, field: Field) -> int:
-        """Return the number of chunks of a field."""
+        """Return the number of chunks in which a field of this history is stored."""
         return -(-self.rows(field) // field.chunk)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the JSON object of the index line, without `label_view` and `teammate_of_episode` if they are None."""
+        """Return the index line as a JSON object, where `label_view` or `teammate_of_episode` is left out if None."""
         content = json.loads(msgspec.json.encode(self))
         return {name: value for name, value in content.items() if value is not None or name not in _LEFT_OUT}
 
     def to_row(self) -> dict[str, Any]:
-        """Return the fields as a row of a table, with `teammate_of_episode` as JSON text."""
-        texts = {name: encode(getattr(self, name)) for name in ENCODED}
+        """Return the fields of this entry as a row of a table, with `teammate_of_episode` as JSON text."""
+        texts = {name: as_json(getattr(self, name)) for name in ENCODED}
         return msgspec.structs.asdict(self) | {"obs_shape": list(self.obs_shape)} | texts
 
 
-_LEFT_OUT = ("label_view", "teammate_of_episode")  # so that releases without them keep their bytes
+_LEFT_OUT = ("label_view", "teammate_of_episode")  # not written if None, so that the bytes of old releases stay equal
 
 ENTRY_HINTS: dict[str, Any] = get_type_hints(Entry)
-"""Field of an index line -> type without bounds."""
+"""Types of the fields of an index line by name, without bounds."""
 
 TEXTS = (str, str | None)
 """Types of text fields in `ENTRY_HINTS`."""
 
 ENCODED = tuple(name for name, hint in ENTRY_HINTS.items() if hint == tuple[tuple[int, str], ...] | None)
-"""Fields that columns and tables hold as JSON text."""
+"""Fields that columns and tables store as JSON text."""
 
 
-def encode(value: Any) -> str | None:
+def as_json(value: Any) -> str | None:
     """Return the value of a field in `ENCODED` as JSON text; None stays None."""
     return None if value is None else json.dumps(value)
 
@@ -289,19 +290,19 @@ def check_name(text: str) -> None:
     """Check that a name is short and printable.
 
     Raises:
-        IndexFormatError: if it is too long, or has control characters or ones that UTF-8 cannot encode.
+        IndexFormatError: if the name is too long, or has control characters or characters that UTF-8 cannot encode.
     """
     if len(text) > _NAME_LENGTH or not text.isprintable():
-        raise IndexFormatError(f"expected at most {_NAME_LENGTH} printable characters: {text[:100]!r}")
+        raise IndexFormatError(f"expected at most {_NAME_LENGTH} printable characters, found {text[:100]!r}")
 
 
 def episode_ends(steps: int, kept_steps: int) -> np.ndarray:
-    """Return bool (steps,), True on the last step of each episode of `kept_steps` steps."""
+    """Return bool (steps,), True for the last step of each episode of `kept_steps` steps."""
     return np.arange(steps) % kept_steps == kept_steps - 1
 
 
 def episode_returns(rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
-    """Return the return of each episode, float64 (E,), from `rewards` (T,) and `dones` (T,), True on last steps."""
+    """Return the sum of rewards of each episode, float64 (E,), from `rewards` (T,) and `dones` (T,)."""
     ends = np.flatnonzero(dones) + 1
     return np.diff(np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)[ends - 1]]))
 
@@ -309,13 +310,13 @@ def episode_returns(rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
 def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean returns of the first and the last w = max(5, floor(0.1 N)) of N episodes (paper, App. F.1).
 
-    With fewer than 10 episodes, which the paper does not have, w is half of them, at least 1.
+    With fewer than 10 episodes, which does not occur in the paper, w is half of N, but at least 1.
 
     Args:
-        returns: (B, N), episode returns.
+        returns: (B, N), returns of the episodes in order.
 
     Returns:
-        The means at the start and at the end, float64 (B,) each.
+        The mean return at the start and the mean return at the end, float64 (B,) each.
     """
     episodes = returns.shape[-1]
     window = max(1, min(max(5, episodes // 10), episodes // 2))
@@ -323,21 +324,21 @@ def curve_ends(returns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def are_labels_weak(expert_return: Any, return_end: Any) -> Any:
-    """Return whether an expert earns less than half of the ego's return at the end of its history.
+    """Return whether an expert earns less than half of the ego's return at the end of the history.
 
-    If the ego's return is negative, the labels are weak below 1.5 times that return.
+    If the ego's return is negative, the limit is 1.5 times the ego's return.
 
     Args:
-        expert_return: the expert's greedy return, a number or float64 (N,); None or NaN (not measured) is never weak.
-        return_end: mean return of the history's last episodes, of the same shape.
+        expert_return: the expert's greedy return, a number or float64 (N,); None or NaN (not measured) gives False.
+        return_end: mean return of the history's last episodes, a number or float64 (N,).
 
     Returns:
-        bool, or bool (N,).
+        True or False for each expert: bool, or bool (N,).
     """
     return False if expert_return is None else expert_return < return_end - abs(return_end) / 2
 
 
 def stream_score(returns: np.ndarray) -> np.ndarray:
-    """Return the score end + (end - start) of learning curves (B, N), float64 (B,) (paper, App. F.1)."""
+    """Return the score end + (end - start) of each learning curve (B, N), float64 (B,) (paper, App. F.1)."""
     start, end = curve_ends(returns)
     return end + (end - start)

@@ -11,4 +11,4 @@ PUBLISHED_ACTIONS = ("right", "down", "left", "up", "stay", "interact")
 """Action names in the order of the published code's ids, which are remapped on reading."""
 
 EGO, TEAMMATE = 0, 1
-"""Agent slots. The ego (blue) learns or is evaluated; its teammate (red) has a fixed policy unknown to it."""
+"""Agent slots. The ego (blue) learns or is evaluated; the teammate (red) has a fixed policy unknown to the ego."""

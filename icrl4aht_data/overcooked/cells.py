@@ -1,6 +1,6 @@
 """Constants of cells, items and windows, which layouts, rules and observations share.
 
-A cell is (x, y), x = column, y = row, origin top-left; its flat number is y * width + x.
+A cell (x, y) has column x and row y, from the top left corner; the cell's number is y * width + x.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import numpy as np
 from icrl4aht_data.overcooked.actions import ACTIONS
 
 EMPTY, WALL, GOAL, POT, INDICATOR, BUTTON, PLATES, PILE = range(8)
-"""Kinds of cells. A wall is a counter for one item; PLATES and PILE never run out."""
+"""Kinds of cells. A wall that an agent can face is a counter for one item; PLATES and PILE never run out."""
 
 FACINGS = ("up", "down", "right", "left")
-"""Facing names by number, the order of the observation's facing channels."""
+"""Names of the facings; the position is the facing's number and the order of the observation's channels."""
 
 STEP = {"up": (0, -1), "down": (0, 1), "right": (1, 0), "left": (-1, 0)}
 """Facing name -> (dx, dy) to the cell ahead."""
@@ -31,10 +31,10 @@ VISIBLE = WINDOW * WINDOW
 """Number of cells in the window."""
 
 CENTRE = VISIBLE // 2
-"""Position in the window, in reading order, of the observing agent's own cell."""
+"""Position of the observing agent's cell in the window, in reading order."""
 
 NOWHERE = 255
-"""Entry of lookup tables for a cell that is outside the window; also the largest byte."""
+"""Value in lookup tables for a missing cell, such as one outside the window; the largest byte."""
 
 CANONICAL_TYPES = 4
-"""Number of ingredient types that have canonical channels: ids 0..3, those of the published layouts."""
+"""Number of ingredient types with canonical channels: ids 0 to 3, which the published layouts use."""

@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.tables import Array
 
 Channels = Literal["own", "canonical"]
 CHANNELS: tuple[Channels, ...] = ("own", "canonical")
-"""Channels of observations: each layout's own, or the canonical ones."""
+"""Sets of observation channels: "own" differs between layouts, "canonical" is the same for all layouts."""
 
 
 def _names(ingredient_types: int, delivery: bool) -> tuple[str, ...]:
@@ -37,11 +37,11 @@ def _names(ingredient_types: int, delivery: bool) -> tuple[str, ...]:
 
 
 CANONICAL_CHANNELS: tuple[str, ...] = _names(CANONICAL_TYPES, True)
-"""Names of the 46 canonical channels, in order: four ingredient types and the delivery indicator."""
+"""Names of the 46 canonical channels, in order, for four ingredient types and the delivery indicator."""
 
 
 def channel_names(layout: Layout) -> tuple[str, ...]:
-    """Return the names of a layout's own channels, in order, C of them; see `observe` for their meaning."""
+    """Return the names of a layout's C own channels, in order; the docstring of `observe` explains the channels."""
     return _names(layout.ingredient_types, layout.indicates_delivery)
 
 
@@ -50,14 +50,14 @@ def canonical_positions(layout: Layout) -> np.ndarray:
     """Return the canonical position of each of a layout's own channels, int64 (C,), ascending.
 
     Raises:
-        OptionError: if the layout has an ingredient that no published layout has, and so no canonical channel.
+        OptionError: if an ingredient of the layout has no canonical channel, since no published layout has it.
     """
     names = channel_names(layout)
     missing = [name for name in names if name not in CANONICAL_CHANNELS]
     if missing:
         raise OptionError(
             f"layout {layout.name}: channels {missing} are not among the {len(CANONICAL_CHANNELS)} canonical channels: "
-            f"take its own channels, or give its piles ingredients that the published layouts have"
+            f'use channels="own", or give its piles ingredients that the published layouts have'
         )
     positions = np.array([CANONICAL_CHANNELS.index(name) for name in names])
     positions.flags.writeable = False  # the cached array is shared by all callers
@@ -75,7 +75,7 @@ def to_canonical(layout: Layout, obs: Array) -> Array:
     The result equals `observe` with canonical=True.
     """
     xp = obs.__array_namespace__()
-    # A channel of zeros is appended; canonical channels that the layout does not have are taken from it.
+    # Canonical channels that the layout does not have are copies of an appended channel of zeros.
     source = np.full(len(CANONICAL_CHANNELS), layout.channels)
     source[canonical_positions(layout)] = np.arange(layout.channels)
     return xp.take(xp.concat([obs, xp.zeros_like(obs[..., :1])], axis=-1), xp.asarray(source), axis=-1)

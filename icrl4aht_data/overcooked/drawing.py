@@ -1,7 +1,7 @@
-"""Draws the parts of a state (cells, pots, buttons, items, chefs) as a list of a few primitive shapes, see `Canvas`.
+"""Draws the parts of a state (cells, pots, buttons, items, chefs) as a list of primitive shapes, see `Canvas`.
 
-`render` draws the shapes as pixels, and a page draws them from JSON, see `browsing.drawings`. Positions and lengths are
-in cells, (0, 0) is the map's top left corner.
+`render` draws the shapes as pixels; a web page draws the shapes from JSON, see `browsing.drawings`. Positions and
+lengths are in cells, and (0, 0) is the top left corner of the map.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import BUTTON_STEPS, POT_STEPS, columns, record_size
 
 Colour = tuple[int, int, int]
-"""Red, green and blue, 0 to 255."""
+"""Colour as red, green and blue, each from 0 to 255."""
 
 FOOTER = 0.8
-"""Height of the strip with the recipe below the map."""
+"""Height, in cells, of the strip below the map that shows the recipe."""
 
 AGENT_COLOURS = {EGO: (33, 104, 222), TEAMMATE: (213, 33, 53)}
 """Colour of each agent's coat."""
@@ -57,17 +57,17 @@ _INGREDIENTS = {
         (0.36, (90, 170, 80), (0.48, -0.44), (0.72, -0.7)),
     ),
 }
-"""ingredient id -> edge colour and strokes that draw it within a radius of 1, see `Canvas.strokes`."""
+"""Drawing of each ingredient by id: edge colour, then strokes within a radius of 1, see `Canvas.strokes`."""
 _OTHER_INGREDIENT = (INK, (1.6, _STEEL, (0, 0)))
 
 
 class Canvas:
-    """Records shapes, with positions and lengths in cells.
+    """Records drawn shapes in a list, with positions and lengths in cells.
 
     Attributes:
         shapes: ("box", x, y, width, height, fill, radius), ("disc", x, y, radius, fill, part),
             ("line", thickness, fill, x, y, x, y, ...), ("frame", left, top, right, bottom, thickness, fill) or
-            ("text", x, y, words, size, fill, anchor, room), in the order in which they are drawn.
+            ("text", x, y, words, size, fill, anchor, max_width), in drawing order.
     """
 
     def __init__(self) -> None:
@@ -78,22 +78,22 @@ class Canvas:
         self.shapes.append(("box", x, y, width, height, fill, radius))
 
     def disc(self, x: float, y: float, radius: float, fill: Colour, part: float = 1) -> None:
-        """Add a disc, or a sector of `part` (0..1) of it, clockwise from the top."""
+        """Add a disc, or with `part` < 1 only this fraction of the disc, clockwise from the top."""
         self.shapes.append(("disc", x, y, radius, fill, part))
 
     def line(self, points: Sequence[tuple[float, float]], thickness: float, fill: Colour) -> None:
-        """Add a line through the points, with round ends; one point is a disc."""
+        """Add a line with round ends through the points; a single point gives a disc."""
         self.shapes.append(("line", thickness, fill, *(value for point in points for value in point)))
 
     def frame(self, corners: Sequence[float], thickness: float, fill: Colour) -> None:
-        """Add the inner border of the rectangle (left, top, right, bottom)."""
+        """Add a border just inside the rectangle (left, top, right, bottom)."""
         self.shapes.append(("frame", *corners, thickness, fill))
 
     def text(
-        self, x: float, y: float, words: str, size: float, fill: Colour, anchor: str = "mm", room: float = 99
+        self, x: float, y: float, words: str, size: float, fill: Colour, anchor: str = "mm", max_width: float = 99
     ) -> None:
-        """Add text, shrunk if it is wider than `room`; `anchor` is one of Pillow's."""
-        self.shapes.append(("text", x, y, words, size, fill, anchor, room))
+        """Add text, shrunk if it is wider than `max_width`; `anchor` is a text anchor of Pillow, such as "mm"."""
+        self.shapes.append(("text", x, y, words, size, fill, anchor, max_width))
 
     def strokes(
         self,
@@ -107,7 +107,7 @@ class Canvas:
     ) -> None:
         """Add lines or discs, each given as (thickness, fill, *points), with a common outline of colour `edge`.
 
-        The points are relative to (x, y), in units of `size`; their first axis points in the direction `turn`.
+        The points are relative to (x, y), in units of `size`, and rotated so that the x-axis points along `turn`.
         """
         for colour, grow in ((edge, 2 * rim), (None, 0)) if edge else ((None, 0),):
             for thick, fill, *points in parts:
@@ -117,14 +117,14 @@ class Canvas:
 
 
 class StatePart(NamedTuple):
-    """One drawn part of a state: what it shows, where, and how.
+    """One drawn part of a state, such as a pot or a chef.
 
     Attributes:
-        name: parts of one layout with the same name and values look the same.
-        moves: whether its position depends on the state.
-        anchor: number of its cell; for a moving part, the column of the state record that contains the cell.
-        columns: columns of the state record whose values determine the drawing.
-        draw: called with a canvas, the coordinates of the cell's centre, and the values.
+        name: name of the part; on one layout, parts with the same name and values look the same.
+        moves: whether the position of the part depends on the state.
+        anchor: number of the part's cell; for a moving part, the column of the state record that contains the cell.
+        columns: columns of the state record that determine what the part looks like.
+        draw: function of a canvas, the coordinates of the cell's centre, and the values in `columns`.
     """
 
     name: str
@@ -135,7 +135,7 @@ class StatePart(NamedTuple):
 
 
 VIEW = "view"
-"""Name of the part that outlines the cells that the ego observes."""
+"""Name of the part that draws an outline around the cells that the ego observes."""
 
 
 @lru_cache(maxsize=32)
@@ -157,7 +157,7 @@ def state_parts(layout: Layout) -> tuple[StatePart, ...]:
     for agent, name in ((EGO, "ego"), (TEAMMATE, "teammate")):
         position, facing, hand = (int(number[field][agent]) for field in at[:3])
         parts.append(StatePart(name, True, position, (facing, hand), partial(_draw_chef, layout, agent)))
-    lowest = layout.cells - layout.width  # the footer is below the map's last row
+    lowest = layout.cells - layout.width  # first cell of the last row; the footer is below this row
     parts.append(StatePart("recipe", False, lowest, (at.recipe,), partial(_draw_footer, layout)))
     return tuple(parts)
 
@@ -168,12 +168,12 @@ def cell_centre(layout: Layout, cell: int) -> tuple[float, float]:
 
 
 def item_contents(layout: Layout, item: int) -> list[int]:
-    """Return the ingredient ids in an item byte, with repeats, ascending."""
+    """Return the ids of the ingredients in an item byte, ascending, with one entry per piece."""
     return [i for i in layout.ingredients for _ in range(item // layout.ingredient_item(i) & 3)]
 
 
 def _fixture(layout: Layout, cell: int, recipe: int, delivered: int) -> tuple[tuple[int, ...], Callable[..., None]]:
-    """Return the record columns that a cell's drawing depends on (recipe or delivery), and the drawing function."""
+    """Return the state record columns that a cell's drawing depends on, and the function that draws the cell."""
     if layout.kinds[cell] == layouts.INDICATOR:
         return (recipe,), partial(_draw_indicator, layout)
     if layout.kinds[cell] == layouts.GOAL:
@@ -182,7 +182,7 @@ def _fixture(layout: Layout, cell: int, recipe: int, delivered: int) -> tuple[tu
 
 
 def _draw_constant(layout: Layout, cell: int, canvas: Canvas, x: float, y: float) -> None:
-    """Draw floor, a wall or a pile; below pots and buttons only the counter."""
+    """Draw the constant part of a cell: floor, a wall or a pile, or the counter under a pot or a button."""
     kind, odd = layout.kinds[cell], (cell % layout.width + cell // layout.width) % 2
     if kind == layouts.EMPTY:
         canvas.box(x, y, 1, 1, _FLOOR[1 - odd])
@@ -206,7 +206,7 @@ def _draw_counter(canvas: Canvas, x: float, y: float) -> None:
 
 
 def _draw_goal(canvas: Canvas, x: float, y: float, delivered: int) -> None:
-    """Draw the goal: a serving bell, lit in the step after a correct delivery."""
+    """Draw the goal as a serving bell, which is lit in the step after a correct delivery."""
     hatch = _LAMP if delivered else _READY
     _draw_counter(canvas, x, y)
     canvas.box(x, y, 0.88, 0.88, hatch, 0.08)
@@ -223,7 +223,7 @@ def _draw_indicator(layout: Layout, canvas: Canvas, x: float, y: float, recipe: 
 
 
 def _draw_pot(layout: Layout, canvas: Canvas, x: float, y: float, item: int, timer: int) -> None:
-    """Draw a pot: rings for free slots, an orange rim and the steps left while cooking, a green tick when cooked."""
+    """Draw a pot: rings for free slots, an orange rim and the remaining steps while cooking, a green tick if cooked."""
     contents, cooked = item_contents(layout, item), item & COOKED > 0
     canvas.box(x, y, 0.9, 0.9, _DARK_STEEL, 0.08)
     canvas.strokes([(0.12, _STEEL, (-0.4, 0), (0.4, 0))], x, y - 0.05)
@@ -241,7 +241,7 @@ def _draw_pot(layout: Layout, canvas: Canvas, x: float, y: float, item: int, tim
 
 
 def _draw_button(layout: Layout, canvas: Canvas, x: float, y: float, recipe: int, timer: int) -> None:
-    """Draw a button: a knob with a question mark, or while lit the recipe in a ring that shows the remaining time."""
+    """Draw a button: a question mark, or while the button is lit, the recipe in a ring that shows the time left."""
     canvas.box(x, y, 0.88, 0.88, _DARK_STEEL, 0.2)
     canvas.disc(x, y, 0.42, _LAMP, timer / BUTTON_STEPS)
     canvas.disc(x, y, 0.35, PAPER if timer else _STEEL)
@@ -252,7 +252,7 @@ def _draw_button(layout: Layout, canvas: Canvas, x: float, y: float, recipe: int
 
 
 def _draw_item(layout: Layout, canvas: Canvas, x: float, y: float, item: int, *, radius: float) -> None:
-    """Draw an item byte: nothing, one ingredient, or a plate with its content."""
+    """Draw the item that a byte encodes: nothing, one ingredient, or a plate with its content."""
     contents = item_contents(layout, item)
     if item & PLATE:
         for part, colour in ((1, _PLATE_RIM), (0.88, _WHITE), (0.7, _PLATE_RIM), (0.62, _WHITE)):
@@ -289,7 +289,7 @@ def _draw_view(layout: Layout, canvas: Canvas, x: float, y: float, cell: int) ->
 
 
 def _draw_chef(layout: Layout, agent: int, canvas: Canvas, x: float, y: float, facing: int, hand: int) -> None:
-    """Draw a chef from above: coat in the agent's colour, white hat; eyes, arms and held item point forward."""
+    """Draw an agent as a chef seen from above, in the agent's colour, turned in the direction of its facing."""
     forward = STEP[FACINGS[facing]]
     body = [
         (0.42, AGENT_COLOURS[agent], (-0.16, -0.2), (-0.16, 0.2)),
@@ -308,8 +308,8 @@ def _draw_chef(layout: Layout, agent: int, canvas: Canvas, x: float, y: float, f
 
 
 def _draw_footer(layout: Layout, canvas: Canvas, x: float, y: float, recipe: int) -> None:
-    """Draw the current recipe in the strip below the map, from its left edge."""
+    """Draw the current recipe at the left of the strip below the map."""
     left, middle = x - 0.5, y + 0.5 + FOOTER / 2
-    canvas.text(left + 0.15, middle, "Recipe", 0.34, INK, "lm", room=1.15)
+    canvas.text(left + 0.15, middle, "Recipe", 0.34, INK, "lm", max_width=1.15)
     for number, ingredient in enumerate(item_contents(layout, recipe)):
         _draw_ingredient(canvas, ingredient, left + 1.56 + 0.42 * number, middle, 0.2)

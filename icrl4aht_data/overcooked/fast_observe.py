@@ -1,9 +1,9 @@
-"""Fast rendering of the ego's observations from state records, with NumPy into reusable buffers.
+"""Fast rendering of the ego's observations from state records, with NumPy, into reusable buffers.
 
-`observe` defines what an observation is, for NumPy and JAX. This module calls `observe` once for every value of each
-record element, keeps the results as lookup tables, and renders a step as a copy of a background and a few
-small patches: the background by the ego's cell, recipe and delivery; both agents by facing and item; and what is on
-counters, in pots and on lit buttons.
+`observe` defines observations, for NumPy and JAX. This module calls `observe` once for every value of each record
+element and stores the results in lookup tables. An observation is then a copy of a background, selected by the ego's
+cell, the recipe and the delivery flag, and of small patches: both agents by facing and item, and the contents of
+counters, pots and lit buttons.
 
 `n` denotes the number of steps, `S` the bytes of a state record, `A` the channels of one agent, `C` all channels.
 """
@@ -22,24 +22,24 @@ from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, possible_recipes, record_size
 from icrl4aht_data.utils.system import in_slices
 
-_SLAB = 8192  # steps rendered at a time: smaller blocks lose more time in calls than they save in cache misses
-_IMPOSSIBLE = -(2**40)  # so negative that any sum of lookups with it is negative
-_TIMERS = 32  # values of a timer's five bits
+_SLAB = 8192  # steps rendered at a time: in smaller blocks, function calls cost more time than the cache saves
+_IMPOSSIBLE = -(2**40)  # so low that any sum with this table entry is negative
+_TIMERS = 32  # number of values of a five-bit timer
 _ON_COUNTER, _ON_BUTTON, _IN_POT = 0, 256, 512
-"""Number of the first patch of each kind of cell. An item byte b on a counter is patch b, a lit button that shows
-recipe byte b patch 256 + b, and a pot with item byte b and timer t patch 512 + 256 * t + b."""
+"""Number of the first patch of each kind of cell. Patch b shows item byte b on a counter, patch 256 + b a lit button
+with recipe byte b, and patch 512 + 256 * t + b a pot with item byte b and timer t."""
 
 
 def fast_observe(
     layout: Layout, record: np.ndarray, out: np.ndarray, threads: int = 1, canonical: bool = False
 ) -> np.ndarray:
-    """Render the ego's observations into `out`.
+    """Render the ego's observations into the array `out`, and return `out`.
 
     Args:
-        layout: the layout that was played.
+        layout: layout of the state records.
         record: uint8 (..., S), state records.
         out: uint8 or float32 (..., 5, 5, C), C-contiguous.
-        threads: how many threads share the work.
+        threads: number of threads that share the work.
         canonical: whether to render the canonical channels, see `channels`, instead of the layout's own.
 
     Returns:
@@ -49,7 +49,7 @@ def fast_observe(
         ValueError: if `out` is not C-contiguous.
     """
     if not out.flags.c_contiguous:
-        raise ValueError("expected out to be C-contiguous")
+        raise ValueError("out is not C-contiguous; pass np.ascontiguousarray(out)")
     records = record.reshape(-1, record.shape[-1])
     flat = out.reshape(len(records), VISIBLE, observation_shape(layout, canonical)[-1])
     renderer = _renderer(layout, out.dtype.str, canonical)
@@ -64,15 +64,15 @@ def fast_observe(
 
 
 class _Renderer:
-    """Renderer for one layout, dtype and kind of channels, with its lookup tables."""
+    """Lookup tables and rendering for one layout, one dtype, and own or canonical channels."""
 
     def __init__(self, layout: Layout, dtype: str, canonical: bool) -> None:
         self._layout, self._dtype, self._canonical = layout, np.dtype(dtype), canonical
         self._shape = observation_shape(layout, canonical)
         self._columns = columns(layout)
         fixed = fixed_channels(layout, canonical)
-        self._agent: int = fixed.start // 2  # A: the channels of two agents precede the fixed ones
-        self._first: int = fixed.stop  # first channel whose value on a cell can change
+        self._agent: int = fixed.start // 2  # the number A; the channels of both agents come first
+        self._first: int = fixed.stop  # first channel of items, recipes and timers, which can change
         self._floor = np.flatnonzero(layout.walkable).astype(np.uint8)
         self._recipes = np.append(np.uint8(0), possible_recipes(layout))
         self._in_window = layout.window_position.astype(np.intp)
@@ -84,16 +84,16 @@ class _Renderer:
 
     def render(self, record: np.ndarray, out: np.ndarray) -> None:
         """Render state records uint8 (n, S) into `out` (n, 25, C)."""
-        # The first eight columns as pairs of bytes, the ego's in the low byte: with the ego on cell 17 and the teammate
-        # on cell 20, `positions` is 17 + 20 * 256 = 5137. One lookup by pair replaces two by byte and an addition.
+        # The first eight columns are read as pairs of bytes, with the ego's byte as the low one: for the ego on cell 17
+        # and the teammate on cell 20, `positions` is 17 + 20 * 256 = 5137. A pair needs one lookup instead of two.
         positions, facings, hands, recipe = record[:, :8].copy().view("<u2").T.astype(np.intp)
         background = self._by_positions.take(positions)
         background += self._by_recipe.take(recipe)
         if background.min() < 0 or (facings & 0xFCFC).any() or (record[:, self._columns.pot_timers] >= _TIMERS).any():
-            # The rules never produce such a record, so the tables have no entry; the block takes the slow path.
+            # The tables have no entry for a record that the rules cannot produce: `observe` renders the whole block.
             out.reshape(len(out), *self._shape)[...] = self._observe(record)
             return
-        # The default mode first writes into a copy of `out`, to keep `out` unchanged if an index is out of range.
+        # mode="clip" avoids the temporary copy of `out` that the default mode makes in case an index is out of range.
         np.take(self._background, background, axis=0, out=out.reshape(len(out), -1), mode="clip")
         cells = out.reshape(-1, self._shape[-1])
         self._render_agents(positions, facings, hands, cells)
@@ -104,7 +104,7 @@ class _Renderer:
 
     def _render_agents(self, positions: np.ndarray, facings: np.ndarray, hands: np.ndarray, cells: np.ndarray) -> None:
         ego = _as_items(cells[:, : self._agent])
-        # An agent's appearance is numbered facing * 256 + item byte.
+        # The row of an agent's channels in the lookup table is facing * 256 + item byte.
         ego[CENTRE::VISIBLE] = self._agents.take(((facings & 255) << 8) + (hands & 255))
         where = self._teammate_in_window.take(positions)
         seen = np.flatnonzero(where != NOWHERE)
@@ -112,7 +112,7 @@ class _Renderer:
         teammate[seen * VISIBLE + where[seen]] = self._agents.take((facings[seen] & 0xFF00) + (hands[seen] >> 8))
 
     def _render_cells(self, record: np.ndarray, positions: np.ndarray, cells: np.ndarray) -> None:
-        """Render pots, lit buttons and items on counters that are in view; empty cells need no patch."""
+        """Render visible pots with content, lit buttons and items on counters; the background shows all other cells."""
         filled = record[:, self._cell_columns].copy()
         filled[:, : self._pots] |= record[:, self._columns.pot_timers]
         row, cell = np.divmod(np.flatnonzero(filled), filled.shape[1])
@@ -120,8 +120,8 @@ class _Renderer:
         seen = np.flatnonzero(where != NOWHERE)
         row, cell, where = row[seen], cell[seen], where[seen]
         flat, start = np.ascontiguousarray(record).reshape(-1), row * record.shape[1]
-        # A pot with item byte 8, two pieces of ingredient 0, and timer 0 shows patch 512 + 8; one that cooks, with
-        # item byte 12 and timer 19, patch 512 + 19 * 256 + 12. It is copied onto the pot's cell in the window.
+        # A pot with item byte 8 (two pieces of ingredient 0) and timer 0 shows patch 512 + 8; a cooking pot with item
+        # byte 12 and timer 19 shows patch 512 + 19 * 256 + 12. The patch is copied to the pot's cell in the window.
         patch = self._first_patch.take(cell) + flat.take(start + self._patch_column.take(cell))
         pots = np.flatnonzero(cell < self._pots)
         timers = flat.take(start[pots] + self._columns.pot_timers.start + cell[pots]).astype(np.intp)
@@ -129,9 +129,9 @@ class _Renderer:
         _as_items(cells[:, self._first :])[row * VISIBLE + where] = self._patches.take(patch)
 
     def _make_pair_lookups(self) -> None:
-        """Make lookup tables by a pair of bytes, low byte first: intp (2**16,), negative for pairs that cannot occur.
+        """Make tables intp (2**16,), indexed by two bytes with the low byte first; impossible pairs are negative.
 
-        The sum of the first two is a row of the background.
+        The entries of `_by_positions` and `_by_recipe` add up to the row of the background.
         """
         low, high = np.arange(2**16) & 255, np.arange(2**16) >> 8
         cells = self._layout.cells
@@ -141,18 +141,18 @@ class _Renderer:
         self._teammate_in_window = np.where(on_map, self._in_window[low % cells, high % cells], NOWHERE)
 
     def _make_cell_lookups(self) -> None:
-        """Make lookup tables by the number of a cell that changes: pots first, then buttons, then counters."""
+        """Make lookup tables indexed by the number of a changing cell: first pots, then buttons, then counters."""
         layout, where = self._layout, self._columns
         pots, buttons, counters = map(len, (layout.pots, layout.buttons, layout.counters))
         self._pots = pots
         self._cell_columns = np.r_[where.pot_items, where.buttons, where.counters]
         self._cell_in_window = self._in_window[:, [*layout.pots, *layout.buttons, *layout.counters]].reshape(-1)
         self._first_patch = np.repeat([_IN_POT, _ON_BUTTON, _ON_COUNTER], (pots, buttons, counters))
-        # A lit button shows the recipe, whatever its remaining time.
+        # What a lit button shows depends on the recipe, not on the button's remaining time.
         self._patch_column = np.where(self._first_patch == _ON_BUTTON, where.recipe, self._cell_columns)
 
     def _make_background(self) -> np.ndarray:
-        """Return empty maps by ego cell, recipe and delivery flag, (floor * recipes * 2, 25 * C)."""
+        """Return observations of the empty map, (floor * recipes * 2, 25 * C), by ego cell, recipe, delivery flag."""
         shape = len(self._floor), len(self._recipes), 2
         record = np.zeros((*shape, record_size(self._layout)), np.uint8)
         record[..., 0], record[..., self._columns.recipe] = self._floor[:, None, None], self._recipes[:, None]
@@ -182,7 +182,7 @@ class _Renderer:
         patches = np.zeros((*record.shape[:2], self._shape[-1] - self._first), self._dtype)
         kinds = (slice(0, 1), layout.counters), (slice(1, 2), layout.buttons), (slice(2, None), layout.pots)
         for rows, cells in kinds:
-            # The patch is the same for all cells of a kind, from every floor cell.
+            # All cells of one kind have the same patches, seen from any floor cell, so one view is enough.
             views = [(ego, cell) for cell in cells for ego in self._floor if self._in_window[ego, cell] != NOWHERE]
             if views:
                 record[rows, :, 0] = views[0][0]
@@ -192,17 +192,17 @@ class _Renderer:
 
 
 def _as_items(rows: np.ndarray) -> np.ndarray:
-    """Return rows (n, k) as (n,) opaque items, which NumPy copies at once instead of value by value."""
+    """Return rows (n, k) as opaque items (n,), since NumPy copies an item in one operation."""
     return rows.view(np.dtype((np.void, rows.shape[-1] * rows.itemsize)))[..., 0]
 
 
 def _index_of(values: np.ndarray) -> np.ndarray:
-    """Return the position of each byte among the values, intp (256,), or a large negative number."""
+    """Return the position of each byte in `values`, intp (256,); `_IMPOSSIBLE` for a byte that is not in `values`."""
     lookup = np.full(256, _IMPOSSIBLE, np.intp)
     lookup[values] = np.arange(len(values))
     return lookup
 
 
-@lru_cache(maxsize=256)  # up to 4 MB each; a release may have hundreds of layouts, of which a batch mixes many
+@lru_cache(maxsize=256)  # up to 4 MB per renderer; a batch can mix many of a release's hundreds of layouts
 def _renderer(layout: Layout, dtype: str, canonical: bool) -> _Renderer:
     return _Renderer(layout, dtype, canonical)

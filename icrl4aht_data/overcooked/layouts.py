@@ -1,6 +1,6 @@
-"""The ten layouts (maps, recipes, aliases), their lookup tables, and layouts registered by other packages.
+"""The benchmark's ten layouts (maps, recipes, aliases), their lookup tables, and layouts added by other packages.
 
-A cell is (x, y), x = column, y = row, origin top-left; its flat number is y * width + x.
+A cell (x, y) has column x and row y, from the top left corner; the cell's number is y * width + x.
 Map letters: W wall (= counter), A agent, X goal, B plate pile, P pot, R recipe indicator, L button,
 a digit = ingredient pile, a space = floor. Source: paper, App. A.
 """
@@ -47,19 +47,19 @@ _TWO_RECIPES = ((0, 0, 0), (1, 1, 1))
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A map with its recipes; every property is derived from these arguments.
+    """A map with its recipes; every property is derived from the arguments of this class.
 
     Args:
         name: the paper's short name, such as coord_simple.
         alias: the environment name in OvercookedV2 and in the published manifests, such as grounded_coord_simple.
-        rows: the map, one string per row, all of one width; docs/format.md explains the letters.
-        recipes: different triples of ingredient ids, at least one; the current recipe is drawn uniformly from them.
+        rows: the map, one string per row, all of the same length; docs/format.md explains the letters.
+        recipes: at least one triple of ingredient ids; the current recipe is drawn uniformly from the recipes.
         indicates_delivery: whether the observation has the delivery channel.
 
     Raises:
         OptionError: if the map is not rectangular, has an unknown letter, does not have exactly two agents, has piles
-            of more than three ingredient types (an item is one byte), or an agent can reach the map's edge; if the
-            recipes are not different triples of ingredients that have a pile.
+            of more than three ingredient types (an item is one byte), or an agent can reach the map's edge; or if two
+            recipes are equal, there is no recipe, or an ingredient has no pile.
     """
 
     name: str
@@ -77,15 +77,15 @@ class Layout:
     def _map_fault(self) -> str | None:
         """Return what is wrong with the map, or None."""
         if len({len(row) for row in self.rows}) != 1:
-            return f"rows have widths {[len(row) for row in self.rows]}, expected one"
+            return f"the rows have widths {[len(row) for row in self.rows]}, expected equal widths"
         wrong = {c for row in self.rows for c in row if c not in _LETTERS and c not in digits}
         if wrong:
             return f"unknown map letters {sorted(wrong)}"
         if len(self.agent_cells) != 2:
-            return f"{len(self.agent_cells)} agents 'A' in the map, expected 2"
+            return f"the map has {len(self.agent_cells)} agents 'A', expected 2"
         if self.cells > NOWHERE - 1 or len(self.ingredients) > 3:
             return (
-                f"{self.cells} cells and {len(self.ingredients)} piled ingredient types; "
+                f"the map has {self.cells} cells and piles of {len(self.ingredients)} ingredient types; "
                 f"a state record holds at most {NOWHERE - 1} cells and 3 types"
             )
         for cell in self.walkable.nonzero()[0]:
@@ -99,9 +99,9 @@ class Layout:
         missing = {i for recipe in self.recipes for i in recipe} - set(self.ingredients)
         if missing:
             return f"recipes use ingredients {sorted(missing)} that have no pile"
-        # The order of a recipe's pieces does not matter, so a second order would double its chance.
+        # A recipe listed in two orders of its ingredients would be drawn twice as often.
         if not self.recipes or len({tuple(sorted(recipe)) for recipe in self.recipes}) < len(self.recipes):
-            return f"expected different recipes, at least one, found {list(self.recipes)}"
+            return f"expected at least one recipe, and no recipe twice, found {list(self.recipes)}"
         return None
 
     @property
@@ -121,33 +121,33 @@ class Layout:
 
     @cached_property
     def agent_cells(self) -> tuple[int, ...]:
-        """Cells with the letter `A` in reading order: the ego's, then the teammate's."""
+        """Start cells of the agents, marked `A`, in reading order: the ego's, then the teammate's."""
         return tuple(i for i, c in enumerate("".join(self.rows)) if c == "A")
 
     @cached_property
     def kinds(self) -> np.ndarray:
-        """uint8 (cells,): the kind of each cell."""
+        """uint8 (cells,): kind of each cell, such as `cells.WALL`."""
         return np.array([PILE if c in digits else _LETTERS[c] for c in "".join(self.rows)], np.uint8)
 
     @cached_property
     def ingredients(self) -> tuple[int, ...]:
-        """Ids of the ingredients that have a pile, ascending. The k-th uses bits 2 + 2k of an item byte."""
+        """Ids of the ingredients that have a pile, ascending; the k-th is counted by bits 2 + 2k, 3 + 2k of an item."""
         return tuple(sorted({int(c) for c in "".join(self.rows) if c in digits}))
 
     @cached_property
     def ingredient_types(self) -> int:
-        """Number n of ingredient channels: highest pile id + 1."""
+        """Number n of ingredient channels, the highest id of a piled ingredient + 1."""
         return max(self.ingredients) + 1
 
     @cached_property
     def piles(self) -> np.ndarray:
-        """uint8 (cells,): the item byte taken from a pile, 0 elsewhere."""
+        """uint8 (cells,): item byte that an agent takes from the pile on a cell; 0 for cells without a pile."""
         items = [PLATE if c == "B" else self.ingredient_item(int(c)) if c in digits else 0 for c in "".join(self.rows)]
         return np.array(items, np.uint8)
 
     @cached_property
     def channels(self) -> int:
-        """Number C of observation channels: 25 + 5n, + 1 with the delivery indicator."""
+        """Number C of observation channels: 25 + 5n, or 26 + 5n with the delivery indicator."""
         return 25 + 5 * self.ingredient_types + int(self.indicates_delivery)
 
     @property
@@ -160,32 +160,32 @@ class Layout:
         return 4 << (2 * self.ingredients.index(ingredient))
 
     def recipe_item(self, recipe: tuple[int, int, int]) -> int:
-        """Return the item byte of a recipe: the sum of its three ingredients, no flags."""
+        """Return the item byte of a recipe, which is the sum of its three ingredients' bytes, without flags."""
         return sum(self.ingredient_item(i) for i in recipe)
 
     @cached_property
     def recipe_items(self) -> np.ndarray:
-        """uint8 (R,): the item bytes of the layout's recipes."""
+        """uint8 (R,): item bytes of the layout's R recipes."""
         return np.array([self.recipe_item(recipe) for recipe in self.recipes], np.uint8)
 
     @cached_property
     def rooms(self) -> tuple[np.ndarray, np.ndarray]:
-        """uint8, ascending: the floor cells that each agent can reach from its start."""
-        first, second = (self._room(cell) for cell in self.agent_cells)
+        """Floor cells that the ego can reach, and floor cells that the teammate can reach; uint8, ascending."""
+        first, second = (self._reachable(cell) for cell in self.agent_cells)
         return first, second
 
-    def _room(self, start: int) -> np.ndarray:
+    def _reachable(self, start: int) -> np.ndarray:
         floor = set((self.kinds == EMPTY).nonzero()[0].tolist())
         room, edge = set(), {start}
         while edge:
             room |= edge
-            # A step off the map's edge would end in another row; maps whose edge can be reached are refused.
+            # A step beyond the map's edge would wrap to another row; maps with a reachable edge raise an error.
             edge = {cell + dy * self.width + dx for cell in edge for dx, dy in STEP.values()} & floor - room
         return np.array(sorted(room), np.uint8)
 
     @cached_property
     def shows_recipe(self) -> bool:
-        """Whether the ego can see an indicator or a button, which show the current recipe, from a cell of its room."""
+        """Whether the ego can see a recipe indicator or a button from at least one cell that it can reach."""
         shown = ((self.kinds == INDICATOR) | (self.kinds == BUTTON)).nonzero()[0]
         own = self.rooms[EGO].astype(int)
         (rows, columns), (own_rows, own_columns) = (divmod(cells, self.width) for cells in (shown, own))
@@ -194,20 +194,20 @@ class Layout:
 
     @cached_property
     def walkable(self) -> np.ndarray:
-        """bool (cells,): floor cells that some agent can reach."""
+        """bool (cells,): True for floor cells that at least one agent can reach."""
         floor = np.zeros(self.cells, bool)
         floor[np.concatenate(self.rooms)] = True
         return floor
 
     @cached_property
     def ahead(self) -> np.ndarray:
-        """uint8 (cells, 4): the cell that an agent on a walkable cell faces, by facing; 0 elsewhere."""
+        """uint8 (cells, 4): cell in front of an agent, by the agent's cell and facing; 0 for cells not walkable."""
         steps = [dy * self.width + dx for dx, dy in (STEP[name] for name in FACINGS)]
         return np.where(self.walkable[:, None], np.arange(self.cells)[:, None] + steps, 0).astype(np.uint8)
 
     @cached_property
     def moves(self) -> np.ndarray:
-        """uint8 (cells, 6): the cell after an action if the other agent is not in the way."""
+        """uint8 (cells, 6): an agent's next cell by its cell and action, if the other agent does not block it."""
         table = np.repeat(np.arange(self.cells, dtype=np.uint8)[:, None], len(ACTIONS), axis=1)
         for action, name in enumerate(ACTIONS):
             if name in FACINGS:
@@ -218,23 +218,23 @@ class Layout:
 
     @cached_property
     def pots(self) -> tuple[int, ...]:
-        """Cells of the pots, in reading order."""
+        """Numbers of the cells with a pot, in reading order."""
         return tuple(int(c) for c in (self.kinds == POT).nonzero()[0])
 
     @cached_property
     def buttons(self) -> tuple[int, ...]:
-        """Cells of the buttons, in reading order."""
+        """Numbers of the cells with a button, in reading order."""
         return tuple(int(c) for c in (self.kinds == BUTTON).nonzero()[0])
 
     @cached_property
     def counters(self) -> tuple[int, ...]:
-        """Cells of the walls that some agent can face, in reading order: the only ones that can hold an item."""
+        """Numbers of the wall cells that an agent can face, in reading order; only these walls can hold an item."""
         reach = np.unique(self.ahead[self.walkable])
         return tuple(int(c) for c in reach if self.kinds[c] == WALL)
 
     @cached_property
     def window(self) -> np.ndarray:
-        """int16 (cells, 25): the cells of the 5 x 5 window centred on a cell, in reading order; -1 outside the map."""
+        """int16 (cells, 25): cells of the 5 x 5 window around each cell, in reading order; -1 outside the map."""
         cell, position, reach = np.arange(self.cells)[:, None], np.arange(VISIBLE), WINDOW // 2
         x, y = cell % self.width + position % WINDOW - reach, cell // self.width + position // WINDOW - reach
         inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
@@ -242,7 +242,7 @@ class Layout:
 
     @cached_property
     def window_position(self) -> np.ndarray:
-        """uint8 (cells, cells): position of the second cell in the first one's window, or NOWHERE."""
+        """uint8 (cells, cells): position of the second cell in the window around the first cell, or NOWHERE."""
         table = np.full((self.cells, self.cells), NOWHERE, np.uint8)
         cell, position = np.nonzero(self.window >= 0)
         table[cell, self.window[cell, position]] = position
@@ -250,7 +250,7 @@ class Layout:
 
     @cached_property
     def tables(self) -> Tables:
-        """The lookup tables that rules, observations and scripted agents take as an argument."""
+        """Lookup tables of this layout, an argument of the rules, the observations and the scripted agents."""
         return make_tables(self)
 
     def __repr__(self) -> str:
@@ -263,7 +263,7 @@ def _field_types() -> dict[str, Any]:
 
 
 def tables_of(layout: Layout | Tables) -> Tables:
-    """Return the tables of a layout; tables are returned as they are."""
+    """Return the lookup tables of a layout; an argument that is already `Tables` is returned unchanged."""
     return layout.tables if isinstance(layout, Layout) else layout
 
 
@@ -321,7 +321,7 @@ _ALL = (
 )
 
 LAYOUTS: dict[str, Layout] = {layout.name: layout for layout in _ALL}
-"""The ten layouts of the benchmark: short name -> layout."""
+"""The ten layouts of the benchmark by short name."""
 
 _BY_ALIAS = {layout.alias: layout for layout in _ALL}
 
@@ -329,21 +329,21 @@ LAYOUT_PLUGINS = Plugins("icrl4aht.layouts", (*LAYOUTS, *_BY_ALIAS))
 """Layouts registered by other installed packages; no published task uses them."""
 
 _content = attrgetter("rows", "recipes", "indicates_delivery")
-_OF_RELEASES: dict[str, Layout] = {}  # those that the releases opened in this process carry, and generated ones
+_RELEASE_LAYOUTS: dict[str, Layout] = {}  # layouts from releases opened in this process, and generated layouts
 
 
 def get_layout(name: str) -> Layout:
     """Return the layout with a short name (coord_simple) or environment name (grounded_coord_simple).
 
-    A layout registered by another package has one name, see docs/extending.md.
+    A layout registered by another package has only one name, see docs/extending.md.
 
     Raises:
-        UnknownNameError: lists the valid names and the nearest.
+        UnknownNameError: for an unknown layout; the message lists the valid names and suggests the nearest.
         PluginError: if a registered layout cannot be used.
     """
     if not isinstance(name, str):
         raise unknown("layout", name, all_layout_names())
-    layout = LAYOUTS.get(name) or _BY_ALIAS.get(name) or _OF_RELEASES.get(name) or _of_manifests().get(name)
+    layout = LAYOUTS.get(name) or _BY_ALIAS.get(name) or _RELEASE_LAYOUTS.get(name) or _manifest_layouts().get(name)
     if layout is not None:
         return layout
     if name not in LAYOUT_PLUGINS.names:
@@ -361,12 +361,12 @@ class LayoutLine(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
     Args:
         name: the layout's name, which is also its environment name.
-        map: its rows.
+        map: rows of the map, as strings.
         recipes: triples of ingredient ids.
         indicates_delivery: whether observations have the delivery channel.
-        family: family of generated layouts, or `layouts_file.OTHER`.
-        seed: seed of the family's sequence; None for a layout that was not generated.
-        number: number in that sequence.
+        family: family of the generated layout, or `layouts_file.OTHER`.
+        seed: seed of the sequence of generated layouts; None for a layout that was not generated.
+        number: position of the layout in the sequence of generated layouts, or None.
     """
 
     name: str
@@ -378,13 +378,13 @@ class LayoutLine(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     number: int | None = None
 
     def layout(self) -> Layout:
-        """Return the layout; see `Layout` for the errors."""
+        """Return the layout that the line describes; see `Layout` for the errors."""
         return Layout(self.name, self.name, self.map, self.recipes, self.indicates_delivery)
 
 
 @cache
-def _of_manifests() -> dict[str, Layout]:
-    """Return the layouts of this package's own tasks that are not published: name -> layout."""
+def _manifest_layouts() -> dict[str, Layout]:
+    """Return the layouts of this package's tasks that the paper does not have, by name."""
     path = Path(__file__).parent.parent / "manifests" / "layouts.jsonl"
     lines = msgspec.json.Decoder(LayoutLine).decode_lines(path.read_bytes())
     return {line.name: line.layout() for line in lines}
@@ -392,47 +392,47 @@ def _of_manifests() -> dict[str, Layout]:
 
 @lru_cache(maxsize=1024)
 def with_recipes(layout: Layout, recipes: tuple[tuple[int, int, int], ...]) -> Layout:
-    """Return a layout with other recipes; equal arguments give the same object.
+    """Return a copy of a layout with other recipes; equal arguments give the same object.
 
     Raises:
-        OptionError: if the recipes are not different triples of ingredients that have a pile.
+        OptionError: if there is no recipe, two recipes are equal, or an ingredient has no pile.
     """
     return replace(layout, recipes=recipes)
 
 
 def add_layouts(layouts: Iterable[Layout]) -> list[Layout]:
-    """Make layouts known to `get_layout` in this process, as opening a release does with those that it carries.
+    """Make layouts available to `get_layout` in this process, such as those stored in an opened release.
 
     Returns:
-        The layouts; one that was known before is the earlier object.
+        The layouts; a layout that was already available is returned as the earlier object.
 
     Raises:
-        OptionError: if another layout has the name of one of them.
+        OptionError: if a layout has the name of a different available layout.
     """
     found = []
     for layout in layouts:
-        is_known = layout.name in all_layout_names() or layout.name in _of_manifests()
+        is_known = layout.name in all_layout_names() or layout.name in _manifest_layouts()
         known = get_layout(layout.name) if is_known else layout
         if _content(known) != _content(layout):
             raise OptionError(
-                f"layout {layout.name!r}: differs from the layout that this name stands for; expected "
+                f"layout {layout.name!r}: differs from the known layout of this name; expected "
                 f"{'/'.join(known.rows)} with recipes {known.recipes}, found {'/'.join(layout.rows)} with recipes "
-                f"{layout.recipes}: give it another name"
+                f"{layout.recipes}: give the new layout another name"
             )
-        found.append(_OF_RELEASES.setdefault(layout.name, known))
+        found.append(_RELEASE_LAYOUTS.setdefault(layout.name, known))
     return found
 
 
-def further_layout_names() -> tuple[str, ...]:
-    """Return the names of layouts that the benchmark does not have: registered ones, and those of opened releases."""
-    return (*LAYOUT_PLUGINS.names, *(name for name in _OF_RELEASES if name not in LAYOUTS))
+def added_layout_names() -> tuple[str, ...]:
+    """Return the names of layouts registered by other packages, stored in opened releases, or generated."""
+    return (*LAYOUT_PLUGINS.names, *(name for name in _RELEASE_LAYOUTS if name not in LAYOUTS))
 
 
 def known_layouts() -> list[Layout]:
-    """Return all layouts that this process knows: published ones, those of this package's tasks, and further ones."""
-    return list({name: get_layout(name) for name in (*LAYOUTS, *_of_manifests(), *further_layout_names())}.values())
+    """Return all layouts: those of the benchmark, of this package's tasks, of other packages and opened releases."""
+    return list({name: get_layout(name) for name in (*LAYOUTS, *_manifest_layouts(), *added_layout_names())}.values())
 
 
 def all_layout_names() -> list[str]:
-    """Return all names that `get_layout` accepts: short names, environment names, and further ones."""
-    return [*LAYOUTS, *_BY_ALIAS, *further_layout_names()]
+    """Return the short and environment names of the benchmark's layouts, and the names of added layouts."""
+    return [*LAYOUTS, *_BY_ALIAS, *added_layout_names()]

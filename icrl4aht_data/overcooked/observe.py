@@ -1,18 +1,18 @@
-"""State records -> 5 x 5 observations, batch first, for NumPy and JAX alike (paper, App. A.2 and App. D).
+"""Converts state records to 5 x 5 observations, for NumPy and JAX arrays with batch axes first (paper, App. A.2, D).
 
 Channels, in order, for n ingredient types:
 
     self        7 + n   position 1, facing 4 (up, down, right, left), item in hand 2 + n (plate, cooked, counts)
-    other       7 + n   the same for the other agent
+    other       7 + n   position, facing and item in hand of the other agent
     static      6       wall, goal, pot, recipe indicator, button, plate pile
     piles       n       ingredient piles
     item        2 + n   the item on the cell, or the pot's content
-    recipe      2 + n   on recipe indicators always, on buttons while lit; plate and cooked are always 0
-    pot timer   1       0..19
-    delivery    1       on goal cells in the step after a correct delivery; only test_simple and test_wide
+    recipe      2 + n   the recipe, on recipe indicators and lit buttons; plate and cooked are always 0
+    pot timer   1       steps until the pot is cooked, 0..19
+    delivery    1       1 on goals in the step after a correct delivery; only on test_simple and test_wide
 
-`channels` lists their names. The canonical channels, shared by all layouts, have n = 4 and delivery.
-Cells outside the map are all zero. Every value is an integer in 0..19: uint8 holds it without loss.
+The module `channels` lists the channels' names. The canonical channels, shared by all layouts, have n = 4 and delivery.
+Cells outside the map are zero in all channels. All values are integers in 0..19, which uint8 stores without loss.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from icrl4aht_data.overcooked.tables import (
 
 
 def observe(layout: Layout | Tables, record: Array, agent: int, canonical: bool = False) -> Array:
-    """Return the observations of one agent: the 5 x 5 cells around it.
+    """Return the observations of one agent, which show the 5 x 5 cells around the agent.
 
     Args:
-        layout: the layout, or its tables.
+        layout: the layout, or its lookup tables.
         record: uint8 (B, S), state records.
         agent: 0 (ego) or 1 (teammate).
         canonical: whether to return the canonical channels, see `channels`, instead of the layout's own.
 
     Returns:
-        uint8 (B, 5, 5, C). NumPy and JAX give equal bytes.
+        Observations uint8 (B, 5, 5, C); NumPy and JAX give equal bytes.
 
     Raises:
         OptionError: if the layout has an ingredient that has no canonical channel.
@@ -62,24 +62,24 @@ def observe_both(layout: Layout | Tables, record: Array, canonical: bool = False
 
 
 def fixed_channels(layout: Layout, canonical: bool = False) -> slice:
-    """Return the slice of channels that are constant for a cell: its kind and its ingredient pile."""
+    """Return the slice of channels that never change: a cell's kind and its ingredient pile."""
     names = CANONICAL_CHANNELS if canonical else channel_names(layout)
     return slice(names.index("wall"), names.index("item_plate"))
 
 
 def _expand(tables: Tables, agents: Array, cells: Array, canonical: bool) -> Array:
-    """Unpack words uint32 (B, 25) of agents and of cells to uint8 (B, 5, 5, C)."""
+    """Unpack packed words of agents and of cells, uint32 (B, 25), to observations uint8 (B, 5, 5, C)."""
     xp = agents.__array_namespace__()
     shift, mask, of_agents = (xp.asarray(one) for one in (tables.canonical if canonical else tables.own))
     if not len(shift):
-        raise OptionError("canonical channels: the layout has an ingredient without one, take its own channels")
+        raise OptionError('an ingredient of the layout has no canonical channel; use channels="own"')
     word = xp.where(of_agents, agents[..., None], cells[..., None])
     values = xp.astype(word >> shift & mask, xp.uint8)
     return xp.reshape(values, (*agents.shape[:-1], WINDOW, WINDOW, len(shift)))
 
 
 def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
-    """Return two uint32 (B, 25): for each visible cell the word of the agents on it, and its own word."""
+    """Return two packed words uint32 (B, 25) per visible cell: of the agents on the cell, and of the cell itself."""
     xp = record.__array_namespace__()
     state = unpack(tables, record)
     me, other = state.positions[..., agent], state.positions[..., 1 - agent]
@@ -93,7 +93,7 @@ def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
     right, down = (look_up(axis, other) - look_up(axis, me) for axis in (tables.column, tables.row))
     reach = WINDOW // 2
     seen = (xp.abs(right) <= reach) & (xp.abs(down) <= reach)
-    # The observer is always in the centre. An agent out of view is at NOWHERE, which equals no position in the window.
+    # The observer is always in the centre. An agent out of view gets position NOWHERE, which matches no visible cell.
     relative = xp.where(seen, CENTRE + right + WINDOW * down, NOWHERE)
     position = xp.arange(VISIBLE, dtype=xp.int32)
     none = xp.zeros_like(cells)
@@ -104,8 +104,8 @@ def _words(tables: Tables, record: Array, agent: int) -> tuple[Array, Array]:
 
 
 def _changing_words(xp, state: State) -> Array:
-    """Return the changing words, uint32 (B, 3 + P + L + K): nothing, indicator, goal, pots, buttons, counters."""
-    # The plate and cooked flags are dropped: a recipe has neither.
+    """Return the cells' changing words uint32 (B, 3 + P + L + K): 0, indicator, goal, pots, buttons, counters."""
+    # The shift by 2 removes the plate and cooked flags, which a recipe never has.
     recipe = xp.astype(state.recipe >> 2, xp.uint32)[..., None] << RECIPE_BIT
     delivered = xp.astype(state.delivered, xp.uint32)[..., None] << DELIVERY_BIT
     pots = xp.astype(state.pot_items, xp.uint32) | xp.astype(state.pot_timers, xp.uint32) << TIMER_BIT

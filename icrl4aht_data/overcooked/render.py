@@ -1,7 +1,7 @@
-"""Pictures of state records: a frame as an array or PNG, an episode as an animated GIF.
+"""Pictures of state records: one state as an array of pixels, or an episode as an animated GIF.
 
-Positions and lengths are in cells, (0, 0) is the map's top left corner. Pictures are drawn enlarged,
-then reduced, for smooth edges.
+Positions and lengths are in cells, and (0, 0) is the top left corner of the map. Pictures are drawn larger than
+requested and then reduced, so edges are smooth.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ if TYPE_CHECKING:
     from PIL import Image
 
 _ENLARGE = 4
-_CELL_SIZES = 16, 128  # pixels: below, details vanish; above, the frames of an episode take more than 400 MB
-_GIF_COLOURS = 127  # the last palette entry is transparent, for pixels that do not change
+_CELL_SIZES = 16, 128  # pixels: smaller cells lose details, with larger ones an episode takes more than 400 MB
+_GIF_COLOURS = 127  # a 128th palette entry is needed for transparent pixels, which do not change between frames
 
 
 def draw_frame(
     layout: Layout, record: np.ndarray, *, cell: int = 48, caption: str = "", view: bool = True
 ) -> np.ndarray:
-    """Return a picture of one state: ego blue, teammate red, a footer with the current recipe and a one-line caption.
+    """Return a picture of one state: ego blue, teammate red, and a footer with the current recipe and a caption.
 
     Args:
         layout: the layout.
         record: state record uint8 (S,).
         cell: side of a map cell in pixels, 16 to 128.
-        caption: text for the footer; a long one gets a smaller font.
+        caption: one line of text for the footer; a long text gets a smaller font.
         view: whether to outline the cells that the ego observes.
 
     Returns:
-        uint8 (height, width, 3), RGB: `cell` pixels per row and column of the map, and a footer of 0.8 cells below.
+        RGB image uint8 (height, width, 3), `cell` pixels per row and column of the map, plus a footer of 0.8 cells.
 
     Raises:
-        OptionError: if Pillow is missing, the record has another shape or dtype or impossible values, or `cell` is not
-            within 16..128.
+        OptionError: if Pillow is missing, the record has the wrong shape or dtype or impossible values, or `cell` is
+            not within 16..128.
     """
-    return np.array(_picture(layout, _checked(layout, record, 1, cell), cell, caption, view))
+    return np.array(_draw_state(layout, _check_records(layout, record, 1, cell), cell, caption, view))
 
 
 def save_episode(
@@ -65,8 +65,8 @@ def save_episode(
     """Write an episode as a GIF of T frames that loops endlessly. The file is written atomically.
 
     Args:
-        path: the file to write.
-        layout, records, rewards, cell, fps: see `encode_episode`, also for the errors.
+        path: path of the GIF file.
+        layout, records, rewards, cell, fps: arguments of `encode_episode`, which raises the same errors.
     """
     content = encode_episode(layout, records, rewards, cell=cell, fps=fps)
     with atomic_write(Path(path)) as partial:
@@ -80,27 +80,27 @@ def encode_episode(
 
     Args:
         layout: the layout.
-        records: state records uint8 (T, S) in order.
-        rewards: real (T,), the reward of the step from each record; the captions then show the return so far.
+        records: state records uint8 (T, S) in order of time.
+        rewards: real (T,), reward of the step that starts at each record; if given, captions show the return so far.
         cell: side of a map cell in pixels, 16 to 128.
         fps: frames per second, 1 to 50.
 
     Raises:
-        OptionError: as in `draw_frame`, or for no records, rewards of another shape, or an impossible fps.
+        OptionError: for the reasons given in `draw_frame`, no records, rewards of the wrong shape, or an invalid fps.
     """
-    records = _checked(layout, records, 2, cell)
+    records = _check_records(layout, records, 2, cell)
     rewards = np.full(len(records), np.nan) if rewards is None else np.asarray(rewards)
-    _require(rewards.shape == (len(records),), f"rewards ({len(records)},), one a record", rewards.shape)
+    _require(rewards.shape == (len(records),), f"rewards ({len(records)},), one per record", rewards.shape)
     _require(isinstance(fps, (int, float)) and 1 <= fps <= 50, "fps from 1 to 50", repr(fps))
     frames, earned = [], 0.0
     for step, (record, reward) in enumerate(zip(records, rewards.tolist(), strict=True)):
         caption = f"step {step}" if math.isnan(reward) else f"step {step}   return {earned:g}"
-        frames.append(_picture(layout, record, cell, caption, True))
+        frames.append(_draw_state(layout, record, cell, caption, True))
         earned += reward
     colours, dither = _shared_palette(frames), _pillow("Image").Dither.NONE
     first, *rest = (frame.quantize(palette=colours, dither=dither) for frame in frames)
     other = {"duration": round(1000 / fps), "loop": 0}
-    palette = bytes(colours.getpalette() or [])  # an explicit palette is written once, not once per frame
+    palette = bytes(colours.getpalette() or [])  # Pillow writes an explicit palette once instead of once per frame
     content = BytesIO()
     first.save(content, format="GIF", save_all=True, append_images=rest, palette=palette, optimize=True, **other)
     return content.getvalue()
@@ -115,7 +115,7 @@ def _require(fulfilled: bool, expected: str, found: object) -> None:
         raise OptionError(f"expected {expected}, found {found}")
 
 
-def _checked(layout: Layout, records: np.ndarray, dimensions: int, cell: int) -> np.ndarray:
+def _check_records(layout: Layout, records: np.ndarray, dimensions: int, cell: int) -> np.ndarray:
     records, size = np.asarray(records), record_size(layout)
     fits = records.dtype == np.uint8 and records.ndim == dimensions and records.shape[-1] == size and records.size > 0
     expected = f"uint8 ({size},)" if dimensions == 1 else f"uint8 (T, {size})"
@@ -128,7 +128,7 @@ def _checked(layout: Layout, records: np.ndarray, dimensions: int, cell: int) ->
 
 
 def _shared_palette(frames: list[Image.Image]) -> Image.Image:
-    """Return the palette: the most frequent colours of any single frame, which keeps colours of few frames."""
+    """Return a palette for all frames; a colour ranks by its largest pixel count in any single frame."""
     most = Counter()
     for frame in frames:
         most |= Counter({colour: count for count, colour in frame.getcolors(frame.width * frame.height) or []})
@@ -143,7 +143,7 @@ def _font(pixels: int) -> Any:
 
 
 class _Picture:
-    """Draws the shapes of a `Canvas` in an enlarged Pillow image, each kind by the method with its name."""
+    """Draws the shapes of a `Canvas` in an enlarged Pillow image; each method draws the kind of shape that it names."""
 
     def __init__(self, width: float, height: float, cell: int) -> None:
         self.unit = cell * _ENLARGE
@@ -156,7 +156,7 @@ class _Picture:
         self.pen.rounded_rectangle((left, top, left + wide - 1, top + high - 1), self.unit * radius, fill)
 
     def disc(self, x: float, y: float, radius: float, fill: tuple, part: float = 1) -> None:
-        """Draw a disc, or a sector of `part` (0..1) of it, clockwise from the top."""
+        """Draw a disc, or with `part` < 1 only this fraction of the disc, clockwise from the top."""
         bounds = [self.unit * v for v in (x - radius, y - radius, x + radius, y + radius)]
         self.pen.pieslice(bounds, -90, 360 * part - 90, fill)
 
@@ -169,21 +169,21 @@ class _Picture:
         corners = [self.unit * v for v in (left, top, right, bottom)]
         self.pen.rectangle(corners, outline=fill, width=round(self.unit * thickness))
 
-    def text(self, x: float, y: float, words: str, size: float, fill: tuple, anchor: str, room: float) -> None:
-        """Draw text, shrunk if it is wider than `room`."""
+    def text(self, x: float, y: float, words: str, size: float, fill: tuple, anchor: str, max_width: float) -> None:
+        """Draw text, shrunk if it is wider than `max_width`."""
         width = self.pen.textlength(words, _font(round(self.unit * size))) / self.unit
-        font = _font(max(1, int(self.unit * size * room / max(room, width))))
+        font = _font(max(1, int(self.unit * size * max_width / max(max_width, width))))
         self.pen.text((self.unit * x, self.unit * y), words, fill, font, anchor, stroke_width=round(font.size / 40))
 
 
-def _picture(layout: Layout, record: np.ndarray, size: int, caption: str, view: bool) -> Image.Image:
+def _draw_state(layout: Layout, record: np.ndarray, size: int, caption: str, view: bool) -> Image.Image:
     canvas, picture = Canvas(), _Picture(layout.width, layout.height + FOOTER, size)
     for part in state_parts(layout):
         if view or part.name != VIEW:
             cell = int(record[part.anchor]) if part.moves else part.anchor
             part.draw(canvas, *cell_centre(layout, cell), *(int(record[column]) for column in part.columns))
     middle = layout.height + FOOTER / 2
-    canvas.text(layout.width - 0.15, middle, caption, 0.34, INK, "rm", room=layout.width - 2.9)
+    canvas.text(layout.width - 0.15, middle, caption, 0.34, INK, "rm", max_width=layout.width - 2.9)
     for kind, *values in canvas.shapes:
         getattr(picture, kind)(*values)
     return picture.image.reduce(_ENLARGE)

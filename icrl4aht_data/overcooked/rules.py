@@ -1,8 +1,8 @@
 """The rules: one step of the game as a pure function, for NumPy and JAX arrays, batch axes first.
 
-Order of a step (paper, App. A.1; constants checked against OvercookedV2):
-1. agents turn and move; 2. collisions and 3. exchanges of cells are undone; 4. agent 0 interacts, then agent 1, in the
-state that agent 0 left; 5. timers count down; 6. a correct delivery changes the recipe.
+Order of a step (paper, App. A.1; constants checked against OvercookedV2): 1. Agents turn and move. 2. Collisions and
+3. exchanges of cells are undone. 4. Agent 0 interacts, then agent 1 in the resulting state. 5. Timers count down. 6. A
+correct delivery changes the recipe.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SHAPED_PLATE_PICKUP = 3.0
 CORRECT, WRONG, PRESSED, PLACED, USEFUL_PLACEMENT, TOOK_DISH, USEFUL_DISH, USEFUL_PLATE = (1 << i for i in range(8))
 """Event bits of one agent in one step.
 
-    CORRECT, WRONG      delivered the current recipe's dish, or another one
+    CORRECT, WRONG      delivered a dish of the current recipe, or another dish
     PRESSED             pressed a button
     PLACED              put an ingredient into a pot; USEFUL_PLACEMENT: an ingredient that the recipe still needs
     TOOK_DISH           took a dish out of a pot; USEFUL_DISH: a dish of the current recipe
@@ -44,12 +44,12 @@ CORRECT, WRONG, PRESSED, PLACED, USEFUL_PLACEMENT, TOOK_DISH, USEFUL_DISH, USEFU
 
 
 class StepResult(NamedTuple):
-    """The result of one step. `B` denotes the batch dimensions.
+    """The result of one step of the game. `B` denotes the batch dimensions.
 
     Args:
         state: uint8 (B, S), the next state record.
         reward: float32 (B,), the team's reward.
-        shaped: float32 (B, 2), each agent's shaped reward, not part of the team's.
+        shaped: float32 (B, 2), each agent's shaped reward, which the team's reward does not include.
         events: uint8 (B, 2), event bits of each agent.
     """
 
@@ -63,19 +63,19 @@ def step(layout: Layout | Tables, record: Array, actions: Array, next_recipe: Ar
     """Return the result of one step of the game.
 
     Args:
-        layout: the layout, or its tables.
+        layout: the layout, or its lookup tables.
         record: uint8 (B, S), the state record.
         actions: integers (B, 2), action ids 0..5 of ego and teammate.
-        next_recipe: uint8 (B,), item byte of the recipe that follows a correct delivery in this step.
+        next_recipe: uint8 (B,), item byte of the next recipe if the step has a correct delivery.
 
     Returns:
-        The next states, rewards and events; NumPy and JAX give equal bytes.
+        The next state, the rewards and the events; NumPy and JAX give equal bytes.
     """
     xp = record.__array_namespace__()
     tables = tables_of(layout)
     state = unpack(tables, record)
     state = _move(tables, xp, state, actions)
-    # Both agents' events count the plates in hand before either interacts.
+    # The event USEFUL_PLATE depends on the number of plates in both agents' hands before agent 0 interacts.
     plates_in_hand = xp.sum(state.hands == PLATE, axis=-1, dtype=xp.uint8)
     recipe = state.recipe
     events = []
@@ -86,7 +86,7 @@ def step(layout: Layout | Tables, record: Array, actions: Array, next_recipe: Ar
     happened = xp.stack(events, axis=-1)
     correct = xp.any((happened & CORRECT) > 0, axis=-1)
 
-    # Timers set in this step also count down in it: a press is visible in BUTTON_STEPS - 1 observations.
+    # A timer set in this step already counts down in this step, so a press shows in BUTTON_STEPS - 1 observations.
     ticking = state.pot_timers > 0
     pot_timers = xp.astype(state.pot_timers - ticking, xp.uint8)
     pot_items = xp.astype(state.pot_items | ((ticking & (pot_timers == 0)) * np.uint8(COOKED)), xp.uint8)
@@ -102,12 +102,12 @@ def step(layout: Layout | Tables, record: Array, actions: Array, next_recipe: Ar
 
 
 def team_reward(events: Array) -> Array:
-    """Return the team reward, float32 (B,), of event bits uint8 (B, 2)."""
+    """Return the team's reward, float32 (B,), for event bits uint8 (B, 2)."""
     return _score(events, {CORRECT: DELIVERY_REWARD, WRONG: WRONG_DELIVERY_REWARD, PRESSED: PRESS_REWARD}).sum(axis=-1)
 
 
 def shaped_rewards(events: Array) -> Array:
-    """Return each agent's shaped reward, float32 (B, 2), of event bits uint8 (B, 2)."""
+    """Return the shaped reward of each agent, float32 (B, 2), for event bits uint8 (B, 2)."""
     return _score(
         events,
         {
@@ -124,20 +124,20 @@ def _score(events: Array, values: dict[int, float]) -> Array:
 
 
 def look_up(table: Array, index: Array) -> Array:
-    """Return `table[index]` for a NumPy table and a NumPy or JAX index, or a JAX table and a JAX index."""
+    """Return `table[index]` with the index's array library; the table may be a NumPy array for a JAX index."""
     xp = index.__array_namespace__()
     return xp.take(xp.asarray(table), xp.astype(index, xp.int32), axis=0)
 
 
 def _move(tables: Tables, xp, state: State, actions: Array) -> State:
-    """Apply steps 1 to 3: a directional action always turns; no agent enters an occupied or contested cell."""
+    """Turn and move both agents; undo moves of both agents into one cell, and exchanges of cells."""
     moved = look_up(tables.moves.reshape(-1), xp.astype(state.positions, xp.int32) * 6 + actions)
     old0, old1 = state.positions[..., 0], state.positions[..., 1]
     new0, new1 = moved[..., 0], moved[..., 1]
-    # With two agents, undoing until no conflict remains has a closed form: if the wanted cells coincide both go
-    # back, which leaves no further conflict; exchanging cells sends both back too.
+    # OvercookedV2 undoes moves until no conflict remains. For two agents one condition is enough: both go back if they
+    # want the same cell or exchange cells, and then no conflict remains.
     undo = (new0 == new1) | ((new0 == old1) & (new1 == old0))
-    facing = xp.astype(actions ^ (actions >> 1), xp.uint8)  # equals FACING_OF, without a lookup
+    facing = xp.astype(actions ^ (actions >> 1), xp.uint8)  # equals FACING_OF[actions] but is faster
     return state._replace(
         positions=xp.where(undo[..., None], state.positions, moved),
         facings=xp.where(actions < len(FACINGS), facing, state.facings),
@@ -147,13 +147,13 @@ def _move(tables: Tables, xp, state: State, actions: Array) -> State:
 def _interact(
     tables: Tables, xp, state: State, agent: int, acting: Array, plates_in_hand: Array
 ) -> tuple[State, Array]:
-    """Apply step 4 (interaction) of one agent where `acting`, bool (B,); return state and event bits uint8 (B,)."""
+    """Apply one agent's interaction where `acting`, bool (B,), is True; return the state and event bits uint8 (B,)."""
     hand = state.hands[..., agent]
     pose = xp.astype(state.positions[..., agent], xp.int32) * 4 + state.facings[..., agent]
     faced = look_up(tables.faced.reshape(-1), pose)
     kind, pile, number = faced & 255, xp.astype(faced >> 8 & 255, xp.uint8), faced >> 16
     facing_pot, facing_counter = acting & (kind == POT), acting & (kind == WALL)
-    # One-hot over the few cells that hold items: reads and writes without a scatter, in either library.
+    # One-hot masks over the few cells that hold items read and write in NumPy and JAX without a scatter.
     at_pot = (number[..., None] == _range(xp, len(tables.pots))) & facing_pot[..., None]
     at_counter = (number[..., None] == _range(xp, len(tables.counters))) & facing_counter[..., None]
     at_button = (number[..., None] == _range(xp, len(tables.buttons))) & (acting & (kind == BUTTON))[..., None]
@@ -173,7 +173,7 @@ def _interact(
 
     dish = state.recipe | np.uint8(PLATE | COOKED)
     correct = delivers & (hand == dish)
-    # The hand has a count of 1, the lower bit of its type's count; both bits together mask that count.
+    # A held ingredient sets only the lower of its type's two count bits; `same_type` masks both bits.
     same_type = hand | hand << 1
     useful_placement = adds & ((content & same_type) < (state.recipe & same_type))
     useful_dish = takes_dish & ((content | PLATE) == dish)
@@ -215,5 +215,5 @@ def _range(xp, n: int) -> Array:
 
 
 def _read(xp, at: Array, values: Array) -> Array:
-    """Return uint8 (B,): the value of (B, K) selected by the one-hot `at` (B, K), or 0 if it selects none."""
+    """Return the element of `values` (B, K) that the one-hot mask `at` (B, K) selects, uint8 (B,); 0 for none."""
     return xp.sum(xp.where(at, values, xp.zeros_like(values)), axis=-1, dtype=xp.uint8)

@@ -1,4 +1,4 @@
-"""Search for a way in which the agents of a layout can cook and deliver every recipe.
+"""Checks that the two agents of a layout can cook and deliver every recipe.
 
 Shapes: `N` cells, `P` pots.
 """
@@ -17,46 +17,46 @@ _NEEDED = {GOAL: "a goal", POT: "a pot", PLATES: "a plate pile"}
 def check_solvable(layout: Layout) -> None:
     """Check that the agents of a layout can deliver every recipe.
 
-    Each ingredient has to reach a pot, and the soup of this pot, on a plate, a goal. Agents carry items in their rooms,
-    and hand them over on counters that both can face.
+    Each ingredient has to reach a pot, and the soup of this pot has to reach a goal on a plate. Agents carry items on
+    their reachable floor, and hand over items on counters that both agents can face.
 
     Raises:
-        OptionError: if they cannot; says what is missing.
+        OptionError: if some recipe cannot be delivered; the message says what is missing.
     """
     if fault := _delivery_fault(layout):
         raise OptionError(f"layout {layout.name}: {fault}; change the map or the recipes")
 
 
 def _delivery_fault(layout: Layout) -> str | None:
-    """Return why some recipe cannot be delivered, or None if each can."""
-    reach = np.zeros((2, layout.cells), bool)  # (2, N), the cells that each agent can face
+    """Return the reason why some recipe cannot be delivered, or None if all can."""
+    reach = np.zeros((2, layout.cells), bool)  # (2, N), True for cells that each agent can face
     for faced, room in zip(reach, layout.rooms, strict=True):
         faced[layout.ahead[room]] = True
     counters = bool((reach.all(axis=0) & (layout.kinds == WALL)).any())
 
     def agents_at(fixtures: np.ndarray) -> np.ndarray:
-        """Return bool (2,), the agents that can face one of some fixtures, bool (N,)."""
+        """Return bool (2,): which agents can face at least one of the cells `fixtures`, bool (N,)."""
         return np.any(reach & fixtures, axis=1)
 
-    def agents_given(agents: np.ndarray) -> np.ndarray:
-        """Return bool (2,), the agents that can have an item which some agents, bool (2,), can have."""
+    def after_handover(agents: np.ndarray) -> np.ndarray:
+        """Return bool (2,): which agents can hold an item that the given agents, bool (2,), can take or hand over."""
         return agents | (counters and agents.any())
 
     for kind, what in _NEEDED.items():
         if not agents_at(layout.kinds == kind).any():
             return f"no agent can face {what}"
-    pots = reach[:, layout.kinds == POT]  # (2, P)
-    plates, goals = agents_given(agents_at(layout.kinds == PLATES)), agents_at(layout.kinds == GOAL)
-    served = [pot for pot in pots.T if (agents_given(pot & plates) & goals).any()]
+    pots = reach[:, layout.kinds == POT]  # (2, P), True for pots that each agent can face
+    plates, goals = after_handover(agents_at(layout.kinds == PLATES)), agents_at(layout.kinds == GOAL)
+    served = [pot for pot in pots.T if (after_handover(pot & plates) & goals).any()]
     if not served:
         return "no soup can reach a goal on a plate"
     for recipe in layout.recipes:
         piles = {one: (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(one)) for one in recipe}
-        available = {ingredient: agents_given(agents_at(piles[ingredient])) for ingredient in sorted(piles)}
+        available = {ingredient: after_handover(agents_at(piles[ingredient])) for ingredient in sorted(piles)}
         for ingredient, agents in available.items():
             if not any((pot & agents).any() for pot in served):
                 return f"ingredient {ingredient} cannot reach a pot whose soup can be delivered"
-        # An agent must reach the pot for each ingredient, but it need not be the same agent.
+        # Different agents may put the ingredients of a recipe into the pot, but all into the same pot.
         if not any(all((pot & agents).any() for agents in available.values()) for pot in served):
             return f"the ingredients of recipe {recipe} cannot reach the same pot"
     return None

@@ -1,20 +1,20 @@
-"""The state record: all inputs of the rules and the observations in S bytes (uint8), S = 14..36 by layout.
+"""State records: all inputs of the rules and the observations in S bytes (uint8); S is 14 to 36, by layout.
 
-Columns, in order (a = agent 0, the ego, then agent 1, the teammate):
+Columns of a record, in order (columns of the agents: first the ego, then the teammate):
 
-    positions   2   flat cell number, y * width + x
-    facings     2   0 up, 1 down, 2 right, 3 left
-    hands       2   item byte
+    positions   2   flat cell number of each agent, y * width + x
+    facings     2   facing of each agent: 0 up, 1 down, 2 right, 3 left
+    hands       2   item byte in each agent's hand
     recipe      1   item byte of the current recipe (three ingredients, no flags)
     delivered   1   1 in the step after a correct delivery, else 0
     pot_items   P   item byte of each pot's content, pots in reading order
-    pot_timers  P   steps until cooked, 0..20
+    pot_timers  P   steps until each pot's content is cooked, 0..20
     buttons     L   steps for which each button stays lit, 0..10
     counters    K   item byte on each wall that an agent can face, in reading order
 
-Item byte: bit 0 plate, bit 1 cooked, then two bits (a count 0..3) for each ingredient type that has a pile, in
-ascending id. A recipe is the sum of three ingredients; a finished dish is recipe + plate + cooked.
-The clock is not part of the record: the rules do not depend on it.
+An item byte has bit 0 for a plate, bit 1 for cooked, and two bits (a count 0..3) for each ingredient type that has a
+pile, by ascending id. A recipe is the sum of three ingredients; a finished dish is recipe + plate + cooked.
+The record does not contain the step number, since the rules do not depend on the step number.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class State(NamedTuple):
 
     Args:
         positions: (B, 2), flat cell numbers of ego and teammate.
-        facings: (B, 2), positions in `FACINGS`.
-        hands: (B, 2), item bytes.
+        facings: (B, 2), facings of ego and teammate, as positions in `FACINGS`.
+        hands: (B, 2), item bytes in the hands of ego and teammate.
         recipe: (B,), item byte of the current recipe.
         delivered: (B,), 1 in the step after a correct delivery.
         pot_items: (B, P), item byte of each pot's content.
@@ -62,7 +62,7 @@ class State(NamedTuple):
 
 
 def columns(layout: Layout | Tables) -> State:
-    """Return the position of each field in the record of a layout: slices, and an int for the two single columns."""
+    """Return the columns of each field in a layout's records: an int for `recipe` and `delivered`, slices otherwise."""
     pots, buttons, counters = _counts(layout)
     ends = np.cumsum([8, pots, pots, buttons, counters]).tolist()
     rest = [slice(a, b) for a, b in pairwise(ends)]
@@ -70,7 +70,7 @@ def columns(layout: Layout | Tables) -> State:
 
 
 def record_size(*layouts: Layout | Tables) -> int:
-    """Return S, the number of bytes of a state record of a layout or stacked tables, or padded for all of several."""
+    """Return the number S of bytes of a state record, padded so that it fits each of the given layouts or tables."""
     pots, buttons, counters = np.max([_counts(layout) for layout in layouts], axis=0).tolist()
     return 8 + 2 * pots + buttons + counters
 
@@ -81,14 +81,14 @@ def _counts(layout: Layout | Tables) -> tuple[int, int, int]:
 
 
 def padded_positions(layout: Layout, tables: Tables) -> np.ndarray:
-    """Return where the bytes of a layout's state records are in the padded records of a group of layouts.
+    """Return the positions of the bytes of a layout's state records in the padded records of a group of layouts.
 
     Args:
-        layout: one of the layouts, with records of S bytes.
-        tables: tables of the group, see `stack_tables`.
+        layout: one layout of the group; its records have S bytes.
+        tables: lookup tables of the group, see `stack_tables`.
 
     Returns:
-        int (S,): `padded[..., positions]` are the layout's own records.
+        Positions, int (S,); `padded[..., positions]` are the layout's records without padding.
     """
     own, padded = columns(layout), columns(tables)
     lengths = [one.stop - one.start for one in own[5:]]
@@ -97,35 +97,35 @@ def padded_positions(layout: Layout, tables: Tables) -> np.ndarray:
 
 
 def unpack(layout: Layout | Tables, record: Array) -> State:
-    """Split state records uint8 (B, S) into their columns."""
+    """Split state records uint8 (B, S) into fields."""
     return State(*(record[..., column] for column in columns(layout)))
 
 
 def pack(state: State) -> Array:
-    """Join columns to state records uint8 (B, S)."""
+    """Join the fields of states to state records uint8 (B, S)."""
     xp = state.positions.__array_namespace__()
     single = (state.recipe[..., None], state.delivered[..., None])
     return xp.concat([*state[:3], *single, *state[5:]], axis=-1)
 
 
-def swapped(record: Array) -> Array:
-    """Exchange the two agents in state records uint8 (B, S), so that the ego's observation becomes the teammate's."""
+def swap_agents(record: Array) -> Array:
+    """Exchange ego and teammate in state records uint8 (B, S), so that the ego gets the teammate's observation."""
     order = np.arange(record.shape[-1])
-    order[:6] = 1, 0, 3, 2, 5, 4  # positions, facings, hands
+    order[:6] = 1, 0, 3, 2, 5, 4  # the columns of positions, facings and hands
     return record[..., order]
 
 
-def start(layout: Layout | Tables, positions: Array, facings: Array, recipe: Array) -> Array:
-    """Return the record of an episode's first step: hands, pots and counters empty (paper, App. A.1).
+def start_record(layout: Layout | Tables, positions: Array, facings: Array, recipe: Array) -> Array:
+    """Return the state record of an episode's first step, with empty hands, pots and counters (paper, App. A.1).
 
     Args:
-        layout: the layout or its tables.
+        layout: the layout or its lookup tables.
         positions: uint8 (B, 2), flat cell numbers of the two agents.
         facings: uint8 (B, 2), positions in `FACINGS`.
         recipe: uint8 (B,), item byte of the first recipe.
 
     Returns:
-        uint8 (B, S).
+        State records uint8 (B, S).
     """
     xp = positions.__array_namespace__()
     empty = xp.zeros((*recipe.shape, record_size(layout) - 7), dtype=xp.uint8)
@@ -134,7 +134,7 @@ def start(layout: Layout | Tables, positions: Array, facings: Array, recipe: Arr
 
 
 def possible_recipes(layout: Layout) -> np.ndarray:
-    """Return the item bytes of all dishes that the layout's piles allow, uint8, ascending; tasks choose among them."""
+    """Return the item bytes, uint8, ascending, of all recipes that the layout's piles allow; tasks use some of them."""
     items = np.arange(256)
     plain = (items & (PLATE | COOKED) == 0) & (ingredient_count(items) == 3)
     return np.flatnonzero(possible_items(layout) & plain).astype(np.uint8)
@@ -143,8 +143,8 @@ def possible_recipes(layout: Layout) -> np.ndarray:
 def faults(layout: Layout, record: np.ndarray) -> list[str]:
     """Return descriptions of impossible values in records uint8 (B, S); empty if every value is in range.
 
-    Checks ranges only (distinct positions on floor, item bytes that the rules can produce, timers, recipe made of three
-    ingredients), not whether the state can be reached.
+    Each value is checked against its range: distinct floor cells of the agents, possible item bytes and timers, a
+    recipe of three ingredients. Whether the rules can reach the state is not checked.
     """
     state = unpack(layout, record)
     items = possible_items(layout)
@@ -175,7 +175,7 @@ def ingredient_count(item: Array) -> Array:
 
 
 def possible_items(layout: Layout) -> np.ndarray:
-    """Return bool (256,), True for possible item bytes: nothing, a plate, 1..3 ingredients, soups, dishes."""
+    """Return bool (256,), True for possible item bytes: nothing, a plate, 1 to 3 ingredients, a soup, or a dish."""
     item = np.arange(256)
     count = ingredient_count(item)
     known = item >> (2 + 2 * len(layout.ingredients)) == 0

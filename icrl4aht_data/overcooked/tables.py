@@ -1,10 +1,10 @@
 """Lookup tables of a layout as a pytree of arrays, which compiled programs take as an argument.
 
-The rules, the observations and the scripted agents read a layout from its tables alone, so one compiled program plays
-every layout whose tables have equal shapes. `stack_tables` pads the tables of several layouts to common shapes.
+The rules, the observations and the scripted agents read a layout only from its tables, so one compiled program can run
+all layouts whose tables have equal shapes. `stack_tables` pads the tables of several layouts to common shapes.
 
-Shapes: `cells` cells of the map, row by row; `P` pots, `L` buttons, `K` counters, `F` floor cells of the larger room,
-`R` recipes, `C` own observation channels.
+Shapes: `cells` cells of the map, row by row; `P` pots, `L` buttons, `K` counters, `R` recipes, `C` observation
+channels, and `F` floor cells that one agent can reach, the larger number of both agents.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ Array = Any
 """A NumPy or JAX array; functions find the library through `__array_namespace__`."""
 
 SEARCH_ORDER = (RIGHT, DOWN, LEFT, UP)
-"""Moves in the order in which the published teammates try them: it decides between paths of equal length."""
+"""Order in which the published teammates try moves; the order decides between paths of equal length."""
 
-# Every visible cell is packed into two 32-bit words: lookups move words, and only the last operation writes C
-# channels. Bits of the word of the cell: item 0..7, pot timer 8..12, recipe 13..18, delivery 19, static 20..25, and one
-# per piled type 26..28. Bits of the word of the agents on it: self 0..12 (position 1, facing 4, hand 8), other 13..25.
+# Every visible cell is packed into two 32-bit words, so that only the last operation has to write C channels. Bits of
+# a cell's word: item 0..7, pot timer 8..12, recipe 13..18, delivery 19, kind 20..25, and ingredient piles 26..28. Bits
+# of the word of the agents on a cell: self 0..12 (position 1 bit, facing 4, hand 8), other agent 13..25.
 TIMER_BIT, RECIPE_BIT, DELIVERY_BIT, FIXED_BIT, _PILES = 8, 13, 19, 20, 26
 AGENT_BITS = 13
 _STATIC = (WALL, GOAL, POT, INDICATOR, BUTTON, PLATES)
 
 
 class ChannelBits(NamedTuple):
-    """Bits of a visible cell's words that each observation channel shows.
+    """Bits of a visible cell's two packed words that each observation channel shows.
 
     Attributes:
-        shift: uint32 (C,), lowest bit of each channel in its word.
+        shift: uint32 (C,), lowest bit of each channel in the packed word.
         mask: uint32 (C,), bits of each channel; 0 for channels that the layout does not have, such as an ingredient
             type without a pile.
-        of_agents: bool (C,), whether the channel comes from the word of the agents.
+        of_agents: bool (C,), whether each channel comes from the word of the agents on the cell.
     """
 
     shift: Array
@@ -61,37 +61,36 @@ class ChannelBits(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """Lookup tables of one layout, NumPy arrays until a program makes them its argument.
+    """Lookup tables of one layout, as NumPy arrays or as array arguments of a compiled program.
 
     Attributes:
         kinds: uint8 (cells,), the kind of each cell.
-        piles: uint8 (cells,), the item byte taken from a pile, 0 elsewhere.
+        piles: uint8 (cells,), item byte that an agent takes from a pile; 0 for cells without a pile.
         column: int32 (cells,), x of each cell.
         row: int32 (cells,), y of each cell.
-        walkable: bool (cells,), floor cells that some agent can reach.
-        ahead: uint8 (cells, 4), the cell that an agent on a walkable cell faces, by facing; 0 elsewhere.
-        faced: int32 (cells, 4), what it faces: kind | pile << 8 | number << 16, where the number counts the cells of
-            the same kind: pots, counters or buttons.
-        moves: uint8 (cells, 6), the cell after an action if the other agent is not in the way.
+        walkable: bool (cells,), floor cells that at least one agent can reach.
+        ahead: uint8 (cells, 4), cell in front of an agent, by its cell and facing; 0 for cells not walkable.
+        faced: int32 (cells, 4), properties of the cell in front of an agent: kind | pile << 8 | number << 16, where
+            the number is the cell's position in `pots`, `counters` or `buttons`.
+        moves: uint8 (cells, 6), an agent's next cell by its cell and action, if the other agent does not block it.
         view: int32 (cells, 25), for each agent position and window cell: number of the cell's changing word; from bit 8
             on, the fixed bits of its word, shifted down by FIXED_BIT.
         own: bits of the layout's own channels.
-        canonical: bits of the canonical channels; of length 0 if the layout has an ingredient that none of them shows.
-        pots: uint8 (P,), cells of the pots in reading order; NOWHERE for a padded one, as in `buttons` and `counters`.
+        canonical: bits of the canonical channels; empty if an ingredient of the layout has no canonical channel.
+        pots: uint8 (P,), cells of the pots in reading order; padding is NOWHERE, as in `buttons` and `counters`.
         buttons: uint8 (L,), cells of the buttons.
-        counters: uint8 (K,), cells of the walls that some agent can face.
-        rooms: uint8 (2, F), ascending: the floor cells that each agent can reach from its start, repeated from the
-            first on.
-        room_sizes: uint32 (2,), number of cells of each room.
-        recipes: uint8 (R,), item bytes of the recipes, repeated from the first on.
-        recipe_count: uint32 (), number of recipes.
-        ingredients: int32 (3,), ids of the ingredients that have a pile, ascending; -1 for a type without one.
+        counters: uint8 (K,), wall cells that at least one agent can face.
+        rooms: uint8 (2, F), floor cells that ego and teammate can reach, ascending; padding is 0.
+        room_sizes: uint32 (2,), number of floor cells that ego and teammate can reach.
+        recipes: uint8 (R,), item bytes of the recipes; padding repeats the last recipe.
+        recipe_count: uint32 (), number of recipes without padding.
+        ingredients: int32 (3,), ids of the ingredients that have a pile, ascending, filled up with -1.
         size: int32 (2,), width and height of the map.
         number: uint8 (cells,), position of a cell in `pots`, `buttons` or `counters`; NOWHERE for other cells.
         near: uint8 (cells,), bit k says whether a cell above, below, left or right is of kind k.
-        goal_access: uint8 (A,), floor cells next to a goal; NOWHERE for a padded one.
-        stations: float32 (cells,), distance to the mean cell of pots and piles, minus that to the mean cell of goals
-            and plates: what the teammates H2 may divide a layout by.
+        goal_access: uint8 (A,), floor cells next to a goal; padding is NOWHERE.
+        stations: float32 (cells,), distance to the mean cell of pots and piles minus distance to the mean cell of
+            goals and plates; some teammates of family H2 divide the layout between the agents by this value.
         distance: uint8 (cells, cells), shortest distance between floor cells; NOWHERE if there is no path.
         target_distance: uint8 (cells, cells), distance from a floor cell to the nearest floor cell next to a target;
             NOWHERE if there is no path.
@@ -139,36 +138,36 @@ _PADDING = {
     "first_step": STAY,
     "ingredients": -1,
 }
-"""Values of padded entries, where they are not 0. A padded cell is a wall that no agent can reach or face."""
+"""Padding values other than 0, by field. A padded cell is a wall that no agent can reach or face."""
 
 
 def stack_tables(layouts: Sequence[Layout]) -> Tables:
     """Return the tables of several layouts, padded to the largest and stacked on a new first axis.
 
-    Flat cell numbers remain those of each layout, whose map keeps its own width: cells are padded at the end. The
-    columns of state records follow the padded numbers of pots, buttons and counters, see `state.columns`. Own channels
-    are padded at the end as well, so only layouts with equal channel names give own observations of one meaning.
+    Cells are padded at the end, so the flat cell numbers of each layout do not change. The columns of state records
+    follow the padded numbers of pots, buttons and counters, see `state.columns`. Own channels are padded at the end
+    too, so the channels of two layouts have the same meaning only if the channel names are equal.
 
     Raises:
-        OptionError: if there is no layout, or if only some of the layouts have all canonical channels.
+        OptionError: if there is no layout, or if only some of the layouts have ingredients without canonical channels.
     """
     if not layouts:
-        raise OptionError("no layouts to stack, expected at least one")
+        raise OptionError("no layouts to stack, expected at least one layout")
     pots, buttons = max(len(one.pots) for one in layouts), max(len(one.buttons) for one in layouts)
     each = [make_tables(layout, pots, buttons) for layout in layouts]
     without = [layout.name for layout in layouts if layout.ingredient_types > CANONICAL_TYPES]
     if 0 < len(without) < len(layouts):
-        raise OptionError(f"layouts {without} have ingredients without a canonical channel, the others do not")
+        raise OptionError(f"layouts {without} have ingredients without a canonical channel: stack them separately")
 
     return stack_padded(each, _PADDING)
 
 
 def stack_padded(parts: Sequence[Any], padding: Mapping[str, int]) -> Any:
-    """Return one named tuple of arrays: those of all parts, padded at the end of each axis, on a new first axis.
+    """Stack named tuples of arrays on a new first axis; arrays are padded at the end of each axis to equal shapes.
 
     Args:
-        parts: named tuples of arrays that differ in the lengths of their axes, or of such named tuples.
-        padding: field -> value of padded entries, where it is not 0. An axis "recipes" repeats its last entry, since a
+        parts: named tuples of arrays, possibly nested; equal fields may have different lengths.
+        padding: padding values other than 0, by field. The field "recipes" is padded with its last entry, since a
             repeated recipe changes no decision of a scripted agent.
     """
 
@@ -188,12 +187,12 @@ def stack_padded(parts: Sequence[Any], padding: Mapping[str, int]) -> Any:
 
 
 def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = None) -> Tables:
-    """Return the tables of a layout; use `Layout.tables`, which caches them.
+    """Return new lookup tables of a layout; `Layout.tables` caches the tables.
 
     Args:
         layout: the layout.
-        pots: number of pots of the state records that the tables are for, at least the layout's own.
-        buttons: number of buttons of these records.
+        pots: number of pots in the padded state records; None for the layout's number.
+        buttons: number of buttons in the padded state records; None for the layout's number.
     """
     ahead, kinds, walkable = layout.ahead, layout.kinds, layout.walkable
     pots, buttons = max(pots or 0, len(layout.pots)), max(buttons or 0, len(layout.buttons))
@@ -204,7 +203,7 @@ def make_tables(layout: Layout, pots: int | None = None, buttons: int | None = N
     beside = _neighbours(layout)
     near = np.bitwise_or.reduce(np.where(beside >= 0, 1 << kinds.astype(int)[beside], 0), axis=1).astype(np.uint8)
     distance, first_step = _search(layout)
-    # An index of -1 reads the last cell, which `where` then replaces.
+    # A neighbour of -1 indexes the last cell, but `where` replaces this value.
     to_access = np.where((beside >= 0) & walkable[beside], distance[:, beside], NOWHERE).min(axis=-1)
     canonical = CANONICAL_TYPES if layout.ingredient_types <= CANONICAL_TYPES else 0
     rooms = np.zeros((2, max(map(len, layout.rooms))), np.uint8)
@@ -260,23 +259,23 @@ def _stations(layout: Layout, column: np.ndarray, row: np.ndarray) -> np.ndarray
 
 
 def _search(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Return `Tables.distance` and `Tables.first_step`."""
+    """Return the tables `Tables.distance` and `Tables.first_step`, from a search for shortest paths."""
     far, here = np.int32(NOWHERE), np.arange(layout.cells)
     distance = np.where((here[:, None] == here) & layout.walkable, 0, far)
-    ends = layout.moves[:, SEARCH_ORDER]  # (cells, 4)
+    ends = layout.moves[:, SEARCH_ORDER]  # shape (cells, 4)
     while True:
-        after = distance[ends] + 1  # (cells, 4, cells)
+        after = distance[ends] + 1  # shape (cells, 4, cells)
         shorter = np.minimum(distance, after.min(axis=1))
         if np.array_equal(shorter, distance):
             break
         distance = shorter
-    # Of the moves that shorten the way the first counts, which is the one that a breadth-first search would find.
+    # If several moves shorten the path, the first is taken, as a breadth-first search would do.
     step = np.array(SEARCH_ORDER)[(after == distance[:, None]).argmax(axis=1)]
     return distance.astype(np.uint8), np.where((distance > 0) & (distance < far), step, STAY).astype(np.uint8)
 
 
 def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.ndarray:
-    """Return `Tables.view`; `number` int (cells,) counts the pots, the buttons and the counters."""
+    """Return the table `Tables.view`; `number`, int (cells,), is `Tables.number`."""
     words = {INDICATOR: 1, GOAL: 2, POT: 3 + number, BUTTON: 3 + pots + number}
     changing = np.select([layout.kinds == kind for kind in words], list(words.values()), 0)
     changing[list(layout.counters)] = 3 + pots + buttons + np.arange(len(layout.counters))
@@ -286,12 +285,12 @@ def _view(layout: Layout, number: np.ndarray, pots: int, buttons: int) -> np.nda
     for bit, ingredient in enumerate(layout.ingredients):
         pile = (layout.kinds == PILE) & (layout.piles == layout.ingredient_item(ingredient))
         fixed |= pile.astype(np.int32) << (_PILES - FIXED_BIT + bit)
-    # Outside the map both parts are 0: word number 0 is always zero.
+    # Cells outside the map get 0: changing word number 0 is always zero, and no fixed bits are set.
     return np.where(layout.window >= 0, (changing | fixed << 8)[layout.window], 0).astype(np.int32)
 
 
 def _channel_bits(layout: Layout, types: int, delivery: bool) -> ChannelBits:
-    """Return the bits of channels for a number of ingredient types, with or without delivery; none for 0 types."""
+    """Return the bits of the channels for `types` ingredient types, with or without delivery; empty for 0 types."""
     order = {ingredient: number for number, ingredient in enumerate(layout.ingredients)}
 
     def by_type(first: int, width: int, mask: int) -> list[tuple[int, int]]:
@@ -307,7 +306,7 @@ def _channel_bits(layout: Layout, types: int, delivery: bool) -> ChannelBits:
         *((FIXED_BIT + bit, 1) for bit in range(len(_STATIC))),
         *by_type(_PILES, 1, 1),
         *item(0),
-        (0, 0),  # a recipe is neither on a plate nor cooked
+        (0, 0),  # a recipe never sets the channels plate and cooked
         (0, 0),
         *by_type(RECIPE_BIT, 2, 3),
         (TIMER_BIT, 31),

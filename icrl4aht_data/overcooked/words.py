@@ -1,8 +1,8 @@
 """Words: ids of the contents of the 25 visible cells, computed from state records, for NumPy and JAX.
 
-A *word* is the vector of observation channels of one visible cell. The rules allow only a few hundred words on a
-layout, so a network can compute its per-cell layers once per word and look them up. Records of
-several layouts share their lookup tables, so one batch may mix layouts.
+A *word* is the vector of observation channels of one visible cell. A layout has only a few hundred different words, so
+a network can compute its per-cell layers once per word and read the results from a table. Several layouts share the
+lookup tables, so one batch may mix layouts.
 
 `B` denotes the batch dimensions, `S` the bytes of a state record, `V` the number of words, `C` channels.
 """
@@ -29,21 +29,21 @@ from icrl4aht_data.overcooked.state import (
     record_size,
 )
 
-# What a cell shows follows from its kind and two numbers of the record: a byte (an item or a recipe), and a timer, flag
-# or facing. Lookup tables have an entry for every pair of numbers, so no record can index outside.
+# The channels of a cell depend on its kind and two numbers of the state record: an item or recipe byte, and a timer,
+# flag or facing. Lookup tables have an entry for every pair of numbers, so no record gives an index out of range.
 _SECONDS = 32
 _PAIRS = 256 * _SECONDS
 _FIXED, _RECIPE, _GOAL, _POT, _BUTTON, _COUNTER, _SELF, _OTHER = range(8)
 
 
 class _Slot(NamedTuple):
-    """A part of the record and the cells that show it.
+    """Two columns of the state record that determine the content of some cells, such as a pot's item and timer.
 
     Args:
-        kind: selects the lookup table.
-        cells: numbers of the cells.
-        byte: the record's column of the byte.
-        second: the record's column of the second number; None for 0.
+        kind: number of the lookup table, such as `_POT`.
+        cells: numbers of the cells that show the content.
+        byte: column of the state record with the item or recipe byte.
+        second: column of the state record with the timer, flag or facing; None if there is none.
     """
 
     kind: int
@@ -53,12 +53,12 @@ class _Slot(NamedTuple):
 
 
 class CellWords:
-    """Vocabulary of the visible cells on one or several layouts; created by `cell_words`.
+    """Vocabulary of the visible cells on one or several layouts; `cell_words` creates and caches it.
 
     Attributes:
-        layouts: the layouts; their observations have the same channels.
-        canonical: whether the channels are the canonical ones, or the layouts' own.
-        channels: uint8 (V + 1, C), observation channels of each word. The last row, 255 everywhere, stands for
+        layouts: layouts whose observations have the same channels.
+        canonical: whether words show the canonical channels instead of the layouts' own.
+        channels: uint8 (V + 1, C), observation channels of each word. The last row is 255 everywhere and stands for
             contents that the rules cannot produce.
     """
 
@@ -67,7 +67,7 @@ class CellWords:
         fixed = [_fixed_cells(layout, canonical) for layout in layouts]
         contents = [_contents(layout, canonical) for layout in layouts]
         shown = fixed + [channels for kinds in contents for _, channels in kinds.values()]
-        # Rows are sorted, so word 0 is all zero: empty floor, and cells outside the map.
+        # `unique` sorts the rows, so word 0 has zeros only: empty floor and cells outside the map.
         words, numbers = np.unique(np.concatenate(shown), axis=0, return_inverse=True)
         self.channels = np.append(words, np.full_like(words[:1], 255), axis=0)
         parts = iter(np.split(numbers.reshape(-1).astype(np.int16), np.cumsum([len(rows) for rows in shown])[:-1]))
@@ -80,7 +80,7 @@ class CellWords:
                 self._words[number, kind, pairs] = next(parts)
 
     def _fill_views(self, fixed: list[np.ndarray]) -> None:
-        """Fill the lookup tables of observer cells and of slots; slot 0 stands for all fixed cells."""
+        """Fill the lookup tables of observer cells and of slots, see `_Slot`; slot 0 stands for all fixed cells."""
         count, cells = len(self.layouts), max(layout.cells for layout in self.layouts)
         slots = [[_Slot(_FIXED, [], 0), *_slots(layout)] for layout in self.layouts]
         self._slot = np.zeros((count, cells, VISIBLE), np.uint8)
@@ -101,16 +101,16 @@ class CellWords:
             self._window_position[(*here, slice(layout.cells))] = layout.window_position
 
     def ids(self, record: Array, layout_number: Array | None = None, agent: int = 0) -> Array:
-        """Return the words of the cells that one agent sees.
+        """Return the words of the 25 cells that one agent sees.
 
         Args:
-            record: uint8 (B, S), state records; those of several layouts are padded at the end.
+            record: uint8 (B, S), state records; for several layouts, shorter records are padded at the end.
             layout_number: int, index of each record's layout in `layouts`, with the shape of the first axes of B; None
                 if there is one layout.
             agent: 0 (ego) or 1 (teammate).
 
         Returns:
-            int32 (B, 25), rows of `channels`: `channels[ids]` is what `observe` returns.
+            Word ids int32 (B, 25); `channels[ids]` are the observations that `observe` returns.
         """
         xp = record.__array_namespace__()
         batch = record.shape[:-1]
@@ -121,7 +121,7 @@ class CellWords:
             number = xp.astype(xp.broadcast_to(number, batch), xp.int32)
 
         def at(table: np.ndarray, *indices: Array) -> Array:
-            """Return table[number, *indices], with the table's other axes."""
+            """Return `table[number, *indices]`, where `number` is the number of each record's layout."""
             flat = number
             for index, size in zip(indices, table.shape[1:], strict=False):
                 flat = flat * size + xp.astype(index, xp.int32)
@@ -152,14 +152,14 @@ class CellWords:
 
     @lru_cache  # noqa: B019 - instances live as long as the process, see `cell_words`
     def entries(self, agents: tuple[int, ...] = (0,)) -> np.ndarray:
-        """Return the entries of a flat observation that can differ from 0 on these layouts.
+        """Return the entries of a flattened observation that can differ from 0 on these layouts.
 
         Args:
-            agents: the agents that observe: 0 (ego), 1 (teammate). An agent never leaves its room, so both together
-                see more than one.
+            agents: the observing agents: 0 (ego), 1 (teammate). Agents can have different reachable cells, so two
+                agents can have more such entries than one agent.
 
         Returns:
-            int64 (E,), ascending: cell * C + channel, with cells of the window in reading order.
+            Entries int64 (E,), ascending: cell * C + channel, with cells of the window in reading order.
         """
         nonzero = self.channels[:-1] > 0
         shown = np.zeros((VISIBLE, nonzero.shape[-1]), bool)
@@ -167,7 +167,7 @@ class CellWords:
             of_kind = np.stack([nonzero[words[words < len(nonzero)]].any(axis=0) for words in self._words[number]])
             for agent in agents:
                 room, other_room = layout.rooms[agent], layout.rooms[1 - agent]
-                kinds = self._kind[number, self._slot[number, room]]  # (cells of the room, 25)
+                kinds = self._kind[number, self._slot[number, room]]  # shape (reachable cells, 25)
                 shown |= (of_kind[kinds] | nonzero[self._fixed[number, room]]).any(axis=0)
                 relative = np.unique(layout.window_position[np.ix_(room, other_room)])
                 shown[np.setdiff1d(relative, [NOWHERE, CENTRE])] |= of_kind[_OTHER]
@@ -176,17 +176,17 @@ class CellWords:
 
 
 def cell_words(layouts: Sequence[Layout], canonical: bool = False) -> CellWords:
-    """Return the vocabulary of the visible cells on these layouts, cached.
+    """Return the cached vocabulary of the visible cells on the given layouts.
 
     Args:
-        layouts: one or several; with their own channels, all must have equally many.
+        layouts: one layout or several layouts; without `canonical`, all must have the same number of channels.
         canonical: whether words show the canonical channels, see `channels`, instead of the layouts' own.
     """
-    return _cached(tuple(layouts), canonical)
+    return _cached_words(tuple(layouts), canonical)
 
 
 @lru_cache(maxsize=16)
-def _cached(layouts: tuple[Layout, ...], canonical: bool) -> CellWords:
+def _cached_words(layouts: tuple[Layout, ...], canonical: bool) -> CellWords:
     return CellWords(layouts, canonical)
 
 
@@ -203,7 +203,7 @@ def _slots(layout: Layout) -> list[_Slot]:
 
 
 def _fixed_cells(layout: Layout, canonical: bool) -> np.ndarray:
-    """Return uint8 (cells * 25, C): the window around each cell of an empty map without agents."""
+    """Return channels uint8 (cells * 25, C) of the window around each cell, for an empty map without agents."""
     record = np.zeros((layout.cells, record_size(layout)), np.uint8)
     record[:, 0] = np.arange(layout.cells)
     obs = observe(layout, record, 0, canonical)
@@ -212,7 +212,7 @@ def _fixed_cells(layout: Layout, canonical: bool) -> np.ndarray:
 
 
 def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Return kind -> pairs of numbers that the rules allow, int (n,), and the channels they show, uint8 (n, C)."""
+    """Return the possible pairs of numbers, int (n,), and their channels, uint8 (n, C), by kind of content."""
     item = np.arange(256)
     possible, count = possible_items(layout), ingredient_count(item)
     carried = np.flatnonzero(possible & ((item & PLATE > 0) | (count <= 1)))
@@ -233,13 +233,13 @@ def _contents(layout: Layout, canonical: bool) -> dict[int, tuple[np.ndarray, np
     record[:, 0] = np.flatnonzero(layout.walkable)[0]
     record[:, where.facings.start], record[:, where.hands.start] = bodies >> 8, bodies & 255
     own = observe(layout, record, 0, canonical).reshape(len(bodies), VISIBLE, -1)[:, CENTRE]
-    channels = fixed_channels(layout, canonical).start // 2  # channels of one agent; the other agent's follow
+    channels = fixed_channels(layout, canonical).start // 2  # number of channels of one agent
     own[:, channels:] = 0
     return found | {_SELF: (bodies, own), _OTHER: (bodies, np.roll(own, channels, axis=-1))}
 
 
 def _shown(layout: Layout, slot: _Slot, pairs: np.ndarray, observer: int, cell: int, canonical: bool) -> np.ndarray:
-    """Return uint8 (n, C): the channels of a slot's cell, seen from another cell."""
+    """Return the channels uint8 (n, C) of a slot's cell, seen from the cell `observer`."""
     record = np.zeros((len(pairs), record_size(layout)), np.uint8)
     record[:, slot.byte] = pairs & 255
     if slot.second is not None:

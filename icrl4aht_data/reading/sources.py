@@ -17,8 +17,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from icrl4aht_data.format.cached_arrays import cache_room, cached_arrays, new_mapped_array
-from icrl4aht_data.format.schema import FIELDS, Entry, Kind, held_fields
+from icrl4aht_data.format.cached_arrays import cacheable_bytes, cached_arrays, new_mapped_array
+from icrl4aht_data.format.schema import FIELDS, Entry, Kind, memory_fields
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.reading.shard import Shard, Shards
 from icrl4aht_data.utils.system import free_memory, gigabytes, in_slices
@@ -48,7 +48,7 @@ class ReadRequest(NamedTuple):
     """A request to read rows of one field of n histories into an array.
 
     Attributes:
-        field: a name in `schema.held_fields`.
+        field: a name in `schema.memory_fields`.
         histories: int (n,), positions in the selection.
         rows: int (n,), the first row of a window in each history, -1 or more; or int (n, K), any rows of each history.
         out: (n, K, ...), C-contiguous, of any dtype that represents the values. In windows, rows outside the history
@@ -69,7 +69,7 @@ def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
     memory = free_memory()
     if size <= memory // 2:
         return CacheChoice("ram", f"{gigabytes(size)} decoded, {gigabytes(memory)} of memory free")
-    room = cache_room()
+    room = cacheable_bytes()
     if size <= room:
         return CacheChoice(
             "mmap", f"{gigabytes(size)} decoded, more than half of the {gigabytes(memory)} of memory free"
@@ -80,7 +80,7 @@ def choose_cache(cache: CacheMode, size: int) -> CacheChoice:
 def decoded_size(layout: Layout, kind: Kind, steps: int, histories: int, episodes: int) -> int:
     """Return the bytes of the flat arrays of one layout's histories, with `steps` and `episodes` in total."""
     rows = {"T": steps + histories + 1, "E": episodes}
-    return sum(rows[field.axis] * field.held(layout).itemsize for field in held_fields(kind))
+    return sum(rows[field.axis] * field.memory_dtype(layout).itemsize for field in memory_fields(kind))
 
 
 def open_source(cache: CacheMode, entries: Sequence[Entry], shards: Shards, threads: int) -> HistorySource:
@@ -131,10 +131,10 @@ def _decode(
 ) -> dict[str, np.ndarray]:
     """Return field -> array (rows, ...) with one layout's histories; `make(shape, dtype, name)` allocates zeros."""
     arrays = {}
-    for field in held_fields(shards[0].kind):
+    for field in memory_fields(shards[0].kind):
         if any(entry.has(field) for entry in entries):
             rows = sum(entry.rows(field) for entry in entries) + (len(entries) + 1 if field.axis == "T" else 0)
-            element = field.held(shards[0].layout)
+            element = field.memory_dtype(shards[0].layout)
             arrays[field.name] = make((rows, *element.shape), element.base, field.name)
     firsts = {axis: _first_rows(entries, axis) for axis in ("T", "E")}
 
@@ -264,7 +264,7 @@ class StreamedSource:
             entry = self._entries[position]
             history_id, shard = entry.history_id, self._shards.open(entry.shard)
             if field.row != "scalar":
-                size = field.held(shard.layout).shape[-1]
+                size = field.memory_dtype(shard.layout).shape[-1]
                 out[..., size:] = 0
                 out = out[..., :size]
             if rows.ndim:

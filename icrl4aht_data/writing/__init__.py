@@ -1,1 +1,1 @@
-"""Writing releases and converting between formats."""
+"""Writing of releases, and conversion between the formats of releases and of other files."""

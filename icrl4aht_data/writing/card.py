@@ -1,4 +1,4 @@
-"""Dataset card of a release: README.md, and card.json with the tables too long for it."""
+"""Dataset card of a release: README.md, and card.json with tables that are too long for README.md."""
 
 from __future__ import annotations
 
@@ -60,19 +60,19 @@ from icrl4aht_data.utils.text import counted_noun
 from icrl4aht_data.writing.proof import proof_table, read_proof
 
 HEADROOM_PROTOCOL = "published"
-"""Evaluation protocol of the headroom shown in cards, which is the paper's."""
+"""Evaluation protocol of the returns in dataset cards, which is the paper's protocol."""
 
 CURVES_FIGURE, LAYOUTS_FIGURE = (f"figures/{name}.png" for name in ("learning_curves", "layouts"))
 """Paths of the figures of a release built for publication."""
 
-_LEAST_RISE = 5.0  # a quarter of a delivery
+_LEAST_RISE = 5.0  # a history counts as rising if its return rises by a quarter of a delivery
 _MIXED, _WATCHING = "heuristic mixed with random actions", "heuristic that never acts"
 _SCHEDULE = {"histories", "episodes", "start", "end", "begin", "finish", "power"}
 
 
 @cache
 def card_texts(section: str) -> dict[str, str]:
-    """Return a section of `cards/dataset_texts.toml`, name -> text.
+    """Return the texts of a section of `cards/dataset_texts.toml` by name.
 
     Args:
         section: "sources" (of histories), "kinds" (of release), "arrays" (`schema.FIELDS`), "index" (fields of
@@ -82,29 +82,29 @@ def card_texts(section: str) -> dict[str, str]:
 
 
 def episode_texts() -> dict[str, str]:
-    """Return column name -> description, for the columns of `EPISODE_COLUMNS`."""
+    """Return the descriptions of the columns `EPISODE_COLUMNS` by name."""
     texts = card_texts("index") | card_texts("arrays") | card_texts("episodes")
     return {name: texts[name] for name in EPISODE_COLUMNS}
 
 
 def rai_texts(sources: Container[str]) -> dict[str, str]:
-    """Return the responsible-AI fields of a release with these sources, name in mlcroissant -> text."""
+    """Return the texts on responsible AI for a release with these sources, by field name in mlcroissant."""
     return card_texts("rai") | (card_texts("rai_human") if "human" in sources else {})
 
 
 def write_card(root: Path) -> None:
-    """Write README.md and card.json of a release folder, which may still lack a manifest.
+    """Write README.md and card.json of a release folder; the folder need not have a manifest yet.
 
     Raises:
         ReleaseError: if the release cannot be read.
     """
-    content = facts(root)
+    content = card_facts(root)
     (root / RELEASE_CARD).write_text(render_card(content), encoding="utf-8")
     write_json(root / CARD_TABLES, {name: content[name] for name in ("learning", "teammates", "left_out")}, indent=None)
 
 
 def render_card(content: Mapping[str, Any]) -> str:
-    """Return the content of README.md from a release's `facts`."""
+    """Return the content of README.md for a release with these `card_facts`."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(
@@ -115,13 +115,13 @@ def render_card(content: Mapping[str, Any]) -> str:
 
 
 def teammate_name(task: Task) -> str:
-    """Return the name of a task's teammate: family or algorithm, and number, such as "H3/t12" or "fcp/t1"."""
+    """Return the name of a task's teammate, with family or algorithm and number, such as "H3/t12" or "fcp/t1"."""
     family = task.teammate_kind if task.teammate_family == "rl" else task.teammate_family
     return f"{family}/t{task.teammate.get('theta_id', 0)}"
 
 
-def evaluated_on(layouts: Iterable[str]) -> list[str]:
-    """Return the test layouts of the benchmark for models trained on `layouts`."""
+def benchmark_test_layouts(layouts: Iterable[str]) -> list[str]:
+    """Return the layouts of the benchmark that models trained on `layouts` are tested on."""
     names, tested = list(layouts), list[str]()
     for track, splits in TRACKS.items():
         own = [name for name in names if track_of(name) == track]
@@ -131,7 +131,7 @@ def evaluated_on(layouts: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class _TaskFacts:
-    """One task of a release with its histories and provenance."""
+    """A task of a release, with the task's histories and provenance."""
 
     first: Entry
     histories: Sequence[Entry]
@@ -148,11 +148,11 @@ class _TaskFacts:
         return bool(are_labels_weak(self.first.expert_return, last))
 
 
-def facts(root: Path) -> dict[str, Any]:
-    """Return the facts that a release's card states: values, and lists of rows for its tables.
+def card_facts(root: Path) -> dict[str, Any]:
+    """Return the facts for the dataset card of a release: values, and lists of rows for tables.
 
     Args:
-        root: a release folder, which may still lack a card and a manifest.
+        root: a release folder; the card and the manifest need not exist yet.
 
     Raises:
         ReleaseError: if the release cannot be read.
@@ -164,7 +164,7 @@ def facts(root: Path) -> dict[str, Any]:
         _TaskFacts(own[0], own, by_id.get(name), provenance.of(name))
         for name, own in grouped(entries, lambda entry: entry.task_id).items()
     ]
-    teammates = _teammates(tasks, list(info.layouts))
+    teammates = _teammate_rows(tasks, list(info.layouts))
     titles = {layout: layout_title(layout) for layout in info.layouts}
     compared = (row for row in teammates if row["matters"] is not None)
     matters = {
@@ -174,7 +174,7 @@ def facts(root: Path) -> dict[str, Any]:
     headroom = {title: any(found) for title, found in matters.items()}
     first = min(entries, key=lambda entry: (entry.split != "train", entry.history_id))
     length = min(500, *(entry.T for entry in entries if (entry.split, entry.layout) == (first.split, first.layout)))
-    tested, learning = evaluated_on(info.layouts), _learning(tasks, titles)
+    tested, learning = benchmark_test_layouts(info.layouts), _learning_rows(tasks, titles)
     sources = Counter(entry.source for entry in entries)
     return {
         "info": info,
@@ -196,10 +196,10 @@ def facts(root: Path) -> dict[str, Any]:
         "example": {"split": first.split, "layout": first.layout, "length": length},
         "layouts": _layouts(info, titles, matters),
         "learning": learning,
-        "curves": _curves(learning, sources),
+        "curves": _curve_rows(learning, sources),
         "teammates": teammates,
-        "teammate_kinds": _kinds_table(tasks, info.layouts),
-        **_behaviours(teammates),
+        "teammate_kinds": _kind_rows(tasks, info.layouts),
+        **_behaviour_counts(teammates),
         "weak": Counter((titles[task.first.layout], task.first.source) for task in tasks if task.has_weak_labels),
         "left_out": [asdict(task) for task in info.left_out],
         "headroom": headroom,
@@ -207,8 +207,8 @@ def facts(root: Path) -> dict[str, Any]:
         "flat_cells": ["/".join(cell) for cell in cells_without_headroom(read_headroom(HEADROOM_PROTOCOL), tested)],
         "arrays": [name for name, array in FIELDS.items() if info.kind not in array.absent or name == "obs"],
         **_known_families(tasks),
-        "suites": _distinct(tasks, "suite"),
-        **_making(tasks),
+        "suites": _distinct_values(tasks, "suite"),
+        **_generation_facts(tasks),
         "least": {"rise": _LEAST_RISE, "headroom": LEAST_HEADROOM, "same": SAME_BEHAVIOUR},
         "texts": {section: card_texts(section) for section in ("sources", "kinds", "arrays")},
         "rai": rai_texts(sources),
@@ -222,14 +222,14 @@ def _mean(values: Iterable[float]) -> float:
 
 
 def _span(values: Iterable[float]) -> str:
-    """Return the range of some values as text, such as "3" or "3 to 5"; empty without values."""
+    """Return the range of values as text, such as "3" or "3 to 5"; an empty text for no values."""
     found = list(values)
     ends = [f"{end:z,.0f}" for end in (min(found), max(found))] if found else []
     return " to ".join(dict.fromkeys(ends))
 
 
 def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return the configurations of the Hub's viewer, name -> split -> file pattern."""
+    """Return the file patterns of the configurations of the Hub's viewer, by configuration name and split."""
     patterns = {"default": f"{PARQUET_INDEX}/*/{{}}.parquet"}
     patterns |= {entry.layout: f"{PARQUET_INDEX}/{entry.layout}/{{}}.parquet" for entry in entries}
     patterns |= {PARQUET_EPISODES: f"{PARQUET_EPISODES}/*/{{}}-*.parquet"}
@@ -241,10 +241,10 @@ def _viewer_configs(entries: Sequence[Entry], files: Iterable[str]) -> dict[str,
     return configs
 
 
-def _learning(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return rows on the rise of returns, one for each title of layouts, source and split, in their usual order."""
+def _learning_rows(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return one row on the rise of returns for each layout title, source and split, sorted by these."""
     names = ("layout", "source", "split")
-    order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # other sources by first appearance
+    order = [*titles, *SOURCES, *(task.first.source for task in tasks), *SPLITS]  # sources not in SOURCES come last
     ordered = sorted(tasks, key=lambda task: [order.index(getattr(task.first, name)) for name in names])
     groups = grouped(ordered, lambda task: (titles[task.first.layout], task.first.source, task.first.split))
     rows = []
@@ -262,8 +262,8 @@ def _learning(tasks: Sequence[_TaskFacts], titles: Mapping[str, str]) -> list[di
     return rows
 
 
-def _curves(learning: Iterable[Mapping[str, Any]], sources: Iterable[str]) -> list[list[str]]:
-    """Return the rows of the card's table of learning curves: a row for each layout and split, a column per source."""
+def _curve_rows(learning: Iterable[Mapping[str, Any]], sources: Iterable[str]) -> list[list[str]]:
+    """Return the rows of the card's table of learning curves, with a row per layout and split, a column per source."""
     found = defaultdict[tuple[str, str], dict[str, str]](dict)
     for row in learning:
         text = f"{row['first']:z.1f} to {row['last']:z.1f} ({row['histories']})"
@@ -271,8 +271,8 @@ def _curves(learning: Iterable[Mapping[str, Any]], sources: Iterable[str]) -> li
     return [[*key, *(of_key.get(source, "") for source in sources)] for key, of_key in found.items()]
 
 
-def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict[str, Any]]:
-    """Return one row per teammate of a release, sorted by layout, split and family."""
+def _teammate_rows(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict[str, Any]]:
+    """Return a row of facts for each teammate of a release, sorted by layout, split and family."""
     known = (one for one in tasks if one.task is not None)
     rows = []
     for own in grouped(known, lambda one: one.task and (*one.task.teammate_key, one.task.split)).values():
@@ -288,7 +288,7 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
                 "seed": task and task.teammate.get("base_seed"),
                 "sources": sorted({one.first.source for one in own}),
                 "references": references and references.returns,
-                "matters": references and references.matters,
+                "matters": references and references.has_headroom,
                 "nearest_test": nearest and msgspec.structs.asdict(nearest),
             }
         )
@@ -301,7 +301,7 @@ def _teammates(tasks: Iterable[_TaskFacts], layouts: Sequence[str]) -> list[dict
     return sorted(rows, key=place)
 
 
-def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def _behaviour_counts(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the numbers of teammates with known behaviour and of distinct behaviours, by split."""
     known = [row for row in teammates if row["nearest_test"] and row["nearest_test"]["behaviour"] is not None]
     found = {
@@ -313,12 +313,12 @@ def _behaviours(teammates: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _layouts(info: ReleaseInfo, titles: Mapping[str, str], matters: Mapping[str, Sequence[bool]]) -> list[list[str]]:
-    """Return the rows of the card's table of layouts, one for each title.
+    """Return the rows of the card's table of layouts, one for each layout title.
 
     Args:
-        info: says what there is on each layout.
-        titles: layout -> its title, see `layout_title`.
-        matters: title -> whether the ego matters, for each teammate.
+        info: info of the release, with a summary of each layout.
+        titles: titles of the layouts by name, see `layout_title`.
+        matters: `ReferenceEgos.has_headroom` of each teammate, by layout title.
     """
     rows = []
     for title in dict.fromkeys(titles.values()):
@@ -343,15 +343,15 @@ def _known_families(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
     """Return the families of heuristic training and validation teammates, by their similarity to test teammates.
 
     Returns:
-        `tested`: families in which a teammate is a test teammate, acts like one of its family, or was not compared with
-            those of its layout.
-        `drawn`: families with other teammates, the drawn ones.
+        `tested`: families with a teammate that behaves the same as a test teammate of its family, or that was not
+            compared with the test teammates of its layout.
+        `drawn`: families with other teammates, whose parameters were drawn at random.
         `drawn_distance`: smallest distance of a drawn teammate to a test teammate, rounded down to two digits.
-        `alike`: drawn teammates that act like a test teammate of another family.
+        `alike`: drawn teammates that behave the same as a test teammate of another family.
         `untested`: whether a teammate plays on a layout that has no test teammates to compare with.
     """
     tested, drawn, alike, distances, untested = set(), set(), set(), [], False
-    # A teammate may have tasks of several sources, of which only some say which test instance is nearest.
+    # A teammate may have tasks of several sources, and only some of the tasks may record the nearest test teammate.
     nearest = {one.task.teammate_key: one.made.nearest_test for one in tasks if one.task and one.made.nearest_test}
     for task in tasks:
         family, layout = task.first.teammate_family, task.first.layout
@@ -379,7 +379,7 @@ def _known_families(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
     }
 
 
-def _kind_of_teammate(task: Task) -> str:
+def _teammate_kind(task: Task) -> str:
     theta = task.teammate.get("theta", {})
     if task.teammate_family == "rl":
         return f"learned by {task.teammate_kind}"
@@ -388,19 +388,20 @@ def _kind_of_teammate(task: Task) -> str:
     return _MIXED if theta.get("random_actions") else task.teammate_family
 
 
-def _kinds_table(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[list[str]]:
-    """Return the rows of the card's table of teammates by kind, which shows what is missing.
+def _kind_rows(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[list[str]]:
+    """Return the rows of the card's table of teammates by kind, which also shows missing kinds.
 
-    The columns are the kind, its numbers of different teammates in training and in validation, on the benchmark's
-    training layouts and on others, and those training layouts in the release on which it does not train. A teammate
-    counts once: as one that never acts, as a mixture, or else as a member of its family. No rows without tasks.
+    The columns are the kind, the numbers of different teammates of this kind in training and in validation, on the
+    benchmark's training layouts and on other layouts, and the training layouts that have no training teammate of this
+    kind. A teammate that never acts, or that mixes in random actions, does not count as a member of its family. There
+    are no rows if the release has no tasks.
     """
     published = [name for name in layouts if name in TESTED_ON]
     found = defaultdict[tuple[str, str, bool], set[tuple[str, str]]](set)
     for task in (one.task for one in tasks if one.task is not None):
         name = task.layout.name
-        key = name, json.dumps(task.teammate, sort_keys=True)  # not `teammate_key`, which has the wanted dish
-        found[_kind_of_teammate(task), task.split, name in TESTED_ON].add(key)
+        key = name, json.dumps(task.teammate, sort_keys=True)  # `teammate_key` would also compare recipes
+        found[_teammate_kind(task), task.split, name in TESTED_ON].add(key)
     named = [*HEURISTIC_KINDS.values(), _MIXED, _WATCHING, *(f"learned by {name}" for name in ALGORITHMS)]
     if not found:
         return []
@@ -412,26 +413,26 @@ def _kinds_table(tasks: Iterable[_TaskFacts], layouts: Iterable[str]) -> list[li
     return rows
 
 
-def _distinct(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
-    """Return the distinct values of a field of the tasks' provenance."""
+def _distinct_values(tasks: Iterable[_TaskFacts], name: str) -> list[Any]:
+    """Return the distinct values of a provenance field over the tasks."""
     values = (getattr(task.made, name) for task in tasks)
     found = {json.dumps(value, default=msgspec.structs.asdict): value for value in values if value is not None}
     return [found[text] for text in sorted(found)]
 
 
-def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
-    """Return facts on the generation of histories: egos, kept streams, noise schedules, versions."""
+def _generation_facts(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
+    """Return facts about the generation of the histories: egos, stream filters, noise schedules, versions."""
     noise = {json.dumps([task.made.source, task.made.noise]): task.made for task in tasks if task.made.noise}
     labels = {"profile": "profile", "code_version": "icrl4aht-data", "jax_version": "JAX", "platform": "platform"}
-    versions = {label: ", ".join(map(str, _distinct(tasks, name))) for name, label in labels.items()}
-    streams = defaultdict[tuple[int, int, float | None], list[str]](list)  # the filter's rule -> layouts
+    versions = {label: ", ".join(map(str, _distinct_values(tasks, name))) for name, label in labels.items()}
+    streams = defaultdict[tuple[int, int, float | None], list[str]](list)  # layouts by settings of the stream filter
     for task in tasks:
         made = task.made
         if made.filter and made.streams_kept:
             names = streams[made.streams_recorded or 0, made.streams_kept, made.filter.least_improvement]
             names += [task.first.layout] * (task.first.layout not in names)
     return {
-        "egos": _distinct(tasks, "ego"),
+        "egos": _distinct_values(tasks, "ego"),
         "learners": [task.made.learners or 1 for task in tasks if task.made.ego],
         "streams": streams,
         "schedules": [made for made in noise.values() if (made.noise or {}).keys() >= _SCHEDULE],
@@ -440,10 +441,10 @@ def _making(tasks: Sequence[_TaskFacts]) -> dict[str, Any]:
 
 
 def print_learning(content: Mapping[str, Any], console: Console) -> None:
-    """Print the card's table of learning curves, and the tasks that were left out.
+    """Print a dataset card's table of learning curves, and the tasks without histories in the release.
 
     Args:
-        content: result of `card.facts`.
+        content: result of `card_facts`.
         console: console to print to.
     """
     lines = ["Mean returns of the first and the last tenth of the episodes, and numbers of histories:"]

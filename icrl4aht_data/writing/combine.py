@@ -22,15 +22,15 @@ def combine_releases(
     *,
     overwrite: bool = False,
 ) -> Path:
-    """Combine releases, or selections of their histories, into one release, in order and renumbered.
+    """Combine releases, or selections of their histories, into one release with histories numbered anew in order.
 
-    As in new releases, the oracle's actions are left out of tasks in which it earns less than the histories' end.
+    As in new releases, a task's oracle actions are left out if the oracle earns less than the histories at their end.
 
     Args:
         target: the folder to write.
-        roots: releases of the same kind and episode length without common tasks; a `Dataset` for a part of one.
-        data_version: version of the combination; by default the common version of the releases.
-        overwrite: replace a release at `target`.
+        roots: releases of the same kind and episode length without common tasks; a `Dataset` selects a part of one.
+        data_version: version of the new release; by default the common version of the releases.
+        overwrite: whether to replace a release at `target`.
 
     Raises:
         OptionError: if the releases differ in kind or environment, or share a task; if `data_version` is not SemVer; if
@@ -43,8 +43,8 @@ def combine_releases(
     _check_compatible(datasets)
     versions = {dataset.info.data_version for dataset in datasets}
     if data_version is None and len(versions) > 1:
-        raise OptionError(f"data versions {', '.join(sorted(versions))}: say which one the combination has")
-    first, tasks = datasets[0].info, _tasks(datasets)
+        raise OptionError(f"data versions {', '.join(sorted(versions))} differ: give the new release a data version")
+    first, tasks = datasets[0].info, _new_tasks(datasets)
     written = {new.task.task_id for new in tasks}
     left_out = dict.fromkeys(task for dataset in datasets for task in dataset.info.left_out)
     return write_release(
@@ -65,12 +65,12 @@ def _check_compatible(datasets: Sequence[Dataset]) -> None:
         found, expected = getattr(other.info, name), getattr(first.info, name)
         if found != expected:
             raise OptionError(
-                f"{other.root}: {name} {found!r}, but {first.root} has {expected!r}; combine releases of one kind and "
-                f"environment"
+                f"{other.root} has {name} {found!r}, but {first.root} has {expected!r}; combine only releases of one "
+                f"kind and environment"
             )
 
 
-def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
+def _new_tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
     owners: dict[str, Dataset] = {}
     tasks = []
     for dataset in datasets:
@@ -82,21 +82,21 @@ def _tasks(datasets: Sequence[Dataset]) -> list[NewTask]:
             owner = owners.setdefault(task.task_id, dataset)
             if owner is not dataset:
                 raise OptionError(
-                    f"{dataset.origin}: task {task.task_id} is also in {owner.origin}; leave one of them out, or "
-                    f"generate it with another seed"
+                    f"{dataset.origin}: task {task.task_id} is also in {owner.origin}; leave one of the tasks out, or "
+                    f"generate one with another seed"
                 )
             made = dataset.provenance.of(task.task_id)
             partial = is_part and len(histories) < len(dataset.index.query(task_id=task.task_id))
             if partial and made.streams_kept is not None:
-                made = _of_part(made, histories)
-            weak = not made.wants_oracle(float(histories.column("return_end").mean()))
+                made = _partial_provenance(made, histories)
+            weak = not made.is_oracle_useful(float(histories.column("return_end").mean()))
             without = ("oracle_actions",) if weak else ()
             tasks.append(stored_task(histories, task, made, dataset.info.kind, without=without))
     return tasks
 
 
-def _of_part(made: Provenance, histories: Dataset) -> Provenance:
-    """Return the provenance of a task of which only some histories are kept."""
+def _partial_provenance(made: Provenance, histories: Dataset) -> Provenance:
+    """Return a task's provenance for a release that has only some of the task's histories."""
     kept = len(histories)
     if made.filter is None:
         return replace(made, streams_kept=kept)

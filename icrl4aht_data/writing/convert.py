@@ -15,11 +15,11 @@ from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 HistoryProgress = Callable[[int, int], None]
-"""Callback that receives the number of histories done and their total."""
+"""Callback that receives the number of finished histories and the number of all histories."""
 
 
 def release_tasks(dataset: Dataset) -> Mapping[str, Task]:
-    """Return the tasks of a dataset's release by id; if it stores none, `NamedTask`s made from the selected entries."""
+    """Return the tasks of a dataset by id; a `NamedTask` from each index entry if the release stores no tasks."""
     return dataset.tasks or {entry.task_id: named_task(entry.to_json()) for entry in dataset.entries}
 
 
@@ -31,15 +31,15 @@ def stored_task(
     done: Callable[[], None] = lambda: None,
     without: Collection[str] = (),
 ) -> NewTask:
-    """Return a task to write, with its histories and the checkpoints of its teammate and expert.
+    """Return a task of a release as a `NewTask`, with histories and the checkpoints of teammate and expert.
 
     Args:
         dataset: histories of the task.
         task: the task.
         provenance: how the histories were made.
         kind: kind of the release to write.
-        done: called after each history.
-        without: fields of the histories to leave out.
+        done: function called after each history.
+        without: names of fields to leave out of the histories.
     """
 
     def load() -> Iterator[NewHistory]:
@@ -48,9 +48,9 @@ def stored_task(
             done()
 
     files: dict[str, Path] = {}
-    for one in provenance.played(task):
+    for one in provenance.played_tasks(task):
         if one.teammate.get("kind") == "rl":
-            dataset.origin.below(f"{TEAMMATES}/{one.teammate['theta']['sha256']}")  # fetches and checks the checkpoint
+            dataset.origin.below(f"{TEAMMATES}/{one.teammate['theta']['sha256']}")  # fetches and checks the files
         files |= checkpoint_files(dataset.root / TEAMMATES, one, dataset.root)
     if provenance.expert is not None and (sha256 := provenance.expert.policy_sha256) is not None:
         files |= expert_files(dataset.origin.below(expert_folder(sha256)), sha256, dataset.root)
@@ -68,20 +68,20 @@ def to_release(
     """Write a selection as a release of the current format version, with histories numbered from 0.
 
     Args:
-        dataset: a release, or a part of one.
+        dataset: a release, or a selection of its histories.
         target: the folder to write.
         kind: "full", "lite" or "observations"; a dataset without states supports only "observations".
-        overwrite: replace a release at `target`.
-        advance: called with the number of histories written and their total.
+        overwrite: whether to replace a release at `target`.
+        advance: function called with the number of written histories and the number of all histories.
 
     Raises:
-        OptionError: if `target` may not be written, see `release_folder.check_target`, or if `kind` needs states and
-            the dataset has none.
+        OptionError: if `target` may not be written, see `release_folder.check_target`, or if `kind` needs states but
+            the dataset has no states.
     """
     if kind in KINDS and not dataset.has_states:
         raise OptionError(
-            f"{dataset.root}: has observations only, and a {kind} release is made of state records, which observations "
-            f"do not determine; convert to {OBSERVATIONS}, published or parquet"
+            f"{dataset.root} has observations only, but a {kind} release needs state records, which cannot be derived "
+            f"from observations; convert to {OBSERVATIONS}, published or parquet"
         )
     tasks, provenance = release_tasks(dataset), dataset.provenance
     numbers = iter(range(1, len(dataset) + 1))

@@ -1,14 +1,14 @@
-"""Conversion to a Minari dataset.
+"""Conversion of histories to a Minari dataset.
 
-A Minari dataset has one Minari episode per episode of the selection, in order, with the observations of the n kept
-steps and of the state after them, the ego's actions, and the rewards. Episodes never terminate, but are truncated after
-the last kept step. `infos` has arrays of n + 1 rows, one for each observation:
+The Minari dataset has one Minari episode per episode of the selection, in order, with the observations of the n stored
+steps and of the state after the last one, the ego's actions, and the rewards. Episodes never terminate, but are
+truncated after the last stored step. `infos` has arrays of n + 1 rows, one for each observation:
 
     state            uint8 (n + 1, S), state record, see `icrl4aht_data.overcooked.state`
     teammate_action  int8 (n + 1,), the teammate's action that led to the observation; -1 in the first row
-    expert_action, oracle_action   int8 (n + 1,), labels of the observation, if the history has them; -1 in the last row
+    expert_action, oracle_action   int8 (n + 1,), labels, if the history has labels; -1 in the last row
 
-The key `icrl4aht` of the metadata has facts without a Minari field: data version, tasks, provenance, and the task,
+The metadata key `icrl4aht` has the facts that Minari has no field for: data version, tasks, provenance, and the task,
 source, stream, learner and number of episodes of every history. Checkpoints are not converted.
 """
 
@@ -47,37 +47,37 @@ def to_minari(
     overwrite: bool = False,
     advance: HistoryProgress = lambda done, total: None,
 ) -> Path:
-    """Write a selection as a Minari dataset; `minari.load_dataset(target.name)` opens it in MINARI_DATASETS_PATH.
+    """Write a selection as a Minari dataset, which `minari.load_dataset(target.name)` opens in MINARI_DATASETS_PATH.
 
-    Observations have the layouts' own channels if all layouts have the same number, else the canonical channels. For a
-    single task with a heuristic teammate, Minari's `recover_environment` makes its environment.
+    Observations have the layouts' own channels if all layouts have the same number of channels, else the canonical
+    channels. If there is one task with one heuristic teammate, Minari's `recover_environment` makes its environment.
 
     Args:
-        dataset: a release with state records, or a part of one.
+        dataset: a release with state records, or a selection of its histories.
         target: the folder to write, with a Minari name `<name>-v<number>`.
-        overwrite: replace a folder written by this function, or a release.
-        advance: called with the number of histories written and their total.
+        overwrite: whether to replace a folder written by this function, or a release.
+        advance: function called with the number of written histories and the number of all histories.
 
     Raises:
-        OptionError: if Minari is not installed, if the name of `target` has another form, or if it may not be written,
-            see `release_folder.check_target`.
-        NotStoredError: if the release has no state records, and so no observations after the last steps.
+        OptionError: if Minari is not installed, if the name of `target` has another form, or if `target` may not be
+            written, see `release_folder.check_target`.
+        NotStoredError: if the release has no state records, so that observations after the last steps are unknown.
     """
     minari, spaces = import_optional("minari", "Minari"), import_optional("gymnasium.spaces", "Minari")
     storage_module = import_optional("minari.dataset.minari_storage", "Minari")
     target = as_path(target)
     if not dataset.has_states:
         raise NotStoredError(
-            f"{dataset.root}: has observations only, without those after the last steps of episodes, which a Minari "
-            f"dataset needs; convert a full or lite release"
+            f"{dataset.root} has observations only, but a Minari dataset also needs the observation after the last "
+            f"step of each episode; convert a full or lite release"
         )
     if not _NAME.fullmatch(target.name):
-        raise OptionError(f"{target}: expected a folder named as a Minari dataset, such as demo_wide-v0")
+        raise OptionError(f"{target}: expected a folder with a Minari name, such as demo_wide-v0")
     canonical = len({layout.obs_shape for layout in dataset.layouts}) > 1
-    about = _describe(dataset)
+    about = _metadata(dataset)
     with atomic_folder(target, overwrite=overwrite, sources=[dataset.root]) as folder:
         (folder / "data").mkdir()
-        environment = _environment(dataset, about["tasks"], canonical)
+        environment = _environment_spec(dataset, about["tasks"], canonical)
         storage = storage_module.MinariStorage.new(
             folder / "data",
             spaces.Box(0, 255, observation_shape(dataset.layouts[0], canonical), np.uint8),
@@ -101,7 +101,7 @@ def to_minari(
         storage.update_metadata(metadata)
         numbers: list[dict[str, Any]] = []
         for number, history in enumerate(dataset):
-            storage.update_episodes(_buffers(history, dataset.info.environment.kept_steps, canonical))
+            storage.update_episodes(_episode_buffers(history, dataset.info.environment.kept_steps, canonical))
             facts = {"history": number, "task_id": history.entry.task_id, "layout": history.entry.layout}
             numbers += [{**facts, "episode": episode} for episode in range(history.entry.episodes)]
             advance(number + 1, len(dataset))
@@ -109,10 +109,10 @@ def to_minari(
     return target
 
 
-def _describe(dataset: Dataset) -> dict[str, Any]:
+def _metadata(dataset: Dataset) -> dict[str, Any]:
     """Return the content of the metadata key `icrl4aht`."""
     first = {entry.task_id: entry for entry in dataset.entries}
-    names = ("task_id", "source", "env_idx", "learner", "episodes")  # who plays follows from `provenance`
+    names = ("task_id", "source", "env_idx", "learner", "episodes")  # `provenance` says which teammate plays
     return {
         "data_version": dataset.info.data_version,
         "kept_steps": dataset.info.environment.kept_steps,
@@ -122,8 +122,8 @@ def _describe(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def _environment(dataset: Dataset, tasks: list[dict[str, Any]], canonical: bool) -> Any:
-    """Return the environment spec if there is a single task with one heuristic teammate, else None."""
+def _environment_spec(dataset: Dataset, tasks: list[dict[str, Any]], canonical: bool) -> Any:
+    """Return the environment spec of a selection with one task and one heuristic teammate; None for others."""
     swaps = any(entry.teammate_of_episode for entry in dataset.entries)
     if len(tasks) > 1 or tasks[0]["teammate"]["kind"] == "rl" or swaps:
         return None
@@ -134,7 +134,7 @@ def _environment(dataset: Dataset, tasks: list[dict[str, Any]], canonical: bool)
     )
 
 
-def _buffers(history: History, steps: int, canonical: bool) -> Iterator[Any]:
+def _episode_buffers(history: History, steps: int, canonical: bool) -> Iterator[Any]:
     from minari.data_collector import EpisodeBuffer
 
     layout = get_layout(history.entry.layout)

@@ -18,22 +18,22 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ROW_GROUP = 2000
-"""Minimum number of episodes in a row group: about 10 MB in memory."""
+"""Minimum number of episodes in a row group, which takes about 10 MB of memory."""
 
 FILE_EPISODES = 500_000
-"""Number of episodes after which a new file starts: about 100 MB."""
+"""Number of episodes after which a new file starts; such a file has about 100 MB."""
 
 
 def to_parquet(dataset: Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
-    """Write a selection's index as a Parquet file, one row per history. Needs pyarrow (extra `hf`).
+    """Write a selection's index as a Parquet file, one row per history; this needs pyarrow (extra `hf`).
 
     Args:
-        dataset: a release, or a part of one.
-        path: the file to write.
-        overwrite: replace a file at `path`.
+        dataset: a release, or a selection of its histories.
+        path: path of the file to write.
+        overwrite: whether to replace a file at `path`.
 
     Raises:
-        OptionError: if pyarrow is not installed, or `path` may not be written, see `utils.files.check_output`, or
+        OptionError: if pyarrow is not installed, or if `path` may not be written, see `utils.files.check_output`, or
             is inside the release.
     """
     arrow, path = import_pyarrow(), as_path(path)
@@ -41,11 +41,11 @@ def to_parquet(dataset: Dataset, path: str | Path, *, overwrite: bool = False) -
 
     check_output(path, overwrite)
     if path.resolve().is_relative_to(dataset.root.resolve()):
-        raise OptionError(f"{path}: is inside {dataset.root}, which is read; give another path")
+        raise OptionError(f"{path} is inside {dataset.root}, which is read; give another path")
     schema = index_schema().with_metadata({"icrl4aht-data": "index"})
     rows = arrow.Table.from_pylist([entry.to_row() for entry in dataset.entries], schema)
     with explain_full_disk(path), atomic_write(path) as partial, partial.open("wb") as stream:
-        pq.write_table(rows, stream)  # given a stream, because pyarrow leaves its own file open after an error
+        pq.write_table(rows, stream)  # a stream instead of a path, since pyarrow leaves its file open after an error
     return path
 
 
@@ -62,10 +62,10 @@ def write_episodes(
     columns are `arrow_tables.EPISODE_COLUMNS`; state records are padded to the longest of the selection's layouts.
 
     Args:
-        dataset: a release with state records, or a part of one.
-        folder: the folder to write the layouts' folders to.
+        dataset: a release with state records, or a selection of its histories.
+        folder: the folder in which to create one folder per layout.
         file_episodes: number of episodes after which a new file starts.
-        advance: called with the number of histories written and their total.
+        advance: function called with the number of written histories and the number of all histories.
 
     Raises:
         OptionError: if pyarrow is not installed.
@@ -88,7 +88,7 @@ def write_episodes(
 
 
 def _write_row_groups(part: Dataset, path: Path, schema: pa.Schema) -> Iterator[int]:
-    """Write one Parquet file of episodes; yield the number of histories in each row group after writing it."""
+    """Write one Parquet file of episodes; after each row group, yield the number of histories in the row group."""
     arrow = import_pyarrow()
     import pyarrow.parquet as pq
 

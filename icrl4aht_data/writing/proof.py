@@ -1,6 +1,6 @@
-"""What a release teaches: returns of models that were trained on it alone.
+"""Returns of models that were trained only on one release, for the dataset card of this release.
 
-`icrl4aht-data research proof` measures them on validation tasks and stores them in `cards/proof.json`.
+`icrl4aht-data research proof` measures the returns on validation tasks and stores them in `cards/proof.json`.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ _COLUMNS = {
 
 
 def read_proof(root: Path) -> dict[str, Any] | None:
-    """Return the proof in the package's cards if it is of the release in a folder; otherwise None."""
+    """Return the content of `cards/proof.json` if its models were trained on the release in `root`; otherwise None."""
     try:
         content = parse_json(read_text(card_file(PROOF_FILE)))
-    except OptionError:  # not made yet
+    except OptionError:  # the file has not been made yet
         return None
     return content if content["histories_sha256"] == file_hash(root / HISTORIES) else None
 
 
 def proof_table(proof: Mapping[str, Any]) -> str:
-    """Return a Markdown table of models by the histories that they learned from, with the range of their trainings."""
+    """Return a Markdown table of the models' mean returns, with the histories used and the range over trainings."""
     rows = [
-        [one["histories"], one["learner"], str(len(one["seeds"])), *(_spread(one[key], key) for key in _COLUMNS)]
+        [one["histories"], one["learner"], str(len(one["seeds"])), *(_with_range(one[key], key) for key in _COLUMNS)]
         for one in proof["models"]
     ]
     return markdown_table(["histories", "model", "trainings", *_COLUMNS.values()], rows, right=1 + len(_COLUMNS))
 
 
-def _spread(values: Sequence[float], key: str) -> str:
+def _with_range(values: Sequence[float], key: str) -> str:
     digits = 2 if key == "share" else 1
     ends = f" ({min(values):z.{digits}f} to {max(values):z.{digits}f})" if len(values) > 1 else ""
     return f"{sum(values) / len(values):z.{digits}f}{ends}"

@@ -1,12 +1,13 @@
 """Conversion between releases and the files of the published code.
 
 The published code stores all histories in `histories.h5`, one group each, with float32 observations in gzip-6 chunks of
-4096 steps and its own order of action ids. Its index `histories_index.jsonl` has the paper's 14 fields (App. D.3).
-`to_published` also writes `state` and `episode_end_state` of each group, `tasks.jsonl` and `provenance.json`, which the
-published readers ignore. With these, converting back loses only checkpoints and oracle actions. The published index has
-no learners, so the streams of a task's learners are numbered consecutively.
-Files without states become a release of observations, because observations do not determine the state. Without
-`tasks.jsonl`, such a release knows its tasks only by name.
+4096 steps and another order of action ids. The index `histories_index.jsonl` has the paper's 14 fields (App. D.3).
+`to_published` also writes `tasks.jsonl`, `provenance.json`, and for each group `state` and `episode_end_state`, which
+the published readers ignore. With these files, converting back loses only checkpoints and oracle actions. The published
+index has no field for learners, so the streams of a task's learners are numbered consecutively.
+
+Files without states become a release of observations, since states cannot be derived from observations. Without
+`tasks.jsonl`, only the names of the tasks are known in such a release.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from icrl4aht_data.benchmark.tasks import Task, named_task, read_tasks, write_ta
 from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import Icrl4ahtError, PublishedFormatError
 from icrl4aht_data.format.provenance import Provenance, ProvenanceByTask, read_provenance
-from icrl4aht_data.format.safe_hdf5 import find, read_dataset
+from icrl4aht_data.format.safe_hdf5 import find_node, read_dataset
 from icrl4aht_data.format.schema import (
     ACTION_FIELDS,
     FIELDS,
     OBSERVATIONS,
     Kind,
     episode_ends,
-    held_fields,
+    memory_fields,
 )
 from icrl4aht_data.overcooked.actions import ACTIONS, PUBLISHED_ACTIONS
 from icrl4aht_data.overcooked.fast_observe import fast_observe
@@ -50,12 +51,12 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import HISTORIES_H5, HISTORIES_INDEX, as_path, atomic_folder
 
 PUBLISHED_CHUNK = 4096
-"""Steps per chunk in the published files."""
+"""Number of steps per chunk in the published files."""
 
 _TO_PUBLISHED = np.array([PUBLISHED_ACTIONS.index(name) for name in ACTIONS], np.int32)
 
 FROM_PUBLISHED = np.array([ACTIONS.index(name) for name in PUBLISHED_ACTIONS], np.int32)
-"""int32 (6,), maps action ids of the published files to those of this package."""
+"""Action ids of this package by action id of the published files, int32 (6,)."""
 
 
 def to_published(
@@ -70,13 +71,13 @@ def to_published(
     """Write a selection as files of the published code, with histories numbered from 0.
 
     Args:
-        dataset: a release, or a part of one.
+        dataset: a release, or a selection of its histories.
         target: the folder to write.
-        chunk: steps per chunk.
-        states: also store the state records, if there are any; without them, `from_published` makes a release of
-            observations.
-        overwrite: replace a folder written by this function, or a release.
-        advance: called with the number of histories written and their total.
+        chunk: number of steps per chunk.
+        states: whether to store the state records, if the release has any; from files without state records,
+            `from_published` makes a release of observations.
+        overwrite: whether to replace a folder written by this function, or a release.
+        advance: function called with the number of written histories and the number of all histories.
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`.
@@ -92,7 +93,7 @@ def to_published(
                 for field in (one for one in history.entry.stored_fields(kind) if one.name != "oracle_actions"):
                     _write_published(group, field.name, history.read(field.name), chunk)
                 line = history.entry.to_json() | {"history_id": number, "h5_group": f"/{number}"}
-                line["env_idx"] += history.entry.learner * _streams_each(provenance.get(history.entry.task_id))
+                line["env_idx"] += history.entry.learner * _streams_per_learner(provenance.get(history.entry.task_id))
                 index.write(json.dumps({name: line[name] for name in PUBLISHED_FIELDS}) + "\n")
                 advance(number + 1, len(dataset))
         tasks = [task for name, task in dataset.tasks.items() if name in names]
@@ -106,7 +107,7 @@ class _SafeFile(io.FileIO):
     """File that stores write errors instead of raising them, because libhdf5 may crash on a full disk.
 
     Attributes:
-        error: the first write error, after which nothing is written.
+        error: the first write error; later writes do nothing.
     """
 
     error: OSError | None = None
@@ -130,7 +131,7 @@ class _SafeFile(io.FileIO):
 
 @contextmanager
 def _new_hdf5(path: Path) -> Iterator[h5py.File]:
-    """Yield a new HDF5 file to write to; raise OSError with its name if the disk is full."""
+    """Yield a new HDF5 file to write to; raise OSError with the file's name if the disk is full."""
     with add_filename(path), _SafeFile(path, "w+") as stream:
         with h5py.File(stream, "w") as file:
             yield file
@@ -138,8 +139,8 @@ def _new_hdf5(path: Path) -> Iterator[h5py.File]:
             raise stream.error
 
 
-def _streams_each(provenance: Provenance | None) -> int:
-    """Return the number of stream ids in the published index that are reserved for each learner of a task."""
+def _streams_per_learner(provenance: Provenance | None) -> int:
+    """Return how many stream numbers each learner of a task has in the published index."""
     ego = None if provenance is None else provenance.ego
     return 2**31 if ego is None else ego["environments"]
 
@@ -166,22 +167,22 @@ def from_published(
     """Write a release from files of the published code.
 
     Args:
-        source: a folder with `histories.h5` and `histories_index.jsonl`; and with the tasks of the index in
-            `tasks.jsonl`, without which only a release of observations can be made, which knows its tasks by name.
+        source: a folder with `histories.h5`, `histories_index.jsonl` and the tasks of the index in `tasks.jsonl`.
+            Without `tasks.jsonl`, the result can only be a release of observations, in which tasks have only names.
         target: the folder to write.
         kind: kind of the release; by default "lite" if a group has state records, else "observations".
-        data_version: version of the data, SemVer.
-        kept_steps: steps of every episode; the last episode of a history may be unfinished.
-        overwrite: replace a release at `target`.
-        advance: called with the number of histories converted and their total.
+        data_version: version of the data, in the form of SemVer.
+        kept_steps: number of steps of every episode; the last episode of a history may be unfinished.
+        overwrite: whether to replace a release at `target`.
+        advance: function called with the number of converted histories and the number of all histories.
 
     Returns:
-        The kind of the release.
+        The kind of the written release.
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`.
-        PublishedFormatError: if a file is missing or malformed, if a group lacks an array that the kind of release
-            needs, or if two histories have the same group or stream; with file and group.
+        PublishedFormatError: if a file is missing or malformed, if a group has no array that the kind of release
+            needs, or if two histories have the same group or stream; the message has the file and the group.
     """
     kept_steps, source = check_int("kept_steps", kept_steps, 1), as_path(source)
     lines = read_published_index(resolve_inside(source, HISTORIES_INDEX))
@@ -197,12 +198,12 @@ def from_published(
         for group in groups:
             learner, stream = 0, group.line["env_idx"]
             if (made.learners or 1) > 1:
-                learner, stream = divmod(stream, _streams_each(made))
+                learner, stream = divmod(stream, _streams_per_learner(made))
             yield NewHistory(stream, {name: group.read(name) for name in group.field_names()}, learner)
             advance(next(numbers), len(lines))
 
     with file:
-        present = [_stored_names(file, line["h5_group"]) for line in lines]
+        present = [_array_names(file, line["h5_group"]) for line in lines]
         found: Kind = kind or ("lite" if any("state" in (names or ()) for names in present) else OBSERVATIONS)
         histories = [_PublishedHistory(file, line, found, kept_steps) for line in lines]
         for history, names in zip(histories, present, strict=True):
@@ -210,7 +211,7 @@ def from_published(
         new = [
             NewTask(
                 task,
-                _with_notes(provenance.of(task.task_id), members[0]),
+                _with_padding_note(provenance.of(task.task_id), members[0]),
                 len(members),
                 lambda task=task, members=members: load(task, members),
             )
@@ -233,8 +234,8 @@ def _wrap_errors(what: str) -> Iterator[None]:
         raise PublishedFormatError(f"{what}: {error}") from error
 
 
-def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenance:
-    """Return provenance with a note about padded views."""
+def _with_padding_note(provenance: Provenance, history: _PublishedHistory) -> Provenance:
+    """Return provenance with a note about padded views if the history's observations have to be padded."""
     if not (history.short and history.kind == OBSERVATIONS):
         return provenance
     rows = get_layout(history.line["layout"]).height
@@ -242,11 +243,11 @@ def _with_notes(provenance: Provenance, history: _PublishedHistory) -> Provenanc
     return msgspec.structs.replace(provenance, other={**provenance.other, "published": notes})
 
 
-def _stored_names(file: h5py.File, group: str) -> set[str] | None:
+def _array_names(file: h5py.File, group: str) -> set[str] | None:
     """Return the names of the known arrays in a group; None if the group is missing."""
     with _wrap_errors(f"{file.filename}, group {group}: cannot be read"):
-        found = find(file, group)
-        return {name for name in FIELDS if find(found, name)} if isinstance(found, h5py.Group) else None
+        found = find_node(file, group)
+        return {name for name in FIELDS if find_node(found, name)} if isinstance(found, h5py.Group) else None
 
 
 def _tasks(histories: list[_PublishedHistory], source: Path, kind: Kind) -> list[tuple[Task, list[_PublishedHistory]]]:
@@ -258,30 +259,30 @@ def _tasks(histories: list[_PublishedHistory], source: Path, kind: Kind) -> list
     elif kind == OBSERVATIONS:
         known = {name: named_task(members[0].line) for name, members in by_task.items()}
     else:
-        raise PublishedFormatError(f"{found}: missing; give a file with the tasks that the index names")
+        raise PublishedFormatError(f"{found} is missing; add a file with the tasks that the index names")
     absent = by_task.keys() - known.keys()
     if absent:
-        raise PublishedFormatError(f"{found}: missing {len(absent)} tasks of the index, such as {min(absent)!r}")
+        raise PublishedFormatError(f"{found}: {len(absent)} tasks of the index are missing, such as {min(absent)!r}")
     for history in histories:
         task, line = known[history.line["task_id"]], named_task(history.line)
         one, two = ((t.track, t.split, t.layout.name, t.teammate_family, t.teammate_kind) for t in (line, task))
         if one != two:
             raise PublishedFormatError(
-                f"{source / HISTORIES_INDEX}: history {history.line['history_id']} is of {one}, its task "
-                f"{task.task_id!r} of {two}; correct the index or the tasks"
+                f"{source / HISTORIES_INDEX}: history {history.line['history_id']} has {one}, but its task "
+                f"{task.task_id!r} has {two}; correct the index or the tasks"
             )
     return [(known[name], members) for name, members in by_task.items()]
 
 
 @dataclass(frozen=True)
 class _PublishedHistory:
-    """One history of a published file, whose arrays are read, checked and converted on access.
+    """One history of a published file; its arrays are read, checked and converted on access.
 
     Args:
-        file: the open file.
-        line: its index line.
+        file: the open HDF5 file.
+        line: the history's line of the index.
         kind: kind of the release to write.
-        kept_steps: steps of every episode.
+        kept_steps: number of steps of every episode.
     """
 
     file: h5py.File
@@ -291,35 +292,35 @@ class _PublishedHistory:
 
     @property
     def where(self) -> str:
-        """File and group, for messages."""
+        """Names of the file and of the history's group, for messages."""
         return f"{self.file.filename}, group {self.line['h5_group']}"
 
     @property
     def short(self) -> bool:
-        """Whether the observations are short views, see `published_views`."""
+        """Whether the observations have fewer than 5 rows and need padding, see `published_views`."""
         return is_short(get_layout(self.line["layout"]), self.line["obs_shape"])
 
     def field_names(self) -> list[str]:
-        """Return the names of the arrays to convert."""
-        fields = held_fields(self.kind)
+        """Return the names of the arrays of this history to convert."""
+        fields = memory_fields(self.kind)
         return [f.name for f in fields if self.kind not in f.optional or self.line.get(f"has_{f.name}")]
 
     def check_arrays(self, present: set[str] | None) -> None:
-        """Check that the group has the arrays to convert, and observations.
+        """Check that the history's group has observations and all arrays to convert.
 
         Args:
-            present: the names of its arrays; None if the group is missing.
+            present: names of the arrays in the group; None if the group is missing.
 
         Raises:
-            PublishedFormatError: if arrays are missing; with the group and their names.
+            PublishedFormatError: if arrays are missing; the message has the group and the names of the arrays.
         """
         if present is None:
-            raise PublishedFormatError(f"{self.where}: missing, but the index names it")
+            raise PublishedFormatError(f"{self.where} is missing, but the index has a line for it")
         missing = [name for name in dict.fromkeys(("obs", *self.field_names())) if name not in present]
         if missing:
             raise PublishedFormatError(
-                f"{self.where}: missing {', '.join(missing)}: complete the file or correct the index; without state "
-                f"records, convert with `--to {OBSERVATIONS}`"
+                f"{self.where}: missing {', '.join(missing)}: complete the file or correct the index; if state records "
+                f"are missing, convert with `--to {OBSERVATIONS}`"
             )
 
     def read(self, name: str) -> np.ndarray:
@@ -329,7 +330,7 @@ class _PublishedHistory:
             PublishedFormatError: if the array is invalid; the message has its name, and what was expected and found.
         """
         layout, steps = get_layout(self.line["layout"]), self.line["T"]
-        if name == "obs" and self.short and self.kind != OBSERVATIONS:  # rendered, since states show the missing rows
+        if name == "obs" and self.short and self.kind != OBSERVATIONS:  # state records have the missing rows
             return fast_observe(layout, self.read("state"), np.empty((steps, *layout.obs_shape), np.uint8))
         array = self._read_recorded(name)
         if name == "obs" and self.short:
@@ -341,31 +342,31 @@ class _PublishedHistory:
             return FROM_PUBLISHED[array]
         if name == "dones" and not (array.any() and np.array_equal(array, episode_ends(steps, self.kept_steps))):
             raise PublishedFormatError(
-                f"{self.where}: dones: expected an end every {self.kept_steps} steps, found {array.sum()} in {steps} "
-                f"steps, the first at {np.flatnonzero(array)[:3].tolist()}; give the episodes' length with --kept-steps"
+                f"{self.where}: dones: expected an episode end every {self.kept_steps} steps, found {array.sum()} in "
+                f"{steps} steps, first at {np.flatnonzero(array)[:3].tolist()}; give the length with --kept-steps"
             )
         if name == "state":
             obs, shown = self._read_recorded("obs"), np.empty((steps, *layout.obs_shape), np.uint8)
             if not np.array_equal(obs, fast_observe(layout, array, shown)[:, : obs.shape[1]]):
-                raise PublishedFormatError(f"{self.where}: obs is not what state shows")
+                raise PublishedFormatError(f"{self.where}: obs does not match the observations rendered from state")
         return array
 
     def _read_recorded(self, name: str) -> np.ndarray:
-        """Return one array in the field's compact dtype; short views are not padded."""
+        """Return one array as recorded, without padding of observations, in the field's compact dtype."""
         field, layout, steps = FIELDS[name], get_layout(self.line["layout"]), self.line["T"]
         rows = steps if field.axis == "T" else steps // self.kept_steps
-        shape = self.line["obs_shape"] if name == "obs" and self.short else field.held(layout).shape
+        shape = self.line["obs_shape"] if name == "obs" and self.short else field.memory_dtype(layout).shape
         with _wrap_errors(f"{self.where}: {name}: {steps} steps on {layout.name}"):
-            found = read_dataset(find(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
-        return self._compact(name, found)
+            found = read_dataset(find_node(self.file, f"{self.line['h5_group']}/{name}"), (rows, *shape))
+        return self._to_compact(name, found)
 
-    def _compact(self, name: str, found: np.ndarray) -> np.ndarray:
-        """Convert values to the field's compact dtype, if they are integers in its range."""
+    def _to_compact(self, name: str, found: np.ndarray) -> np.ndarray:
+        """Convert values to the field's compact dtype; raise an error for values that the dtype cannot represent."""
         compact = np.dtype(FIELDS[name].compact)
         low, high = (0, 1) if compact.kind == "b" else (np.iinfo(compact).min, np.iinfo(compact).max)
         if name in ACTION_FIELDS:
             low, high = 0, len(ACTIONS) - 1
-        with np.errstate(invalid="ignore"):  # values that the cast changes fail the comparison
+        with np.errstate(invalid="ignore"):  # the comparison below finds values that the cast changes
             array = found.astype(compact)
         wrong = (array != found) | (found < low) | (found > high)
         if wrong.any():

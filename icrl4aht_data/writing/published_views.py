@@ -1,8 +1,8 @@
-"""Padding of observations of the published code, whose views are too short on maps with fewer than 5 rows.
+"""Padding of observations of the published code, which have too few rows on maps with fewer than 5 rows.
 
-On such a map, a published view has only as many rows as the map: 4 x 5 cells on the cramped layouts. The missing row is
-two cells below the agent. The padding is 0 outside the map. Inside the map it shows the fixed cells (walls, pots,
-piles), and 0 for items, which were not recorded.
+On such a map, a published observation has only as many rows as the map: 4 x 5 cells on the cramped layouts. The missing
+row is two cells below the agent. The padding is 0 outside the map. Inside the map the padding shows the fixed cells
+(walls, pots, piles), but 0 for items, which were not recorded.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ PADDING = (
     "below the ego shows the map's fixed cells, and 0 outside of the map; items, pots' contents and timers in it were "
     "not recorded and are 0"
 )
-"""Note about padded views for meta/provenance.json."""
+"""Note about padded observations for meta/provenance.json."""
 
 
 def is_short(layout: Layout, obs_shape: tuple[int, ...]) -> bool:
-    """Return whether observations of this shape are short views, with one row per row of a map of fewer than 5 rows."""
+    """Return whether observations of this shape have fewer than 5 rows, as on a map with fewer than 5 rows."""
     return layout.height < WINDOW and tuple(obs_shape) == (layout.height, *layout.obs_shape[1:])
 
 
 def empty_views(layout: Layout) -> np.ndarray:
-    """Return the views from each cell of the ego's room in a layout without items, uint8 (cells, 5, 5, C)."""
+    """Return the observations from each cell that the ego can reach, without items, uint8 (cells, 5, 5, C)."""
     records = np.zeros((len(layout.rooms[EGO]), record_size(layout)), np.uint8)
     records[:, columns(layout).positions] = layout.rooms[EGO][:, None]
     return np.asarray(observe(layout, records, EGO))
 
 
 def complete_views(layout: Layout, short: np.ndarray) -> np.ndarray:
-    """Pad short views to five rows.
+    """Pad observations that have fewer than five rows to five rows.
 
     Args:
         layout: the layout.
-        short: uint8 (T, H, 5, C), H rows of the map; the ego is in the third row.
+        short: uint8 (T, H, 5, C), observations with the H rows of the map; the ego is in the third row.
 
     Returns:
-        uint8 (T, 5, 5, C).
+        Padded observations uint8 (T, 5, 5, C).
 
     Raises:
-        PublishedFormatError: if a view does not match the layout from any cell of the ego's room; without file and
-            group, which the caller adds.
+        PublishedFormatError: if an observation does not match the layout from any cell that the ego can reach; the
+            caller adds the file and the group to the message.
     """
     rows, fixed, known = short.shape[1], fixed_channels(layout), empty_views(layout)
     cells = {view[:rows, :, fixed].tobytes(): cell for cell, view in enumerate(known)}
     at = np.array([cells.get(view.tobytes(), -1) for view in np.ascontiguousarray(short[..., fixed])], np.int64)
     if (at < 0).any():
-        raise PublishedFormatError(f"step {int(np.argmin(at))} does not show {layout.name} from any cell of the ego's")
+        raise PublishedFormatError(f"step {int(np.argmin(at))} does not show {layout.name} from any reachable cell")
     full = np.zeros((len(short), *layout.obs_shape), np.uint8)
     full[:, :rows] = short
     full[:, rows:, :, fixed] = known[at][:, rows:, :, fixed]

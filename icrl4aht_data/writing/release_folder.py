@@ -1,4 +1,4 @@
-"""Atomic writing of folders. Existing folders are replaced only on request, and only if this package wrote them."""
+"""Atomic writing of folders; a folder is replaced only on request, and only if this package wrote the folder."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from icrl4aht_data.format.schema import MANIFEST
 from icrl4aht_data.utils.files import explain_full_disk, files_below, lock_path, process_lock
 
 HISTORIES_H5, HISTORIES_INDEX = "histories.h5", "histories_index.jsonl"
-"""Names of the files of the published code."""
+"""Names of the two main files of the published format."""
 
 _CONVERTED = (
     {HISTORIES_H5, HISTORIES_INDEX, "tasks.jsonl", "provenance.json"},
     {"data/main_data.hdf5", "data/metadata.json"},
 )
-"""Sets of files by which folders of published files and Minari datasets are recognised."""
+"""Files in folders that this package converted: to the published format, and to a Minari dataset."""
 
 
 def as_path(target: object) -> Path:
-    """Return the path of a folder or file to write.
+    """Return the path of a folder or file to write as a `Path`.
 
     Raises:
-        OptionError: if it is neither a path nor a string.
+        OptionError: if the argument is neither a path nor a string.
     """
     if not isinstance(target, (str, Path)):
         raise OptionError(f"{target!r:.100}: expected the path of a folder or file to write")
@@ -43,8 +43,8 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
 
     Args:
         target: the folder to write.
-        overwrite: replace a release, or a folder of converted files, at `target`.
-        sources: folders that the block reads; addresses are ignored.
+        overwrite: whether to replace a release, or a folder of converted files, at `target`.
+        sources: folders that the block reads; addresses of remote releases are ignored.
 
     Raises:
         OptionError: if `check_target` fails before or after the block, or another process is writing the folder.
@@ -58,14 +58,14 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             with process_lock(lock_path(target), wait=False):
-                if old.exists() and not target.exists():  # a process was killed in `_replace`
+                if old.exists() and not target.exists():  # a run was killed in `_replace`
                     old.rename(target)
                     check_target(target, overwrite, sources)
                 for leftover in (new, old):
                     shutil.rmtree(leftover, ignore_errors=True)
                 try:
                     new.mkdir()
-                    with explain_full_disk(target):  # measures free space before `new` is removed
+                    with explain_full_disk(target):  # here too, to measure the free space before `new` is removed
                         yield new
                     check_target(target, overwrite, sources)
                     _replace(target, new, old)
@@ -74,20 +74,20 @@ def atomic_folder(target: Path, *, overwrite: bool = False, sources: Iterable[st
                         shutil.rmtree(leftover, ignore_errors=True)
         except Timeout as error:
             raise OptionError(
-                f"{target}: another process is writing it; wait for it, or give another folder"
+                f"{target}: another process is writing this folder; wait until it ends, or give another folder"
             ) from error
 
 
 def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = ()) -> bool:
-    """Check that a folder is missing or empty, or may be replaced.
+    """Check that a folder may be written: it must be missing or empty, or may be replaced.
 
     Args:
         target: the folder to write.
-        overwrite: allow replacing a release, or a folder of converted files, without other files.
-        sources: folders to read from; none may equal the target, or be inside or around it.
+        overwrite: whether to allow replacing a release, or a folder of converted files, that has no other files.
+        sources: folders to read from; none may be the target, or be inside or around the target.
 
     Returns:
-        Whether there is a folder to replace.
+        Whether the target exists and will be replaced.
 
     Raises:
         OptionError: if the folder may not be written.
@@ -96,24 +96,24 @@ def check_target(target: Path, overwrite: bool, sources: Iterable[str | Path] = 
     for source in (Path(source) for source in sources if not is_address(source)):
         read = source.resolve()
         if read == resolved:
-            raise OptionError(f"{target}: is also read; give another folder")
+            raise OptionError(f"{target} is also read; give another folder to write")
         if read.is_relative_to(resolved) or resolved.is_relative_to(read):
             relation = "contains" if read.is_relative_to(resolved) else "is inside"
-            raise OptionError(f"{target}: {relation} {source}, which is read; give another folder")
+            raise OptionError(f"{target} {relation} {source}, which is read; give another folder to write")
     if not os.path.lexists(target) or (resolved.is_dir() and not any(resolved.iterdir())):
         return False
     if not overwrite:
         raise OptionError(f"{target}: exists; give another folder, or replace it by --overwrite")
     if fault := _foreign_content(resolved):
         raise OptionError(
-            f"{target}: {fault}; --overwrite replaces only releases and converted files: remove the folder, or "
-            f"give another one"
+            f"{target} {fault}; --overwrite replaces only releases and converted files: remove the folder, or give "
+            f"another folder"
         )
     return True
 
 
 def _foreign_content(folder: Path) -> str | None:
-    """Return why a folder was not written by this package, in words; None if it was."""
+    """Return text that says why a folder was not written by this package; None if it was."""
     if not folder.is_dir():
         return "is not a folder"
     present = set(files_below(folder))
@@ -125,11 +125,11 @@ def _foreign_content(folder: Path) -> str | None:
         foreign = sorted(present - {MANIFEST, *read_manifest(folder)})
     except Icrl4ahtError as error:
         return f"is not a release: {error}"
-    return f"has {foreign[0]}, which its {MANIFEST} does not list" if foreign else None
+    return f"contains {foreign[0]}, which {MANIFEST} does not list" if foreign else None
 
 
 def _replace(target: Path, new: Path, old: Path) -> None:
-    """Rename an existing target to `old`, and the new folder to the target."""
+    """Rename the folder `target`, if it exists, to `old`, and the folder `new` to `target`."""
     if target.exists():
         target.rename(old)
     try:

@@ -15,8 +15,8 @@ import numpy as np
 
 from icrl4aht_data.errors import OptionError
 from icrl4aht_data.format.chunks import (
-    BETWEEN,
     DEFLATE_LEVEL,
+    METADATA_ROW_BYTES,
     chunk_hash,
     chunk_locations,
     chunk_table_name,
@@ -27,15 +27,15 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.utils.files import add_filename
 from icrl4aht_data.utils.system import usable_cores
 
-_BLOCK = 2000  # steps; the length of one chunk of scalars or two chunks of records
+_BLOCK = 2000  # number of steps in one chunk of scalars, or in two chunks of state records
 
 
 class EncodedChunk(NamedTuple):
-    """One chunk of a history, ready to be stored.
+    """One encoded chunk of a history, ready to be stored.
 
     Args:
-        field: field of the chunk.
-        start: first row of the chunk, a step or episode of the history.
+        field: field that the chunk is a part of.
+        start: number of the chunk's first row, which is a step or an episode of the history.
         data: shuffled and deflated bytes.
     """
 
@@ -47,20 +47,20 @@ class EncodedChunk(NamedTuple):
 def write_shard(
     root: Path, shard: str, kind: Kind, entries: Sequence[Entry], histories: Sequence[Sequence[EncodedChunk]]
 ) -> None:
-    """Write a shard and its chunk table into a release folder that no reader has opened yet.
+    """Write a shard and its chunk table into a new release folder that no reader has opened yet.
 
     Args:
         root: the release folder.
-        shard: path in the release, equal to `shard` of every entry.
+        shard: path of the shard in the release, equal to `shard` of every entry.
         kind: kind of the release.
-        entries: index entries of the histories, each with its position in the shard (`h5_group`, `h5_row`).
-        histories: the chunks of each entry's history, see `encode_history`.
+        entries: index entries of the histories, with the histories' positions in the shard (`h5_group`, `h5_row`).
+        histories: encoded chunks of each entry's history, see `encode_history`.
     """
     path, table_path = root / shard, root / chunk_table_name(shard)
     path.parent.mkdir(parents=True, exist_ok=True)
     table_path.parent.mkdir(parents=True, exist_ok=True)
     layout = get_layout(entries[0].layout)
-    # In memory, since libhdf5 may crash when it closes a file on a full disk. A shard is small, see `SHARD_BYTES`.
+    # The file is made in memory, since libhdf5 may crash when it closes a file on a full disk. Shards are small.
     with h5py.File(path, "w", libver=("v110", "v110"), driver="core", backing_store=False) as file:
         file.attrs["format_version"] = FORMAT_VERSION
         file.attrs["layout"] = layout.name
@@ -85,25 +85,25 @@ def write_shard(
 
 
 def metadata_lines(content: bytes, chunks: np.ndarray) -> np.ndarray:
-    """Return the chunk table's rows for the HDF5 metadata of a shard, the bytes between its chunks."""
+    """Return the rows of a chunk table for the HDF5 metadata of a shard, that is, for the bytes between the chunks."""
     ordered = np.sort(chunks, order="offset")
     starts = [*ordered["offset"].tolist(), len(content)]
     stops = [0, *(ordered["offset"] + ordered["size"]).tolist()]
     lines = []
     for stop, start in zip(stops, starts, strict=True):
-        for low in range(stop, start, BETWEEN):
-            data = content[low : min(low + BETWEEN, start)]
+        for low in range(stop, start, METADATA_ROW_BYTES):
+            data = content[low : min(low + METADATA_ROW_BYTES, start)]
             lines.append((low, len(data), 0, *_checksums(data)))
     return np.array(lines, CHUNK_DTYPE)
 
 
 def _checksums(data: bytes) -> tuple[int, np.ndarray]:
-    """Return CRC-32 and hash of a chunk, the last two values of a chunk table's row."""
+    """Return the CRC-32 and the hash of a chunk, which are the last two values of a row of the chunk table."""
     return zlib.crc32(data), np.frombuffer(chunk_hash(data), np.uint8)
 
 
 def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Sequence[Entry]) -> None:
-    """Create the empty datasets of a group: (T,) for one history, (histories, T) for stacked ones."""
+    """Create the empty datasets of a group, with shape (T,) for one history, (histories, T) for stacked histories."""
     first = entries[0]
     group = file.create_group(first.h5_group)
     for field in first.stored_fields(kind):
@@ -123,7 +123,7 @@ def _create_datasets(file: h5py.File, layout: Layout, kind: Kind, entries: Seque
 
 
 def file_order(field: Field, start: int) -> tuple[int, ...]:
-    """Return the sort key of a chunk, which makes a window of steps one byte range of the file.
+    """Return a sort key that orders a history's chunks so that a window of steps is one byte range of the file.
 
     Chunks are sorted by block of `_BLOCK` steps, then by field. In a block, the scalars that every window needs are
     between the first and the second chunk of state records.
@@ -141,20 +141,20 @@ def encode_history(kind: Kind, entry: Entry, arrays: Mapping[str, np.ndarray]) -
     Args:
         kind: kind of the release.
         entry: the history's index entry.
-        arrays: field name -> array, of any dtype with values that the stored dtype can hold.
+        arrays: arrays by field name, of any dtype; the stored dtype must be able to represent all values.
 
     Raises:
-        OptionError: if the stored dtype cannot hold a value, or an array's length differs from the index entry.
+        OptionError: if the stored dtype cannot represent a value, or an array's length differs from the index entry.
     """
     layout, parts = get_layout(entry.layout), []
     for field in entry.stored_fields(kind):
         element, array, rows = field.element(layout, kind), arrays[field.name], entry.rows(field)
         where = f"task {entry.task_id}, stream {entry.env_idx}: field {field.name}"
         if len(array) != rows:
-            raise OptionError(f"{where} has {len(array)} rows, expected {rows}")
+            raise OptionError(f"{where}: expected {rows} rows, found {len(array)}")
         stored = np.ascontiguousarray(array, element.base)
         if not np.array_equal(stored, array):
-            raise OptionError(f"{where} has values that {element.base} cannot hold")
+            raise OptionError(f"{where} has values that {element.base} cannot represent")
         length = min(field.chunk, rows)
         parts += [
             (field, start, stored[start : start + length], length, element.itemsize) for start in range(0, rows, length)

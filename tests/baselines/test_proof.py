@@ -13,7 +13,7 @@ from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_refer
 from icrl4aht_data.format.schema import HISTORIES
 from icrl4aht_data.utils.files import file_hash
 from icrl4aht_data.writing import proof
-from icrl4aht_data.writing.card import facts, render_card
+from icrl4aht_data.writing.card import card_facts, render_card
 from icrl4aht_data.writing.proof import proof_table, read_proof
 from tests.helpers.random_releases import random_release
 
@@ -68,10 +68,10 @@ def test_a_card_shows_the_proof_of_its_own_release(release, tmp_path, monkeypatc
     monkeypatch.setattr(proof, "card_file", lambda name: stored)
     stored.write_text(json.dumps(content))
     assert read_proof(release) == content
-    assert "## What it teaches" in render_card(facts(release))
+    assert "## What it teaches" in render_card(card_facts(release))
     stored.write_text(json.dumps(content | {"histories_sha256": "0"}))
     assert read_proof(release) is None
-    assert "## What it teaches" not in render_card(facts(release))
+    assert "## What it teaches" not in render_card(card_facts(release))
 
 
 @pytest.mark.slow

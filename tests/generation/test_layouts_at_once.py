@@ -114,7 +114,7 @@ class TestTables:
         odd = Layout("mine", "mine_too", ("W5W2W", "0A AW", "WWXWW"), recipes=((0, 2, 5),))
         with pytest.raises(OptionError, match=r"layouts \['mine'\] have ingredients without a canonical channel"):
             stack_tables([odd, *GROUP])
-        with pytest.raises(OptionError, match="take its own channels"):
+        with pytest.raises(OptionError, match="has no canonical channel"):
             observe_both(odd, np.zeros((1, 8 + len(odd.counters)), np.uint8), canonical=True)
 
 

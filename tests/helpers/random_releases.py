@@ -20,7 +20,7 @@ from icrl4aht_data.format.provenance import ExpertLabels, Provenance, TeammateSw
 from icrl4aht_data.format.schema import LAYOUTS_FILE, Entry, Kind
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import step
-from icrl4aht_data.overcooked.state import start
+from icrl4aht_data.overcooked.state import start_record
 from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 
 SHARD = "data/teammate/coord_simple/train-00000-of-00001.h5"
@@ -34,7 +34,7 @@ def random_history(layout: Layout, episodes: int, length: int, rng: np.random.Ge
     clash = positions[:, 0] == positions[:, 1]
     positions[clash] = rooms[0][0], rooms[1][-1]
     facings = rng.integers(0, 4, (episodes, 2)).astype(np.uint8)
-    state = start(layout, positions, facings, rng.choice(layout.recipe_items, episodes))
+    state = start_record(layout, positions, facings, rng.choice(layout.recipe_items, episodes))
     actions = np.where(rng.random((length, episodes, 2)) < 0.4, 5, rng.integers(0, 6, (length, episodes, 2)))
     states, rewards = [], []
     for row in actions:

@@ -34,7 +34,7 @@ from icrl4aht_data.benchmark.facts import (
     SAME_BEHAVIOUR,
     TRACKS,
 )
-from icrl4aht_data.benchmark.reference_returns import HEURISTICS, alike_tasks, has_headroom, read_headroom
+from icrl4aht_data.benchmark.reference_returns import HEURISTICS, has_headroom, read_headroom, same_behaviour_tasks
 from icrl4aht_data.benchmark.tasks import Task, manifest_path, read_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
@@ -112,7 +112,7 @@ def behaviours_of_tests() -> tuple[int, ...]:
     """Return the behaviours and tasks of all cells, then the behaviours of the cells that the protocol names."""
     by_id = {task.task_id: task for task in tasks("test")}
     counts = Counter((task.layout.name, task.teammate_family) for task in by_id.values())
-    for first, *others in alike_tasks():
+    for first, *others in same_behaviour_tasks():
         counts[by_id[first].layout.name, by_id[first].teammate_family] -= len(others)
     total = sum(counts.values())
     assert {counts.pop(cell) for cell in list(counts) if cell[1] == "H4"} == {1}

@@ -80,7 +80,7 @@ verify none | none: no such folder; give the folder or the address of a release 
 list htps://x | not an address that fsspec opens: Protocol not known: htps; expected hf://datasets/
 convert {MINI} --out file/x --to lite | file: File exists; a file is where a folder is needed
 convert {MINI} --out none/index --to parquet | none/index: No such file or directory; check the path;
-combine --out out {MINI} --data-version banana | data version 'banana': expected one such as 1.0.0
+combine --out out {MINI} --data-version banana | data version 'banana': expected a SemVer version such as 1.0.0
 research diversity --suite empty | empty: no layout has all its populations finished; `icrl4aht-data
 train ad --layout asymm_right | no history has split='train', layout=['asymm_right']. This release
 train ad --layout demo_wide --mirror --channels own | expected state records and canonical channels
@@ -157,4 +157,4 @@ def test_invalid_data_version_in_a_profile(tmp_path: Path, say):
     smoke = (ROOT / "generation" / "icrl4aht_generation" / "profiles" / "smoke.toml").read_text(encoding="utf-8")
     profile.write_text(smoke.replace('data_version = "0.0.1"', 'data_version = "new"'), encoding="utf-8")
     code, said = say("plan", "--profile", str(profile))
-    assert (code, "mine.toml: data version 'new': expected one such as 1.0.0" in said) == (1, True)
+    assert (code, "mine.toml: data version 'new': expected a SemVer version such as 1.0.0" in said) == (1, True)

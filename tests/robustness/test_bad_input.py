@@ -77,9 +77,9 @@ def drop(name):
         (put(colour="red"), "unknown field `colour`"),
         (put(T="many"), r"Expected `int`, got `str` - at `\$\.T`"),
         (put(T=-5), r"Expected `int` >= 1 - at `\$\.T`"),
-        (put(history_id=0), "history_id 0: ids count up from 0, expected 2"),
+        (put(history_id=0), "expected history_id 2, since ids count up from 0, found 0"),
         (put(layout="cave"), "unknown layout of the train split of track teammate 'cave'"),
-        (put(obs_shape=[5, 5, 41]), r"obs_shape \[5, 5, 41\], expected \[5, 5, 40\]"),
+        (put(obs_shape=[5, 5, 41]), r"expected obs_shape \[5, 5, 40\] for .*, found \[5, 5, 41\]"),
         (put(shard="../../etc/passwd"), "expected data/teammate/coord_simple/train-NNNNN"),
     ],
 )

@@ -25,7 +25,7 @@ from icrl4aht_data.dataset import Dataset
 from icrl4aht_data.errors import CacheError, Icrl4ahtError, IndexFormatError, OptionError
 from icrl4aht_data.fetch import fetch_planned, plan_download
 from icrl4aht_data.format.manifest import parse_manifest, write_manifest
-from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, held_fields
+from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, TASKS, memory_fields
 from icrl4aht_data.reading.sources import CacheMode
 from icrl4aht_data.utils.files import atomic_write
 from tests.helpers.damages import contents
@@ -87,7 +87,7 @@ class DamagedCopy:
     def read(self, root: Path, cache: CacheMode = "ram") -> tuple[bytes, str]:
         """Return a hash of all arrays and of batches, and the metadata as text."""
         dataset = load_icrl4aht(root, obs="uint8", cache=cache, threads=1)
-        names = {h: [one.name for one in held_fields(dataset.info.kind) if h.entry.has(one)] for h in dataset}
+        names = {h: [one.name for one in memory_fields(dataset.info.kind) if h.entry.has(one)] for h in dataset}
         arrays = digest(itertools.chain.from_iterable([h.obs[:], *map(h.read, names[h])] for h in names))
         histories = [(repr(h.entry), dataset.recover_teammate(h.entry.history_id)) for h in dataset]
         return arrays + hash_batches(dataset), f"{histories} {dataset.info}"
@@ -290,7 +290,7 @@ def test_episodes_one_step_shorter_by_a_flipped_bit(small, tmp_path):
 
 def test_a_manifest_without_its_last_byte_is_cut_off(small):
     text = (small.root / "MANIFEST.sha256").read_text()
-    with pytest.raises(IndexFormatError, match=r"MANIFEST: cut off: its last line has no end"):
+    with pytest.raises(IndexFormatError, match=r"MANIFEST is cut off: the last line does not end"):
         parse_manifest(text[:-1], "MANIFEST")
 
 

@@ -395,7 +395,7 @@ def _agent_task(
         for stream in range(config.histories):
             of_history = {name: array[stream] for name, array in arrays.items()}
             of_history["dones"] = episode_ends(rewards.shape[1], KEPT_STEPS)
-            if made.wants_oracle(curve_ends(returns)[1].mean()):
+            if made.is_oracle_useful(curve_ends(returns)[1].mean()):
                 of_history["oracle_actions"] = oracle_labels(task.layout, of_history["state"], of_history["actions"])
             yield NewHistory(stream, of_history)
 
@@ -415,6 +415,6 @@ def _agent_task(
         swaps=swaps,
     )
     files: dict[str, Path] = {}
-    for one in made.played(task):
+    for one in made.played_tasks(task):
         files |= checkpoint_files(teammates.suite, one)
     return NewTask(task, made, config.histories, load, files)

@@ -43,7 +43,7 @@ from icrl4aht_baselines.report.statistics import (
 from icrl4aht_baselines.training.seen import overlap_marks
 from icrl4aht_data.benchmark.best_responses import best_responses, read_best_responses
 from icrl4aht_data.benchmark.facts import KEPT_STEPS, LEAST_HEADROOM, TRACKS
-from icrl4aht_data.benchmark.reference_returns import alike_tasks, has_headroom, read_headroom, stay_returns
+from icrl4aht_data.benchmark.reference_returns import has_headroom, read_headroom, same_behaviour_tasks, stay_returns
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.utils.text import counted_noun
 
@@ -105,7 +105,7 @@ def behaviour_names() -> dict[str, str]:
 
     Known are the package's test tasks and those with best responses.
     """
-    groups = [*alike_tasks(), *(best.tasks for best in best_responses().values())]
+    groups = [*same_behaviour_tasks(), *(best.tasks for best in best_responses().values())]
     return {task_label(task): group[0] for group in groups for task in group}
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from icrl4aht_data.overcooked.actions import EGO, STAY, TEAMMATE
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.rules import DELIVERY_REWARD
-from icrl4aht_data.overcooked.state import swapped
+from icrl4aht_data.overcooked.state import swap_agents
 from icrl4aht_data.overcooked.tables import Tables, stack_tables
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE, oracle_params
@@ -80,7 +80,7 @@ def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) 
 
     def act(agent: int) -> Callable[..., Any]:
         def act_if_playing(params: Any, memory: Any, view: Situation, key: Any) -> Any:
-            record = view.record if agent == EGO else swapped(view.record)
+            record = view.record if agent == EGO else swap_agents(view.record)
             action, memory = SITUATION_ORACLE.act(params, memory, view._replace(record=record), key)
             return jnp.where(playing[agent], action, STAY), memory
 

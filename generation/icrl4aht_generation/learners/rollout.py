@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
-from icrl4aht_data.overcooked.state import swapped
+from icrl4aht_data.overcooked.state import swap_agents
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.learners.encoder import CompactView
 from icrl4aht_generation.learners.network import ActorCritic
@@ -252,4 +252,4 @@ def slot_records(record: UInt8[Array, "*B N S"], agent_slots: np.ndarray) -> UIn
     if not agent.any():  # the ego's slots in order need no gather
         return record if np.array_equal(env, np.arange(n)) else record[..., env, :]
     own = record[..., env, :]
-    return jnp.where((agent == 1)[:, None], swapped(own), own)
+    return jnp.where((agent == 1)[:, None], swap_agents(own), own)

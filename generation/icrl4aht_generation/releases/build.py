@@ -16,8 +16,7 @@ from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.plotting import check_can_draw
 from icrl4aht_data.utils.files import check_own_folder, process_lock
 from icrl4aht_data.utils.progress import counted, progress_bars
-from icrl4aht_data.writing.card import facts as release_facts
-from icrl4aht_data.writing.card import print_learning, teammate_name
+from icrl4aht_data.writing.card import card_facts, print_learning, teammate_name
 from icrl4aht_generation.collection.job import CollectionJob
 from icrl4aht_generation.jobs.job import FAILED, FailedJobsError
 from icrl4aht_generation.jobs.options import QueueOptions
@@ -90,7 +89,7 @@ def build_releases(
                 steps = (counted(show, f"{step} {kind}", len(tasks)) for step in ("choosing labellers for", "packing"))
                 package_release(artefacts, release, units, profile, suite, kind, facts, left_out, *steps)
         for release in releases:
-            print_learning(release_facts(release), console)
+            print_learning(card_facts(release), console)
     return releases
 
 
@@ -115,7 +114,7 @@ def train_teammates(
     units, left_out = [], []
     for work in profile.units(learned):
         earned = of_teammate.get(work.task.teammate_key)
-        if earned is None or earned.matters:
+        if earned is None or earned.has_headroom:
             units.append(work)
         elif work.learner == 0:
             reason = f"the ego does not matter: {earned.describe()}"

@@ -108,7 +108,7 @@ class TeammateFacts(NamedTuple):
     @property
     def matters(self) -> bool:
         """Whether an ego can raise the return with this teammate."""
-        return self.references.matters
+        return self.references.has_headroom
 
 
 def teammate_facts(

@@ -260,7 +260,7 @@ def _new_task(
         **own,
     )
     # The oracle's actions are stored where they are worth learning, or are the labels anyway.
-    with_oracle = profile.oracle_actions and made.wants_oracle(float(curve_ends(found.kept)[1].mean()))
+    with_oracle = profile.oracle_actions and made.is_oracle_useful(float(curve_ends(found.kept)[1].mean()))
 
     def load() -> Iterator[NewHistory]:
         label = _labels(found, labeller)

@@ -45,7 +45,7 @@ from icrl4aht_data.dataset import load_icrl4aht
 from icrl4aht_data.errors import EmptySelectionError, OptionError
 from icrl4aht_data.overcooked.actions import STAY
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.overcooked.state import start
+from icrl4aht_data.overcooked.state import start_record
 from tests.helpers.commands import run_cli
 
 LAYOUT = get_layout("cramped_up")
@@ -254,7 +254,7 @@ class TestGroups:
 def played_actions(mates: list[Policy]) -> list[np.ndarray]:
     """Return 40 actions of each teammate in the state at the start of an episode."""
     cells, facings = np.array(LAYOUT.agent_cells, np.uint8), np.zeros(2, np.uint8)
-    record = jnp.asarray(start(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
+    record = jnp.asarray(start_record(LAYOUT, cells, facings, LAYOUT.recipe_items[0]))
     act = jax.jit(mates[0].act)
     found = []
     for mate in mates:

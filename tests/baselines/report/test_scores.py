@@ -109,10 +109,10 @@ def test_damaged_best_responses(tmp_path):
     assert card.version == "7" and isinstance(card.behaviours[0], BestResponse)
     text = (tmp_path / "b.json").read_text()
     (tmp_path / "twice.json").write_text(text.replace('"behaviours": [', f'"behaviours": [{text.splitlines()[5]}', 1))
-    with pytest.raises(OptionError, match=r"twice\.json: two best responses to task teammate_test_grounded_coord_simp"):
+    with pytest.raises(OptionError, match=r"twice\.json: expected one best response to task teammate_test_grounded_"):
         read_best_responses(tmp_path / "twice.json")
     (tmp_path / "bad.json").write_text(text.replace('"best":', '"beast":'))
-    with pytest.raises(OptionError, match=r"bad\.json: not a file of best responses: .*restore it"):
+    with pytest.raises(OptionError, match=r"bad\.json: invalid file of best responses: .*restore it"):
         read_best_responses(tmp_path / "bad.json")
 
 

@@ -72,7 +72,7 @@ def test_the_unspoiled_release_is_valid(learned):
         ),
         (HISTORIES, lambda c: c[-1].update(source="human"), "source: expected 'human' as in the index, found 'ppo'"),
         (HISTORIES, lambda c: [line.update(teammate_kind="territory") for line in c], "'territory' is of another fam"),
-        (INFO, lambda c: c.update(data_version="../.."), "data version '../..': expected one such as 1.0.0"),
+        (INFO, lambda c: c.update(data_version="../.."), "data version '../..': expected a SemVer version"),
         (INFO, lambda c: first(c["statistics"]).update(disk_bytes=1), "statistics: expected"),
     ],
 )

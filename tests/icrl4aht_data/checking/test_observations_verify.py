@@ -65,6 +65,6 @@ def test_convert_lists_missing_options(published_folder, tmp_path):
     run_cli("convert", out, "--out", tmp_path / "part", "--to", "observations", "--layout", "demo_wide")
     run_cli("convert", out, "--out", tmp_path / "files", "--to", "published")
     assert verify_release(tmp_path / "part").ok
-    with pytest.raises(Icrl4ahtError, match="is made of state records"):
+    with pytest.raises(Icrl4ahtError, match="needs state records"):
         run_cli("convert", out, "--out", tmp_path / "full", "--to", "full")
     assert "give the form to convert to" in run_cli("convert", out, "--out", tmp_path / "x", code=2)

@@ -90,7 +90,7 @@ def test_a_cache_folder_that_is_a_file(tmp_path, monkeypatch, below):
     path = tmp_path / "plain"
     path.touch()
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(path / "below" if below else path))
-    assert module.cache_room() == 0
+    assert module.cacheable_bytes() == 0
     with pytest.raises(CacheError, match=r'plain.*: the cache folder (is a file|cannot).*ICRL4AHT_CACHE_DIR.*"stream"'):
         cached_arrays(KEY, SIZE, build)
     assert path.read_bytes() == b""
@@ -103,7 +103,7 @@ def test_a_cache_folder_that_can_only_be_read(folder):
     try:
         with permissions_count():
             check(cached_arrays(KEY, SIZE, build))  # existing arrays can still be read
-            assert module.cache_room() == 0
+            assert module.cacheable_bytes() == 0
             with pytest.raises(CacheError, match=r"cannot be used: Permission denied \(.*check its permissions"):
                 cached_arrays(f"histories-{1:032x}", SIZE, build)
     finally:

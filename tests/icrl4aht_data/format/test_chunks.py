@@ -20,7 +20,7 @@ from tests.helpers.random_releases import SHARD
 def test_bytes_behind_the_deflate_stream_are_refused(tail):
     data = encode_chunk(np.arange(12, dtype=np.uint8).reshape(4, 3), 4, 3)
     assert decode_chunk(data, 12, 3) == bytes(range(12))
-    with pytest.raises(ValueError, match=f"{len(tail)} bytes after the end of the deflate stream"):
+    with pytest.raises(ValueError, match=f"expected no bytes after the deflate stream, found {len(tail)}"):
         decode_chunk(data + tail, 12, 3)
 
 

@@ -107,7 +107,7 @@ def test_queries_find_what_a_scan_finds(long):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"episodes": 99999}, "99999 episodes in"),
+        ({"episodes": 99999}, "found 99999 in"),
         ({"has_teammate_actions": False}, "has_teammate_actions true"),
         ({"seed": 2**63}, r"Expected `int` <= 9223372036854775807 - at `\$\.seed`"),
         ({"history_id": 5000}, "ids count up"),

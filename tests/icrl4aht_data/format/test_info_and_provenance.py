@@ -29,9 +29,9 @@ def test_unknown_fields_of_a_provenance_are_kept():
 
 
 def test_headroom_with_a_learned_teammate_uses_its_partners_return():
-    assert not ReferenceEgos(2.0, 4.75, 6.0, 20).matters
+    assert not ReferenceEgos(2.0, 4.75, 6.0, 20).has_headroom
     learned = ReferenceEgos(2.0, 4.75, 6.0, 20, self_play=10.0)
-    assert learned.matters
+    assert learned.has_headroom
     assert learned.describe() == "stay 2.0, random 4.8, oracle 6.0, self-play 10.0"
     for references in (learned, ReferenceEgos(2.0, 4.75, 6.0, 20)):
         made = Provenance(references=references)
@@ -59,14 +59,12 @@ def test_expert_fields_are_kept():
         ({"streams_recorded": -1}, "Expected `int` >= 0"),
         ({"expert": {"policy_sha256": "0" * 64, "action": "", "return_greedy": 1e300}}, "Expected `float` <"),
         ({"filter": {"before": {}, "after": {}}}, "missing required field `streams`"),
-        ([], "an object of objects"),
+        ([], "expected a JSON object"),
     ],
 )
 def test_a_malformed_provenance_is_named(tmp_path, note, message):
     (tmp_path / "provenance.json").write_text(json.dumps({"task": note}))
-    with pytest.raises(
-        IndexFormatError, match=rf"provenance\.json: not as `generation` writes it: 'task': .*{message}"
-    ):
+    with pytest.raises(IndexFormatError, match=rf"provenance\.json: malformed provenance of task 'task': .*{message}"):
         read_provenance(tmp_path / "provenance.json")
 
 
@@ -76,8 +74,8 @@ def test_a_malformed_provenance_is_named(tmp_path, note, message):
         ({"kind": "heavy"}, "Invalid enum value 'heavy'"),
         ({"environment": {"max_steps": 400, "kept_steps": 0}}, "Expected `int` >= 1"),
         ({"environment": {"max_steps": 400, "kept_steps": 100, "speed": 2}}, "unknown field `speed`"),
-        ({"data_version": "1.0.0-.."}, r"data version '1\.0\.0-\.\.': expected one such as 1.0.0"),
-        ({"data_version": "\x1b[2J"}, r"data version '\\x1b\[2J': expected one such as 1.0.0"),
+        ({"data_version": "1.0.0-.."}, r"data version '1\.0\.0-\.\.': expected a SemVer version such as 1.0.0"),
+        ({"data_version": "\x1b[2J"}, r"data version '\\x1b\[2J': expected a SemVer version such as 1.0.0"),
     ],
 )
 def test_a_malformed_info_says_what_is_wrong(change, message):

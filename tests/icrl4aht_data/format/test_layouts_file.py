@@ -36,7 +36,7 @@ MINE = Layout("mine-3-5", "mine-3-5", ROWS, ((0, 0, 1), (0, 1, 1)))
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
     """Each test begins like a process that has not opened a release with layouts."""
-    monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+    monkeypatch.setattr(known_layouts, "_RELEASE_LAYOUTS", {})
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def root(tmp_path, fresh, monkeypatch) -> Path:
     """Return a release with histories on a layout of its own and on a published one, unknown to this process."""
     add_layouts([MINE])
     random_release(tmp_path / "release", layouts=("coord_simple", "mine-3-5"), teammates=1, streams=2)
-    monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+    monkeypatch.setattr(known_layouts, "_RELEASE_LAYOUTS", {})
     with pytest.raises(UnknownNameError):
         get_layout("mine-3-5")
     return tmp_path / "release"
@@ -116,7 +116,7 @@ class TestRelease:
 
     def test_a_dataset_brings_them_to_another_process(self, root, monkeypatch):
         sent = pickle.dumps(load_icrl4aht(root))
-        monkeypatch.setattr(known_layouts, "_OF_RELEASES", {})
+        monkeypatch.setattr(known_layouts, "_RELEASE_LAYOUTS", {})
         ds = pickle.loads(sent)
         assert ds[-1].obs.shape == (120, 5, 5, 35) and get_layout("mine-3-5").rows == ROWS
 
@@ -131,10 +131,10 @@ class TestRelease:
             (lambda lines: lines * 2, "line 2: layout 'mine-3-5' is listed twice"),
             (
                 lambda lines: [lines[0] | {"name": "coord_simple"} | OTHER],
-                "layout 'coord_simple': differs from the layout",
+                "layout 'coord_simple': differs from the known layout",
             ),
             (lambda lines: [lines[0] | {"map": ["WPWWW", *ROWS[1:3], "WBWWW"]}], "no agent can face a goal"),
-            (lambda lines: [lines[0] | {"map": ["WP2W3", *ROWS[1:]]}], "20 cells and 4 piled ingredient types"),
+            (lambda lines: [lines[0] | {"map": ["WP2W3", *ROWS[1:]]}], "20 cells and piles of 4 ingredient types"),
             (lambda lines: [lines[0] | {"recipes": [[0, 0, 2]]}], r"recipes use ingredients \[2\]"),
             (lambda lines: [lines[0] | {"name": "mine\x1b[31m"}], "name"),
             (
@@ -165,7 +165,7 @@ class TestRelease:
     def test_one_name_for_two_maps(self, root, tmp_path):
         load_icrl4aht(root)
         other = [stored(root)[0] | {"map": ["WWPWW", *ROWS[1:]]}]
-        with pytest.raises(IndexFormatError, match="give it another name"):
+        with pytest.raises(IndexFormatError, match="give the new layout another name"):
             load_icrl4aht(rewritten(root, other))
 
 
@@ -182,8 +182,8 @@ class TestRecipesOfATask:
     @pytest.mark.parametrize(
         ("recipes", "message"),
         [
-            ([], "expected different recipes, at least one"),
-            ([[0, 0, 1], [0, 1, 0]], "expected different recipes"),
+            ([], "expected at least one recipe"),
+            ([[0, 0, 1], [0, 1, 0]], "expected at least one recipe, and no recipe twice"),
             ([[0, 0, 9]], r"recipes use ingredients \[9\] that have no pile"),
             ("000", "recipes"),
         ],
@@ -218,5 +218,5 @@ class TestRecipesOfATask:
 def test_a_release_cannot_change_a_layout_of_the_packages_own_tasks():
     known = get_layout("rooms-0-46")
     assert add_layouts([known]) == [known]
-    with pytest.raises(OptionError, match="layout 'rooms-0-46': differs from the layout that this name stands for"):
+    with pytest.raises(OptionError, match="layout 'rooms-0-46': differs from the known layout of this name"):
         add_layouts([dataclasses.replace(known, rows=tuple(row.replace("P", "W", 1) for row in known.rows))])

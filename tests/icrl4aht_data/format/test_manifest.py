@@ -34,7 +34,7 @@ def test_a_damaged_file_is_an_error_that_names_it(damaged, name, damage):
     path = damaged / name
     right = path.read_bytes()
     DAMAGES[damage](path)
-    expected = rf": expected sha256 \w{{64}} as {MANIFEST} says, found \w{{64}}" if damage == UNNOTICED else ""
+    expected = rf": expected sha256 \w{{64}} from {MANIFEST}, found \w{{64}}" if damage == UNNOTICED else ""
     with pytest.raises(ReleaseError, match=f"{path}{expected}"):
         load_icrl4aht(damaged)[0].read("actions")
     restore(path, right)
@@ -43,7 +43,7 @@ def test_a_damaged_file_is_an_error_that_names_it(damaged, name, damage):
 
 def test_an_empty_manifest_is_refused(damaged):
     (damaged / MANIFEST).write_text("")
-    with pytest.raises(IndexFormatError, match=rf"{MANIFEST}: empty: expected a line for each file"):
+    with pytest.raises(IndexFormatError, match=rf"{MANIFEST} is empty: expected a line for each file"):
         load_icrl4aht(damaged)
     for level in ("quick", "full"):
         report = verify_release(damaged, level=level)

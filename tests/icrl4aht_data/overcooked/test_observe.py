@@ -21,7 +21,7 @@ from icrl4aht_data.overcooked import rules
 from icrl4aht_data.overcooked.actions import INTERACT, STAY
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, get_layout
 from icrl4aht_data.overcooked.observe import observe, observe_both
-from icrl4aht_data.overcooked.state import columns, faults, pack, record_size, start, unpack
+from icrl4aht_data.overcooked.state import columns, faults, pack, record_size, start_record, unpack
 from tests.helpers.states import random_records, state_record
 
 CRAMPED, RING, SIMPLE, WIDE = (LAYOUTS[name] for name in ("cramped_up", "coord_ring", "test_simple", "test_wide"))
@@ -117,7 +117,7 @@ def test_an_unknown_layout_lists_the_names_and_the_nearest(wrong, nearest):
         (("WWWWW", "0AA1", "WWWWW"), {}, "widths \\[5, 4, 5\\]"),
         (("WWZWW", "0AAz1", "WWWWW"), {}, "letters \\['Z', 'z'\\]"),
         (("WWWWW", "0A  1", "WWWWW"), {}, "1 agents"),
-        (("W2W3W", "0A A1", "WWWWW"), {}, "4 piled ingredient types"),
+        (("W2W3W", "0A A1", "WWWWW"), {}, "piles of 4 ingredient types"),
         (("W" * 32, "0A A1" + "W" * 27, *["W" * 32] * 6), {}, "256 cells"),
         (("WWWWW", "0A A0", "WWWWW"), {}, "ingredients \\[1\\] that have no pile"),
         (("WWWWW", "0A A1", "WWWWW"), {"recipes": ((0, 1, 2), (0, 3, 1))}, "ingredients \\[2, 3\\]"),
@@ -125,7 +125,7 @@ def test_an_unknown_layout_lists_the_names_and_the_nearest(wrong, nearest):
         ((), {}, "widths \\[\\]"),
         ("WWWWW", {}, "rows = "),
         (("WWWWW", "WA AW", "WWWWW"), {"recipes": ()}, "at least one"),
-        (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 0, 1), (0, 1, 0))}, "different recipes"),
+        (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 0, 1), (0, 1, 0))}, "no recipe twice"),
         (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 1),)}, "recipes = "),
         (("W0W1W", "WA AW", "WWWWW"), {"recipes": ((0, 0, True),)}, "recipes = "),
         (("W0W1W", "WA AW", "WWWWW"), {"indicates_delivery": 1}, "indicates_delivery = "),
@@ -214,7 +214,7 @@ def test_unpacking_and_packing_round_trips(layout):
 
 def test_a_start_has_empty_hands_pots_and_counters():
     positions, facings = np.array([[10, 13]], np.uint8), np.array([[3, 2]], np.uint8)
-    record = start(RING, positions, facings, np.array([RECIPE_111], np.uint8))
+    record = start_record(RING, positions, facings, np.array([RECIPE_111], np.uint8))
     np.testing.assert_array_equal(record[0, :7], [10, 13, 3, 2, 0, 0, RECIPE_111])
     assert record.shape == (1, record_size(RING))
     assert not record[:, 7:].any()

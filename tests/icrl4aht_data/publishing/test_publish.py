@@ -109,7 +109,7 @@ def test_an_invalid_source_is_refused(damaged, tmp_path):
     with pytest.raises(ReleaseError, match=r"release: not valid: .*\.h5: sha256: expected .*; see `icrl4aht"):
         build_release(damaged, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    with pytest.raises(OptionError, match="release: is also read"):
+    with pytest.raises(OptionError, match="release is also read"):
         build_release(damaged, damaged)
 
 

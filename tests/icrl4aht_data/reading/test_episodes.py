@@ -127,7 +127,7 @@ class TestSplit:
 
     def test_invalid_splits(self, two_sourced):
         one = two_sourced.filter(task_id=str(two_sourced.column("task_id")[0]))
-        with pytest.raises(OptionError, match=r'has one teammate, so none can be held out; take by="history"'):
+        with pytest.raises(OptionError, match=r'has one teammate, so none can be held out; use by="history"'):
             one.split()
         with pytest.raises(OptionError, match=r"every task of .* has one history"):
             one[:1].split(by="history")

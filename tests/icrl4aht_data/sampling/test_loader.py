@@ -59,7 +59,7 @@ class TestCaches:
         assert dataset.cache.cache == "ram"
         assert "GB decoded" in dataset.cache.reason
         monkeypatch.setattr("icrl4aht_data.reading.sources.free_memory", lambda: 10**9)
-        monkeypatch.setattr("icrl4aht_data.reading.sources.cache_room", lambda: 10**10)
+        monkeypatch.setattr("icrl4aht_data.reading.sources.cacheable_bytes", lambda: 10**10)
         assert [choose_cache("auto", size).cache for size in (10**8, 10**9, 10**11)] == ["ram", "mmap", "stream"]
         assert choose_cache("stream", 1).cache == "stream"
         with pytest.raises(UnknownNameError, match="unknown cache 'disk'; valid: auto, ram, mmap, stream"):

@@ -14,7 +14,7 @@ from icrl4aht_data.benchmark.facts import HEURISTIC_KINDS
 from icrl4aht_data.benchmark.tasks import Task, make_task, write_tasks
 from icrl4aht_data.dataset import MINI
 from icrl4aht_data.format.index import read_index
-from icrl4aht_data.format.info import LeftOutTask, describe
+from icrl4aht_data.format.info import LeftOutTask, make_info
 from icrl4aht_data.format.provenance import (
     ExpertLabels,
     NearestTest,
@@ -25,9 +25,9 @@ from icrl4aht_data.format.schema import ENTRY_HINTS, FIELDS, HISTORIES, INFO, PR
 from icrl4aht_data.reading.arrow_tables import EPISODE_COLUMNS
 from icrl4aht_data.utils.files import write_json
 from icrl4aht_data.writing.card import (
+    card_facts,
     card_texts,
     episode_texts,
-    facts,
     rai_texts,
     render_card,
     write_card,
@@ -85,12 +85,12 @@ def write(lite, tmp_path) -> Callable[..., dict[str, Any]]:
                 changes |= of_task.entry_fields(like.episodes) | fields
                 entries.append(msgspec.structs.replace(like, **changes))
         (tmp_path / "meta").mkdir(exist_ok=True)
-        info = replace(describe("lite", "1.0.0", 20, entries), left_out=[LEFT_OUT], shards={"data/x.h5": 1})
+        info = replace(make_info("lite", "1.0.0", 20, entries), left_out=[LEFT_OUT], shards={"data/x.h5": 1})
         write_json(tmp_path / INFO, info.to_json())
         (tmp_path / HISTORIES).write_text("".join(json.dumps(entry.to_json()) + "\n" for entry in entries))
         write_tasks(tmp_path / TASKS, [task for task, _, _ in tasks])
         write_json(tmp_path / PROVENANCE, {task.task_id: change(of_task).to_json() for task, of_task, _ in tasks})
-        return facts(tmp_path)
+        return card_facts(tmp_path)
 
     return write
 
@@ -137,7 +137,7 @@ def test_teammates_that_act_like_the_test_are_named(write):
 
 
 def test_the_bundled_card_is_short_and_current():
-    content = facts(MINI)
+    content = card_facts(MINI)
     assert (MINI / "README.md").read_text() == render_card(content)
     words = [word for word in (MINI / "README.md").read_text().split() if word.strip("|:-")]  # not lines of tables
     assert len(words) <= 2500
@@ -145,9 +145,9 @@ def test_the_bundled_card_is_short_and_current():
 
 def test_histories_of_people_change_the_datasheet():
     assert rai_texts({"noise"})["personal_sensitive_information"] == "None."
-    people = rai_texts({"noise", "human"})
-    assert "Pseudonyms" in people["personal_sensitive_information"] and people.keys() == rai_texts({"noise"}).keys()
-    assert f"* Personal data: {people['personal_sensitive_information']}" in render_card(facts(MINI) | {"rai": people})
+    rai = rai_texts({"noise", "human"})
+    assert "Pseudonyms" in rai["personal_sensitive_information"] and rai.keys() == rai_texts({"noise"}).keys()
+    assert f"* Personal data: {rai['personal_sensitive_information']}" in render_card(card_facts(MINI) | {"rai": rai})
 
 
 def test_every_field_is_described():

@@ -73,16 +73,16 @@ def test_other_kinds_lengths_versions_and_formats_are_refused(tmp_path):
         layout = "coord_simple" if name == "a" else "demo_wide"
         random_release(tmp_path / name, kind, (layout,), teammates=1, streams=1, length=length)
     a, b, c, d = (tmp_path / name for name in "abcd")
-    with pytest.raises(OptionError, match=r"b: kind 'full', but .*a has 'lite'; combine releases of one kind"):
+    with pytest.raises(OptionError, match=r"b has kind 'full', but .*a has 'lite'; combine only releases of one"):
         combine_releases(tmp_path / "out", [a, b])
-    with pytest.raises(OptionError, match=r"c: environment .*kept_steps=10.*a has .*kept_steps=20"):
+    with pytest.raises(OptionError, match=r"c has environment .*kept_steps=10.*a has .*kept_steps=20"):
         combine_releases(tmp_path / "out", [a, c])
-    with pytest.raises(OptionError, match="a: is also read; give another folder"):
+    with pytest.raises(OptionError, match="a is also read; give another folder"):
         combine_releases(a, [a, d])
     info = json.loads((d / INFO).read_text())
     (d / INFO).write_text(json.dumps(info | {"data_version": "0.0.2"}))
     write_manifest(d)
-    with pytest.raises(OptionError, match=r"data versions 0\.0\.1, 0\.0\.2: say which one"):
+    with pytest.raises(OptionError, match=r"data versions 0\.0\.1, 0\.0\.2 differ: give"):
         combine_releases(tmp_path / "out", [a, d])
     combine_releases(tmp_path / "out", [a, d], "0.1.0")
     assert json.loads((tmp_path / "out" / INFO).read_text())["data_version"] == "0.1.0"

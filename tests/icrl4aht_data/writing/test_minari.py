@@ -93,6 +93,6 @@ def test_the_command(lite, tmp_path):
 def test_wrong_selections_and_names_are_errors(lite, converted_release, tmp_path):
     with pytest.raises(NotStoredError, match="has observations only"):
         to_minari(load_icrl4aht(converted_release), tmp_path / "some-v0")
-    with pytest.raises(OptionError, match="expected a folder named as a Minari dataset, such as demo_wide-v0"):
+    with pytest.raises(OptionError, match="expected a folder with a Minari name, such as demo_wide-v0"):
         to_minari(load_icrl4aht(lite[0]), tmp_path / "some")
     assert not list(tmp_path.iterdir())

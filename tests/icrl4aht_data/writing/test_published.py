@@ -108,7 +108,7 @@ def test_short_views_with_states(short_views, tmp_path, kind):
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
         stored: Any = file["/1/obs"]
         stored[7] = stored[8]
-    with pytest.raises(PublishedFormatError, match="group /1: obs is not what state shows"):
+    with pytest.raises(PublishedFormatError, match="group /1: obs does not match the observations rendered from state"):
         from_published(tmp_path / "files", tmp_path / "again", kind, kept_steps=20)
 
 
@@ -117,19 +117,19 @@ def test_short_views_of_nothing_are_refused(short_views, tmp_path):
     with h5py.File(tmp_path / "files" / "histories.h5", "r+") as file:
         stored: Any = file["/1/obs"]
         stored[7] = 0
-    with pytest.raises(PublishedFormatError, match="group /1: obs: step 7 does not show cramped_up from any cell"):
+    with pytest.raises(PublishedFormatError, match="group /1: obs: step 7 does not show cramped_up from any reachable"):
         from_published(tmp_path / "files", tmp_path / "out", kept_steps=20)
 
 
 def test_duplicates_and_contradictions_are_refused(published_folder, tmp_path):
     cases = {
-        "line 2: group '0' is already that of line 1": {1: {"h5_group": "0"}},
-        "line 2: stream 10 of task 'task_a' is already that of line 1": {1: {"env_idx": 10}},
+        "line 2: group '0' is already used by line 1": {1: {"h5_group": "0"}},
+        "line 2: stream 10 of task 'task_a' is already used by line 1": {1: {"env_idx": 10}},
         r"line 2: Expected `int` >= 0 - at `\$\.env_idx`": {1: {"env_idx": -1}},
         "line 3: unknown teammate_family 'my_pbt'; valid: rl, H1, ": {
             2: {"teammate_family": "my_pbt", "teammate_kind": "rl"}
         },
-        "line 3: teammate_kind 'heuristic', but teammate_family 'ippo'": {
+        "line 3: teammate_family 'ippo' is rl, but teammate_kind is 'heuristic'": {
             2: {"teammate_family": "ippo", "teammate_kind": "heuristic"}
         },
     }

@@ -101,13 +101,13 @@ def fail() -> list[NewHistory]:
 @pytest.mark.parametrize(
     ("spoil", "streams", "message"),
     [
-        (lambda a: a | {"rewards": a["rewards"] + 0.5}, 2, "values that int8 cannot hold"),
-        (lambda a: a | {"actions": a["actions"][:-1], "state": a["state"][:-1]}, 2, "rows, expected"),
-        (lambda a: {name: a[name] for name in a if name != "episode_end_state"}, 2, "is missing the arrays"),
+        (lambda a: a | {"rewards": a["rewards"] + 0.5}, 2, "values that int8 cannot represent"),
+        (lambda a: a | {"actions": a["actions"][:-1], "state": a["state"][:-1]}, 2, "rows, found"),
+        (lambda a: {name: a[name] for name in a if name != "episode_end_state"}, 2, "a history lacks the arrays"),
         (lambda a: a | {"dones": np.roll(a["dones"], 1)}, 2, "10 steps"),
-        (lambda a: a, 1, "2 histories, but 1 were announced"),
-        (lambda a: a, 3, "2 histories, but 3 were announced"),
-        (lambda a: a, 0, "announced without histories"),
+        (lambda a: a, 1, "expected 1 histories, found 2"),
+        (lambda a: a, 3, "expected 3 histories, found 2"),
+        (lambda a: a, 0, "has no histories; add at least one"),
     ],
 )
 def test_invalid_histories_are_refused_without_leftovers(tmp_path, spoil, streams, message):
@@ -137,13 +137,13 @@ def test_no_task_and_a_task_twice_are_refused(tmp_path):
     (task,) = make_tasks(["cramped_up"])
     new = NewTask(task, Provenance(), 1, list)
     for tasks in ([], [new, new]):
-        with pytest.raises(OptionError, match="at least one task and none twice"):
+        with pytest.raises(OptionError, match="at least one task and no task twice"):
             write_release(tmp_path / "out", "lite", tasks, data_version="0.0.1", card="")
 
 
 def test_two_writers_of_one_release(tmp_path):
     def meanwhile() -> list[NewHistory]:
-        with pytest.raises(OptionError, match="another process is writing it"):
+        with pytest.raises(OptionError, match="another process is writing this folder"):
             random_release(tmp_path / "release")
         return [NewHistory(0, played())]
 
@@ -176,14 +176,14 @@ def list_note(root: Path) -> None:
     [
         (lambda root: root.write_text("mine"), "is not a folder"),
         (add_note, r"is not a release: it has no MANIFEST\.sha256; --overwrite replaces only"),
-        (list_note, "is not a release: .*'note.txt' is not a file that a release has"),
+        (list_note, "is not a release: .*'note.txt' is not a file that a release may contain"),
         (
             lambda root: (add_note(root), (root / "MANIFEST.sha256").touch()),
             "is not a release: .* empty: expected a line",
         ),
         (
             lambda root: (random_release(root), add_note(root)),
-            r"has note\.txt, which its MANIFEST\.sha256 does not list",
+            r"contains note\.txt, which MANIFEST\.sha256 does not list",
         ),
     ],
     ids=["file", "folder", "listed", "empty manifest", "release"],
@@ -206,7 +206,7 @@ def test_folders_created_during_writing_are_not_replaced(tmp_path):
         add_note(root)
         return [NewHistory(0, played())]
 
-    for overwrite, message in ((False, "exists"), (True, r"has note\.txt")):
+    for overwrite, message in ((False, "exists"), (True, r"contains note\.txt")):
         with pytest.raises(OptionError, match=message):
             write_cramped(root, meanwhile, overwrite=overwrite)
         assert (root / "note.txt").read_text() == "mine"

@@ -13,7 +13,7 @@ from icrl4aht_data.dataset import teammate_ids, teammate_names
 from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.format.provenance import ExpertLabels, Provenance, ReferenceEgos
 from icrl4aht_data.format.schema import HISTORIES
-from icrl4aht_data.writing.card import facts, render_card
+from icrl4aht_data.writing.card import card_facts, render_card
 from icrl4aht_data.writing.combine import combine_releases
 from icrl4aht_data.writing.convert import to_release
 from icrl4aht_data.writing.published import from_published, to_published
@@ -30,7 +30,7 @@ def swapped(tmp_path_factory) -> Path:
 
 
 def test_the_card_says_so(swapped):
-    content = facts(swapped)
+    content = card_facts(swapped)
     assert (content["views"], content["swapped"]) == ({"ego": {"ppo": 4}}, 4)
     card = render_card(content)
     assert "In 4 histories the teammate changes" in card and "(`ego`) in 4 histories of `ppo`" in card
@@ -103,6 +103,6 @@ def test_a_malformed_teammate_is_refused():
 
 def test_the_oracle_is_wanted_where_it_earns_what_the_end_earns():
     references = ReferenceEgos(stay=0.0, random=0.0, oracle=20.0, episodes=100)
-    assert Provenance(references=references).wants_oracle(20.0)
-    assert not Provenance(references=references).wants_oracle(20.5)
-    assert Provenance().wants_oracle(1000.0)
+    assert Provenance(references=references).is_oracle_useful(20.0)
+    assert not Provenance(references=references).is_oracle_useful(20.5)
+    assert Provenance().is_oracle_useful(1000.0)

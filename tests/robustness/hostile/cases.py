@@ -249,8 +249,8 @@ _NAMES = {
     "long": "x" * 300,
 }
 add("release", "leads out of the release", {f"manifest: {name}": listed(path) for name, path in _NAMES.items()})
-add("release", "are one file on some systems", {"manifest: upper case": listed(SHARD.replace("teammate", "TEAMMATE"))})
-add("release", "not a file that a release has", {"manifest: code": listed("sitecustomize.py")})
+add("release", "are the same file on some", {"manifest: upper case": listed(SHARD.replace("teammate", "TEAMMATE"))})
+add("release", "not a file that a release may contain", {"manifest: code": listed("sitecustomize.py")})
 _many = "".join(f"data/d/d/{number}.h5\n{number:064}  " for number in range(50_000)) + "data/d/d/last.h5"
 add("release", "listed in the manifest, but missing", {"manifest: many lines": listed(_many)})
 
@@ -422,7 +422,7 @@ _SHARED: dict[str, dict[str, ChangeFile]] = {
         "link to a file": link(lambda out: h5py.ExternalLink(str(out / "secret.h5"), "/secret")),
         "link to a pipe": link(lambda out: h5py.ExternalLink(str(out / "pipe"), "/secret")),
     },
-    "in other files|a local heap": {"external storage": actions(external), "virtual": actions(virtual)},
+    "in other files|local heap": {"external storage": actions(external), "virtual": actions(virtual)},
     r"filters \[32004\]|found \(\[32004\]": {"a plugin's filter": actions(filtered)},
     "expected numbers": {
         "texts": typed(h5py.string_dtype()),
@@ -475,8 +475,8 @@ for _message, _make in {"leads out": link_out, "neither a file": pipe, "at most|
     add("published", _message, {f"{_make.__name__}: {name}": replaced(name, _make) for name in _PUBLISHED})
 _endless = hdf5(dataset((2**39,), "i4", chunks=(4096,), compression="gzip"), _H5)
 add("published", "expected numbers of shape", {"endless rows": _endless})
-add("published", "cannot hold them|memory", {"endless history": endless_history})
-add("published", "not stored as|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published, _H5)})
+add("published", "cannot contain the declared|memory", {"endless history": endless_history})
+add("published", "contradicts the|inflate", {"chunk that inflates to a gigabyte": hdf5(inflating_published, _H5)})
 add("published", "Expected `int` >= 1", {"rows below zero": entry(_INDEX, T=-5)})
 add("published", "missing", {"group above": entry(_INDEX, h5_group="../0")})
 add("published", "lite", {"circle of groups": hdf5(lambda file, out: file["0"].__setitem__("a", file["0"]), _H5)})
