@@ -1,4 +1,4 @@
-"""Choice of teammates and histories to hold out of training, a function of names and a seed.
+"""Choice of teammates and histories to hold out of training, determined by names and a seed.
 
 Each name has a random rank, so the choice between two histories does not depend on the rest of the selection.
 """
@@ -31,7 +31,7 @@ def choose_teammates(teammates: np.ndarray, share: float, seed: int) -> np.ndarr
         bool (H,): True for the histories with a chosen teammate.
     """
     names = sorted(set(teammates.tolist()), key=lambda name: _rank(seed, name))
-    return np.isin(teammates, names[: _count(share, len(names)) if len(names) > 1 else 0])
+    return np.isin(teammates, names[: _held_out_count(share, len(names)) if len(names) > 1 else 0])
 
 
 def choose_histories(selection: Selection, share: float, seed: int) -> np.ndarray:
@@ -51,22 +51,22 @@ def choose_histories(selection: Selection, share: float, seed: int) -> np.ndarra
     names, of_task = selection.index.values("task_id"), defaultdict(list)
     columns = [selection.column_codes("task_id"), selection.column("env_idx"), selection.column("learner")]
     for row, (code, stream, learner) in enumerate(np.stack(columns, axis=1).tolist()):
-        # The rank depends on the learner only if it is not 0, as before releases had several.
+        # Names omit learner 0, so ranks remain as they were when releases had one learner per task.
         name = (names[code], stream, learner) if learner else (names[code], stream)
         of_task[code].append((_rank(seed, *name), row))
-    # One history per task stays in training.
+    # The history with the highest rank in each task always stays in training.
     candidates = sorted(one for ranked in of_task.values() for one in sorted(ranked)[:-1])
     if not candidates:
         raise OptionError(
-            f"every task of {selection!r} has one history: expected a task with two or more, one to train on and one "
-            f"to hold out"
+            f"every task of {selection!r} has one history: expected a task with two or more histories, one to train "
+            f"on and one to hold out"
         )
     chosen = np.zeros(len(selection), bool)
-    chosen[[row for _, row in candidates[: _count(share, len(selection))]]] = True
+    chosen[[row for _, row in candidates[: _held_out_count(share, len(selection))]]] = True
     return chosen
 
 
-def _count(share: float, total: int) -> int:
+def _held_out_count(share: float, total: int) -> int:
     return max(1, min(round(share * total), total - 1))
 
 
