@@ -71,7 +71,7 @@ class ReleaseLocation:
         return disk.resolve_inside(self.folder, name)
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Download missing files; does nothing here, since a local release has all of its files."""
+        """Download missing files; for a local release, nothing is downloaded, since all of its files are present."""
 
     def file(self, name: str) -> Path:
         """Return the path of a file, downloaded if necessary; local files in meta/ are checked against the manifest.

@@ -2,7 +2,7 @@
 
 A sampler is a sequence of batches, each a pure function of its number, so most loaders accept it directly:
 
-    plain loop     for batch in sampler.batches(): ...
+    Python loop    for batch in sampler.batches(): ...
     Grain          grain.MapDataset.source(sampler); no shuffling is needed, batches are random already
     PyTorch        torch_loader(sampler, workers=4); needs the extra `torch`
     Hugging Face   hf_index(dataset), hf_episodes(dataset), hf_windows(sampler); need the extra `hf`

@@ -84,7 +84,7 @@ def verify_release(
         _verify(origin, report, advance, wanted)
     except (Icrl4ahtError, OSError) as error:
         if isinstance(error, (EmptySelectionError, UnknownNameError)) and any(wanted.values()):
-            raise  # errors of the arguments are raised, since they are no problems of the release
+            raise  # wrong arguments are errors of the caller, not of the release
         report.add("meta", str(error))
     return report
 

@@ -63,7 +63,7 @@ class Folder(click.Path):
     """Click type of a folder, which need not exist; an empty text, as from an unset shell variable, is an error.
 
     Args:
-        made_by: the command that makes such folders; if given, the folder has to exist.
+        made_by: the command that makes such folders, for the message; if given, the folder must exist.
     """
 
     def __init__(self, made_by: str | None = None) -> None:
@@ -135,7 +135,7 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems 
 
 
 _FILTERS: dict[str, tuple[click.ParamType, str | None, str]] = {
-    "layout": (RELEASE_LAYOUT, None, "Only this layout; repeat it for more."),
+    "layout": (RELEASE_LAYOUT, None, "Only this layout; repeat the option for more."),
     "split": (SPLIT, None, "Only this split: train, validation, test or heldout."),
     "track": (TRACK, None, "Only this track: teammate or layout."),
     "teammate-family": (FAMILY, None, "Only this family: rl (learned), H1, H2, H3 or H4."),

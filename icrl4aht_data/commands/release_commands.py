@@ -159,7 +159,7 @@ def show(
     type=COUNT_OR_NONE,
     multiple=True,
     metavar="ID",
-    help="Only this history; repeat for more.",
+    help="Only this history; repeat the option for more.",
 )
 @click.option("--histories", type=COUNT, default=PAGE_HISTORIES, help="Maximum number of histories on the page.")
 @click.option("--megabytes", type=COUNT, default=PAGE_MEGABYTES, help="Maximum size of the page in MB.")

@@ -43,7 +43,7 @@ class History(FieldArrays):
         entry: the history's entry of the index.
         open_shard: function from a shard's name to the opened shard, called on first access of a field.
         obs: form of the observations in `History.obs`; see `OBS`.
-        channels: channels of `History.obs`, the layout's own or the canonical ones; see `channels.CHANNELS`.
+        channels: channels of `History.obs`, "own" (of the layout) or "canonical"; see `channels.CHANNELS`.
 
     Attributes:
         entry: the history's index entry, with ids, layout, teammate, T, returns and other fields.
@@ -86,7 +86,7 @@ class History(FieldArrays):
     def read(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Return rows start..stop of a field as stored; see `schema.FIELDS` for names, dtypes and shapes.
 
-        Observations that a lite release does not store are rendered, with the layout's own channels.
+        Observations that a lite release does not store are rendered, with channels="own".
 
         Args:
             name: the field.
@@ -95,7 +95,7 @@ class History(FieldArrays):
         Raises:
             UnknownNameError: for a name that is not a field.
             OptionError: if `start` or `stop` is not an integer.
-            LabelsMissingError: for expert, oracle or teammate actions of a history without them.
+            LabelsMissingError: if the history does not have the expert, oracle or teammate actions asked for.
             NotStoredError: for states of a release without state records.
             ShardCorruptError: if the checksum of a chunk is wrong; the message names the chunk.
         """
@@ -147,7 +147,7 @@ class History(FieldArrays):
         return field
 
     def returns(self) -> np.ndarray:
-        """Return the learning curve, float64 (E,): each episode's return over its kept steps."""
+        """Return the learning curve: the return of each episode over the kept steps, as float64 (E,)."""
         return episode_returns(self.read("rewards"), self.read("dones"))
 
     @property

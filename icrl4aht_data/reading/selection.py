@@ -97,7 +97,7 @@ class Selection:
         root: the release's folder on this machine; for a remote release the folder of downloaded files.
         options: form and channels of observations, cache mode, threads.
         obs: form of observations: "float32", "uint8" or "state"; see `history.OBS`.
-        channels: channels of observations: each layout's own, or the canonical ones; see `channels.CHANNELS`.
+        channels: channels of observations, "own" (of each layout) or "canonical"; see `channels.CHANNELS`.
         threads: number of threads that decode and render.
 
     Raises:
@@ -124,7 +124,7 @@ class Selection:
                 f'obs = "state": {location} has observations only, no state records; use float32 or uint8'
             )
 
-    # Workers of a data loader get a pickle without the decoded arrays, and open their own source.
+    # The pickle for workers of a data loader omits decoded arrays: each worker opens a new source.
     def __getstate__(self) -> tuple:
         return self.origin, self.index, self._shards, self.options, self.ids
 
@@ -217,7 +217,7 @@ class Selection:
         field = ALIASES.get(name, name)
         if ENTRY_HINTS.get(field) not in TEXTS:
             raise unknown("field of names", name, ("labels", *(one for one, of in ENTRY_HINTS.items() if of in TEXTS)))
-        # Codes are positions in the values of the whole release, so some of them may be absent from this selection.
+        # Codes are positions in the values of the release, so some values may be absent from this selection.
         numbers = np.bincount(self.column_codes(field), minlength=1).tolist()
         found = zip(self.index.values(field), numbers, strict=False)
         return {value: number for value, number in found if value and number}
@@ -225,8 +225,8 @@ class Selection:
     def has_labels(self, labels: Labels) -> np.ndarray:
         """Return bool (H,), True for histories with labels of a kind; see `history.LABELS`.
 
-        For noise histories the oracle labels are the expert actions, even if `has_oracle_actions` is False because they
-        are not stored twice; see `Entry.stored_field`.
+        In noise histories, oracle labels are equal to expert actions, and exist even if `has_oracle_actions` is False,
+        since equal actions need not be stored twice; see `Entry.stored_field`.
         """
         # In noise histories oracle and expert labels are equal, and stored once, as expert labels.
         has = self.column(f"has_{labels}_actions")
@@ -237,7 +237,7 @@ class Selection:
         return "\n".join([repr(self), *(f"{name}: {self.counts_text(name)}" for name in COUNTED)])
 
     def history(self, history_id: int) -> History:
-        """Return the history of the release with this id, even if it is not selected.
+        """Return the history of the release with the given id, even if this history is not selected.
 
         Raises:
             UnknownNameError: if the release has no history with that id.
@@ -253,7 +253,7 @@ class Selection:
 
         Returns:
             Array (H,) of strings, int64, float64 or bool, with "", -1 or NaN for None; (H, 3) for `obs_shape`, the
-            shape with the layout's own channels. `teammate_of_episode` is JSON text.
+            shape with channels="own". `teammate_of_episode` is JSON text.
 
         Raises:
             UnknownNameError: if there is no such field; suggests the nearest name.
@@ -420,10 +420,10 @@ class Selection:
         return self.select(kept)
 
     def select(self, ids: Sequence[int] | np.ndarray) -> Self:
-        """Return the histories of this selection with these ids, in this order.
+        """Return the histories of this selection with the given ids, in the given order.
 
         Args:
-            ids: history ids; or bool (H,), such as `ds.column("layout") == "demo_wide"`, True for those to keep.
+            ids: history ids; or bool (H,), such as `ds.column("layout") == "demo_wide"`, True for histories to keep.
 
         Raises:
             EmptySelectionError: if no id is given.

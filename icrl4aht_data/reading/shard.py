@@ -43,7 +43,7 @@ class ChunkCache:
     """Thread-safe cache of a release's decoded chunks, of limited size; drops the least recently used chunks.
 
     Args:
-        size: limit in bytes. The newest chunk is kept even if it alone is larger.
+        size: limit in bytes; the newest chunk remains in the cache even if it is larger than the limit.
     """
 
     def __init__(self, size: int = _CACHE_BYTES) -> None:

@@ -1,7 +1,7 @@
 """Cache modes for the histories of a selection: `ram`, `mmap` and `stream`, which return the same rows.
 
 ram      records and scalars decoded once into flat arrays in memory; reading a window is one copy
-mmap     the same arrays decoded once into the cache folder and memory-mapped, shared by processes
+mmap     the arrays of `ram`, decoded once into the cache folder and memory-mapped, shared by processes
 stream   chunks read, checked and inflated on threads when a window needs them
 
 A record is the state record of a step or, in a release without state records, the observation; see

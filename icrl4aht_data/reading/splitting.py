@@ -20,7 +20,7 @@ SPLIT_BY: tuple[SplitBy, ...] = ("teammate", "history")
 
 
 def choose_teammates(teammates: np.ndarray, share: float, seed: int) -> np.ndarray:
-    """Choose a share of the teammates to hold out, at least one unless there is only one.
+    """Choose a share of the teammates to hold out: at least one teammate, but none if there is only one teammate.
 
     Args:
         teammates: strings (H,), the name of each history's teammate.
@@ -35,7 +35,7 @@ def choose_teammates(teammates: np.ndarray, share: float, seed: int) -> np.ndarr
 
 
 def choose_histories(selection: Selection, share: float, seed: int) -> np.ndarray:
-    """Choose a share of the histories to hold out, at least one; every task keeps at least one history.
+    """Choose a share of the histories to hold out: at least one history, but never all histories of a task.
 
     Args:
         selection: the histories to divide.

@@ -115,8 +115,8 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         teammate_actions: whether batches have the field `prev_teammate_actions`.
         weights: probabilities of the histories: "uniform", "length" (proportional to the steps that windows may
             contain) or one non-negative number per history, float (H,).
-        episodes: windows stay inside these episodes of each history, such as (0, 10) or (-10, None).
-        curriculum: windows stay inside a part of each history that moves with i; see `Curriculum`.
+        episodes: range of episodes of each history to which windows are limited, such as (0, 10) or (-10, None).
+        curriculum: part of each history to which windows are limited, which moves with i; see `Curriculum`.
         process_index, process_count: index of this process, and number of processes; each process gets batch_size /
             process_count rows of every batch.
 

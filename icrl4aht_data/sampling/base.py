@@ -209,7 +209,7 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
 
 
 def check_labels(dataset: Selection, labels: Labels) -> Labels:
-    """Check that all histories of a selection have these labels.
+    """Check that all histories of a selection have labels of the given kind.
 
     Returns:
         The labels.

@@ -36,8 +36,8 @@ class Batches(Iterator[B], Generic[B]):
         prefetch: number of batches prepared in advance; with 0, `next` makes each batch itself, without a thread.
         device: a jax.Device or Sharding to which batches are copied as JAX arrays, while the previous batch is in use.
             If a sharding spans processes, each process contributes its share of the rows. Needs JAX.
-        reuse: fill the same few buffers, which is faster than allocating memory. A batch is then valid only until
-            the next one is taken. With a device, host buffers are always reused.
+        reuse: fill the same few buffers again and again, which is faster than allocating memory. A batch is then valid
+            only until the next one is taken. With a device, host buffers are always reused.
 
     Attributes:
         next: number of the next batch.
@@ -110,7 +110,7 @@ class Batches(Iterator[B], Generic[B]):
         return batch
 
     def _take(self) -> B:
-        """Return the next batch; the thread prepares the following ones."""
+        """Return the next batch; the thread prepares the following batches."""
         if not self._prefetch:
             buffer = self._buffer()
             batch = _make_batch(self._sampler, self.next, buffer, self._put)
@@ -141,7 +141,7 @@ class Batches(Iterator[B], Generic[B]):
             return None
         buffer = self._free.pop() if self._free else self._sampler.empty()
         if self._put is not None:
-            self._free.append(buffer)  # the thread copies a batch to the device before it makes the next one
+            self._free.append(buffer)  # the thread copies a batch to the device before it makes the next batch
         return buffer
 
     def close(self) -> None:
@@ -171,7 +171,8 @@ class Batches(Iterator[B], Generic[B]):
         """Continue from the position at which `state_dict` was called.
 
         Raises:
-            OptionError: if the state comes from a sampler with other options or another selection; names them.
+            OptionError: if the state comes from a sampler with other options or another selection; names the
+                differences.
         """
         if not isinstance(state, Mapping):
             raise OptionError(f"state = {state!r:.100}: expected the result of state_dict()")

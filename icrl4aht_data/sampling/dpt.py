@@ -44,12 +44,13 @@ class DPTBatch(NamedTuple, Generic[A]):
     Attributes:
         query_obs: float32 or uint8 (B, 5, 5, C): the ego's observation at the query step.
         query_target: int64 (B,): the label to predict at the query step: the action 0..5 of the expert or the oracle.
-        context_obs: float32 or uint8 (B, K, 5, 5, C): observations of transitions of the same task.
-        context_actions: int32 (B, K): the ego's actions in these transitions, 0..5.
-        context_next_obs: float32 or uint8 (B, K, 5, 5, C): the next observations in the same episode.
-        context_rewards: float32 (B, K): the team's rewards in these transitions.
-        context_teammate_actions: int32 (B, K): the teammate's actions in these transitions, 0..5; None unless the
-            sampler was made with teammate_actions=True.
+        context_obs: float32 or uint8 (B, K, 5, 5, C): observations at the context's transitions.
+        context_actions: int32 (B, K): the ego's actions in the context's transitions, 0..5.
+        context_next_obs: float32 or uint8 (B, K, 5, 5, C): observations after the context's transitions, in the same
+            episode.
+        context_rewards: float32 (B, K): the team's rewards in the context's transitions.
+        context_teammate_actions: int32 (B, K): the teammate's actions in the context's transitions, 0..5; None unless
+            the sampler was made with teammate_actions=True.
         layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
             several layouts.
     """
@@ -86,10 +87,11 @@ class _Contexts(NamedTuple):
 class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[torch.Tensor]"]):
     """A sequence of batches of queries with contexts, each a pure function of (selection, options, seed, i).
 
-    For each row a task is drawn uniformly, then two of its histories independently (uniformly or by `weights`): one for
-    the query, whose step is drawn uniformly, and one for the context of K transitions. Transitions are `contiguous` (as
-    in the published code) or `random` (independent and unordered, as in the original DPT). With `queries` = Q > 1, Q
-    steps are drawn independently from the query's history, so one context is used for Q predictions.
+    For each row a task is drawn uniformly, then two histories of the task independently (uniformly or by `weights`):
+    one for the query, whose step is drawn uniformly, and one for the context of K transitions. Transitions are
+    `contiguous` (as in the published code) or `random` (independent and unordered, as in the original DPT). With
+    `queries` = Q > 1, Q steps are drawn independently from the query's history, so one context is used for Q
+    predictions.
 
     In releases of kind `observations`, contexts skip the last kept step of each episode, whose next observation is not
     stored. In contiguous contexts, the first step of the next episode therefore follows the second to last step.

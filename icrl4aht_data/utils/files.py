@@ -148,7 +148,7 @@ def add_filename(path: Path) -> Iterator[None]:
 
 
 def allocate(stream: BinaryIO, size: int) -> None:
-    """Extend a new file to `size` bytes and allocate them on the disk.
+    """Extend a new file to `size` bytes, and allocate these bytes on the disk.
 
     On a full disk, writing to the memory map of a sparse file would kill the process by a signal.
 
@@ -221,7 +221,7 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
 
 
 def check_folder_content(folder: Path, names: Collection[str], what: str) -> None:
-    """Check that a folder is missing or contains no files other than those to write.
+    """Check that a folder is missing, or contains no files except files that will be written.
 
     Args:
         folder: the folder to write to.
