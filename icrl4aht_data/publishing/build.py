@@ -80,7 +80,7 @@ def build_release(
         digests = {name: file_hash(root / name) for name in files_below(root)}
         for name, digest in kept.items():
             if digests.get(name) != digest:
-                raise ReleaseError(f"{source / name}: the file changed while it was copied; build again")
+                raise ReleaseError(f"{source / name}: changed while it was copied, sha256 now {digests.get(name)}")
         today = datetime.datetime.now(datetime.UTC).date()
         write_json(root / CROISSANT, croissant(root, digests, published or today))
         write_manifest(root, digests)

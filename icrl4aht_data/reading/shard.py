@@ -150,7 +150,7 @@ class Shard:
         wrong = np.flatnonzero((stored > raw + raw // 1000 + 64) | (raw > DEFLATE_RATIO * stored))
         if len(wrong):
             raise ShardMismatchError(
-                f"{self.path}: {self.describe(int(wrong[0]))} has an impossible size for {raw[wrong[0]]} bytes; "
+                f"{self.path}: {self.describe(int(wrong[0]))} cannot be {raw[wrong[0]]} bytes, compressed; "
                 f"fetch meta/ and the shard again"
             )
 
