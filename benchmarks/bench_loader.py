@@ -125,7 +125,7 @@ def batch_seconds(sampler: ADSampler, buffer: ADBatch | None, cache: str, first:
     taken = []
     for i in range(first, first + REPEATS[sampler.dataset.obs]):
         if cache == "stream, nothing kept":
-            sampler.dataset.forget_chunks()
+            sampler.dataset.clear_chunk_cache()
         taken.append(elapsed(lambda i=i: sampler.batch(i, buffer)))
     return statistics.median(taken)
 

@@ -24,9 +24,9 @@ Advance = Callable[[int], None]
 THREADS = 8
 """Number of files fetched in parallel."""
 
-_TIMEOUT = 15.0  # seconds to connect, and between two bytes of a response
+_TIMEOUT = 15.0  # maximum seconds to connect, and to wait for the next bytes of a response
 _WAITS = (1.0, 2.0, 4.0)  # seconds before a request is repeated after a transient error
-_TRANSIENT_STATUS = (408, 429)  # and all from 500
+_TRANSIENT_STATUS = (408, 429)  # HTTP statuses to retry, in addition to all from 500
 _PERMANENT = (FileNotFoundError, PermissionError, ImportError, NotImplementedError, TypeError, ValueError)
 _ADDRESS = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*://)(?:[^/\s'\"<>]*@)?(?P<rest>[^\s?#'\"<>]*)[^\s'\"<>]*")
 
@@ -43,21 +43,21 @@ def without_credentials(text: str) -> str:
 
 
 def check_credentials(address: str) -> None:
-    """Check that the password in an address has no unencoded "/": the rest would be parsed as the path and shown.
+    """Check that a password in an address has no unencoded "/", after which the rest would be shown as a path.
 
     Raises:
-        OptionError: if it may have one; the message does not contain the address.
+        OptionError: if a password may contain an unencoded "/"; the message omits the address.
     """
     try:
         parts = urlsplit(address)
-        # "s3://user:12/3@host" parses as host "user" with port 12: refused, unless the host has a dot.
+        # "s3://user:12/3@host" would be parsed as host "user" with port 12: refused, unless the host has a dot.
         is_clear = parts.port is None or "@" in parts.netloc or "@" not in parts.path or "." in parts.netloc
-    except ValueError:  # the port is not a number
+    except ValueError:  # raised if the port is not a number
         is_clear = False
     if not is_clear:
         raise OptionError(
-            "an address, not shown because it may have a password: expected SCHEME://HOST:PORT/PATH or "
-            "SCHEME://USER:PASSWORD@HOST/PATH: percent-encode the user name and password, such as / as %2F"
+            "an address (not shown, since it may contain a password): expected SCHEME://HOST:PORT/PATH or "
+            "SCHEME://USER:PASSWORD@HOST/PATH; percent-encode the user name and the password, for example / as %2F"
         )
 
 
@@ -74,43 +74,45 @@ class HubClient:
 
     @contextmanager
     def connect(self) -> Iterator[None]:
-        """Open a context for requests that fail after `_TIMEOUT` seconds without a response, retries included.
+        """Return a context in which requests fail after `_TIMEOUT` seconds without a response, even if retried.
 
-        Without the two hooks, huggingface_hub waits for some responses without a limit and for others five times 60 s.
+        Two hooks set this limit: by itself, huggingface_hub waits for some responses forever and for others five times
+        60 s.
         """
         from huggingface_hub import get_session
 
         unanswered: dict[str, float] = {}
 
-        def before(request: Any) -> None:
-            # Per address, as a server may answer other requests; per host, for the client's requests of its own.
+        def before_request(request: Any) -> None:
+            # The time counts per address, as a server may answer only other requests, and per host, as the client
+            # sends further requests by itself.
             now, keys = time.monotonic(), (str(request.url), request.url.host)
             first = min(unanswered.setdefault(key, now) for key in keys)
             left = first + _TIMEOUT - now
             if left < 0.1 * _TIMEOUT:
                 raise TimeoutError(f"no answer for {_TIMEOUT:g} s")
-            # A shorter limit of the client stays: it gives up soon on requests that it can do without.
+            # A shorter limit set by the client is kept, since the client gives up early on optional requests.
             given = request.extensions.get("timeout") or {}
             limits = {name: given.get(name) for name in ("connect", "read", "write", "pool")}
             request.extensions["timeout"] = {
                 name: left if limit is None else min(left, limit) for name, limit in limits.items()
             }
 
-        def after(response: Any) -> None:
+        def after_response(response: Any) -> None:
             unanswered.pop(str(response.request.url), None)
             unanswered.pop(response.request.url.host, None)
 
         hooks = get_session().event_hooks
-        hooks["request"].append(before)
-        hooks["response"].append(after)
+        hooks["request"].append(before_request)
+        hooks["response"].append(after_response)
         try:
             yield
         finally:
-            hooks["request"].remove(before)
-            hooks["response"].remove(after)
+            hooks["request"].remove(before_request)
+            hooks["response"].remove(after_response)
 
     def get(self, name: str, scratch: Path | None, count: Advance) -> Path:
-        """Fetch a file into a folder, or into the Hub's cache for None, and return its path."""
+        """Download a file to the folder `scratch`, or to the Hub's cache if `scratch` is None, and return the path."""
         from huggingface_hub import hf_hub_download
         from huggingface_hub.utils import tqdm
 
@@ -129,7 +131,7 @@ class HubClient:
         return Path(hf_hub_download(self.repo, name, **options, local_files_only=is_offline, tqdm_class=Bar))
 
     def sizes(self, names: list[str]) -> list[int]:
-        """Return the bytes of files; 0 where the server does not say."""
+        """Return the sizes of files in bytes; 0 if the server does not report a size."""
         from huggingface_hub import HfApi
 
         info = HfApi().dataset_info(self.repo, revision=self.revision, files_metadata=True, timeout=_TIMEOUT)
@@ -138,10 +140,10 @@ class HubClient:
 
 
 class FsspecClient:
-    """Client for files below an https://, s3:// or other address that fsspec opens.
+    """Client for the files of a folder at an https://, s3:// or other address that fsspec opens.
 
     Args:
-        address: the folder's address, perhaps with user name and password, or a query sent with every request.
+        address: the folder's address; may have a user name and password, or a query, which is sent with every request.
     """
 
     def __init__(self, address: str) -> None:
@@ -152,12 +154,12 @@ class FsspecClient:
 
     @contextmanager
     def connect(self) -> Iterator[None]:
-        """Open a context for requests with a new file system, since connections do not survive a fork."""
+        """Return a context for requests through a new file system object, since connections do not survive a fork."""
         self._files = _open_filesystem(self._address)
         yield
 
     def get(self, name: str, scratch: Path | None, count: Advance) -> Path:
-        """Fetch a file into a folder and return its path."""
+        """Download a file to the folder `scratch` and return the path."""
         from fsspec.callbacks import Callback
 
         assert self._files is not None and scratch is not None
@@ -174,7 +176,7 @@ class FsspecClient:
         return path
 
     def sizes(self, names: list[str]) -> list[int]:
-        """Return the bytes of files; 0 where the server does not say."""
+        """Return the sizes of files in bytes; 0 if the server does not report a size."""
         assert self._files is not None
         return [int(size or 0) for size in self._files.sizes(list(map(self._file_address, names)))]
 
@@ -212,15 +214,15 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
     """Return the result of a request, which is retried after transient errors.
 
     Raises:
-        RemoteError: if the request fails; replaces the client's error and names the address.
-        OSError: unchanged, if the local disk is full or not writable.
+        RemoteError: if the request fails; the message has the address and the client's error.
+        OSError: if the local disk is full or not writable.
     """
     for wait in (*_WAITS, None):
         try:
             return request()
         except Icrl4ahtError:
             raise
-        except Exception as error:  # each client raises different classes
+        except Exception as error:  # each client library raises errors of different classes
             if isinstance(error, OSError) and error.errno in (*NO_ROOM, errno.EROFS):
                 raise
             status, cause = _http_status(error), _root_cause(error)
@@ -230,7 +232,7 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
                 is_transient = status in _TRANSIENT_STATUS or status >= 500
             # huggingface_hub raises LocalEntryNotFoundError after its own retries.
             if wait is None or not is_transient or type(error).__name__ == "LocalEntryNotFoundError":
-                # Some time-outs have no text.
+                # Some timeout errors have no message.
                 said = str(cause) or (
                     f"no answer for {_TIMEOUT:g} s" if isinstance(cause, TimeoutError) else "no reason given"
                 )
@@ -238,21 +240,21 @@ def with_retries(address: str, request: Callable[[], T]) -> T:
                 if isinstance(cause, FileNotFoundError) or status == 404:
                     raise RemoteError(f"{address}: the remote has no such file: {text}", missing=True) from None
                 raise RemoteError(
-                    f"{address}: {text}; repeat the command, which keeps the files that are complete"
+                    f"{address}: {text}; repeat the command, which does not download complete files again"
                 ) from None
         time.sleep(wait)
     raise AssertionError
 
 
 def _root_cause(error: BaseException) -> BaseException:
-    """Return the cause of a FileNotFoundError, which clients raise for any failed request for a file's size."""
+    """Return the error behind a FileNotFoundError, which clients raise if any request for a file's size fails."""
     while isinstance(error, FileNotFoundError) and error.__cause__ is not None:
         error = error.__cause__
     return error
 
 
 def _http_status(error: BaseException | None) -> int | None:
-    """Return the HTTP status of an error of aiohttp or httpx, or of its cause; None without a response."""
+    """Return the HTTP status of an error of aiohttp or httpx, or of the error's cause; None without a response."""
     if error is None:
         return None
     status = getattr(getattr(error, "response", None), "status_code", getattr(error, "status", None))

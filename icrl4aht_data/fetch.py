@@ -1,8 +1,8 @@
-"""Releases at an address: files are fetched complete, checked once against the manifest, and are local from then on.
+"""Remote releases: complete files are downloaded, checked once against the manifest, and then stay on this machine.
 
-A release at an address has a folder on this machine: for `hf://` its snapshot in the Hub's own cache, which other tools
-share, and for any other address a folder below `system.data_folder`, one per version. A file gets its name there only
-after its SHA-256 was found to be the manifest's, so that an interrupted download is resumed file by file.
+The files of a remote release are stored in a local folder. For `hf://`, this is the snapshot in the Hub's cache, which
+other tools share; for any other address, a folder in `system.data_folder`, one per version. A file is accepted only if
+its SHA-256 is the one in the manifest, so an interrupted download is resumed file by file.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from icrl4aht_data.utils import files as disk
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.utils.system import data_folder
 
-_INDEX_FILES = (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE)  # read when a release is opened
+_INDEX_FILES = (INFO, HISTORIES, TASKS, PROVENANCE, LAYOUTS_FILE)  # files that are read when a release is opened
 _HUB = re.compile(r"hf://datasets/(?P<repo>[\w.-]+/[\w.-]+)(?:@(?P<revision>[^@]+))?/?")
 
 
@@ -51,10 +51,10 @@ def is_address(root: str | Path | None) -> bool:
 
 @dataclass
 class ReleaseLocation:
-    """An opened release: a local one, or as `Remote` one at an address.
+    """Location of an opened release: a local folder, or, in the subclass `Remote`, an address.
 
     Args:
-        folder: its folder on this machine.
+        folder: the release's folder on this machine.
     """
 
     folder: Path
@@ -63,35 +63,35 @@ class ReleaseLocation:
         return str(self.folder)
 
     def path(self, name: str) -> Path:
-        """Return the path of a file in the folder; it need not exist.
+        """Return the path of a file of the release; the file need not exist.
 
         Raises:
-            UnsafePathError: if it leads out of the release.
+            UnsafePathError: if the path leads out of the release.
         """
         return disk.resolve_inside(self.folder, name)
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Download files that are not in the folder; a local release has all of its files."""
+        """Download missing files; for a local release, nothing is downloaded, since all of its files are present."""
 
     def file(self, name: str) -> Path:
-        """Return the path of a file, fetched first if necessary; a local one of meta/ is checked against the manifest.
+        """Return the path of a file, downloaded if necessary; local files in meta/ are checked against the manifest.
 
         Raises:
-            UnsafePathError: if it leads out of the release.
-            RemoteError, OfflineError: if it cannot be fetched.
-            IndexFormatError, ChunkTableError: if it is not the one that the manifest lists.
+            UnsafePathError: if the path leads out of the release.
+            RemoteError, OfflineError: if the file cannot be downloaded.
+            IndexFormatError, ChunkTableError: if the file does not match the manifest.
         """
         if name.startswith("meta/"):
             check_against_manifest(self.folder, [name])
         return self.path(name)
 
     def below(self, name: str) -> Path:
-        """Return the path of a folder, which need not exist, after its files are fetched and checked.
+        """Download and check the files of a folder, which need not exist, and return the path of the folder.
 
         Raises:
-            UnsafePathError: if it leads out of the release.
-            RemoteError, OfflineError: if a file cannot be fetched.
-            IndexFormatError: if a file is not the one that the manifest lists.
+            UnsafePathError: if the path leads out of the release.
+            RemoteError, OfflineError: if a file cannot be downloaded.
+            IndexFormatError: if a file does not match the manifest.
         """
         path = self.path(name)
         listed = [known for known in read_manifest(self.folder) if known.startswith(f"{name}/")]
@@ -102,14 +102,14 @@ class ReleaseLocation:
 
 @dataclass
 class Remote(ReleaseLocation):
-    """A release at an address, pinned to one manifest.
+    """A release at a remote address, pinned to one manifest.
 
     Args:
-        folder: its folder on this machine.
+        folder: the release's folder on this machine.
         url: address of the release, with its revision if it has one, without credentials.
         revision: the Hub's commit, or the first 16 hexadecimal digits of the manifest's SHA-256.
         manifest: file -> SHA-256, hexadecimal.
-        client: fetches files.
+        client: client that downloads files.
         in_hub_cache: whether `folder` belongs to the Hub's cache.
     """
 
@@ -123,38 +123,38 @@ class Remote(ReleaseLocation):
         return self.url
 
     def file(self, name: str) -> Path:
-        self.fetch([name])  # which checks its hash
+        self.fetch([name])  # checks the file's hash
         return self.path(name)
 
     def fetch(self, names: Iterable[str], advance: Advance | None = None, again: bool = False) -> None:
-        """Download files that are not in the folder, several at once; stops at the first one that fails.
+        """Download missing files, several in parallel; stop at the first failure.
 
         Args:
             names: files of the release.
-            advance: called with the number of bytes since the last call, by several threads; negative before a retry.
-                By default a progress bar shows the bytes of shards.
-            again: also download files that are in the folder.
+            advance: called by several threads with the number of bytes received since the last call; negative before a
+                retry. By default a progress bar shows the bytes of shards.
+            again: also download files that are already present.
 
         Raises:
-            OfflineError: names every file that is not downloaded.
-            RemoteError: if a file cannot be fetched, or is not the one that the manifest lists.
+            OfflineError: if network access is switched off; names every missing file.
+            RemoteError: if a file cannot be downloaded, or does not match the manifest.
         """
         wanted = list(dict.fromkeys(names))
         unlisted = [name for name in wanted if name not in self.manifest]
         if unlisted:
-            raise RemoteError(f"{self.url}: its manifest does not list {', '.join(unlisted[:5])}", missing=True)
-        absent = [name for name in wanted if again or not self.is_here(name)]
+            raise RemoteError(f"{self.url}: the manifest does not list {', '.join(unlisted[:5])}", missing=True)
+        absent = [name for name in wanted if again or not self.is_downloaded(name)]
         if absent and offline_switches():
             listed = ", ".join(absent)
-            raise OfflineError(f"{self.url}: offline, and not downloaded, or changed since: {listed}; go online")
+            raise OfflineError(f"{self.url}: offline, but these files are missing or have changed: {listed}; go online")
         if not absent:
             return
         with ExitStack() as stack:
             scratch = None
-            if not self.in_hub_cache:  # whose client has locks of its own
+            if not self.in_hub_cache:  # the Hub's client locks its own cache
                 stack.enter_context(disk.process_lock(disk.lock_path(self.folder)))
-                absent = [name for name in absent if again or not self.is_here(name)]
-                for left in self.folder.glob(".partial-*"):  # by a killed process
+                absent = [name for name in absent if again or not self.is_downloaded(name)]
+                for left in self.folder.glob(".partial-*"):  # left by a killed process
                     shutil.rmtree(left, ignore_errors=True)
                 scratch = Path(stack.enter_context(TemporaryDirectory(prefix=".partial-", dir=self.folder)))
             stack.enter_context(self.client.connect())
@@ -168,42 +168,42 @@ class Remote(ReleaseLocation):
                 file.result()
 
     def _fetch_file(self, name: str, scratch: Path | None, advance: Advance) -> None:
-        """Fetch a file and move it to its path if it has the manifest's hash."""
+        """Download a file, and move it to its final path if its hash is the one in the manifest."""
         address, target = f"{self.url}/{name}", self.path(name)
         if scratch is None:
-            _remove_from_cache(target)  # a changed file, which the client would take
+            _remove_from_cache(target)  # otherwise the client would return a changed file
         most = self._shard_sizes.get(name, 2**62) if name.startswith("data/") else disk.LARGEST
-        path = _get(self.client, address, name, scratch, advance, most)
+        path = _fetch_with_retries(self.client, address, name, scratch, advance, most)
         size, found = path.stat().st_size, disk.file_hash(path)
         if found != self.manifest[name]:
             if scratch is None:
                 _remove_from_cache(path)
             raise RemoteError(
                 f"{address}: expected sha256 {self.manifest[name]}, found {found} in {size:,} bytes: "
-                f"fetch it again; if that does not help, it is damaged there: report it to its publisher",
+                f"download it again; if that does not help, the remote file is damaged: report it to the publisher",
             )
         if scratch is not None:
             disk.sync(path)
             target.parent.mkdir(parents=True, exist_ok=True)
             path.replace(target)
 
-    def is_here(self, name: str, by_hash: bool = False) -> bool:
-        """Return whether a file needs no fetching: it has the manifest's hash, or as a shard the right size.
+    def is_downloaded(self, name: str, by_hash: bool = False) -> bool:
+        """Return whether a file is present and has the hash in the manifest; for shards only the size is compared.
 
         Args:
             name: file of the release.
-            by_hash: compare the hash of a shard, too, whose content is otherwise checked chunk by chunk on reading.
+            by_hash: also compare the hashes of shards, which are otherwise checked chunk by chunk when they are read.
         """
         path, is_shard = self.path(name), name.startswith("data/")
         if not path.is_file() or (is_shard and path.stat().st_size != self._shard_sizes.get(name)):
             return False
         if is_shard and not by_hash:
             return True
-        is_hashable = is_shard or path.stat().st_size <= disk.LARGEST  # a sparse file may have a terabyte
+        is_hashable = is_shard or path.stat().st_size <= disk.LARGEST  # a sparse file may be huge
         return is_hashable and disk.file_hash(path) == self.manifest[name]
 
     def sizes(self, names: Iterable[str]) -> dict[str, int]:
-        """Return the bytes of files as the remote says; 0 where it does not say.
+        """Return file -> size in bytes, as the remote reports; 0 if no size is reported.
 
         Raises:
             RemoteError: if the remote cannot be reached, or does not have a file.
@@ -219,10 +219,10 @@ class Remote(ReleaseLocation):
         return read_info(self.folder).shards
 
 
-def _get(
+def _fetch_with_retries(
     client: HubClient | FsspecClient, address: str, name: str, scratch: Path | None, advance: Advance, most: int
 ) -> Path:
-    """Fetch a file of at most `most` bytes, with retries; the sum of `advance` is then the size of the file."""
+    """Download a file of at most `most` bytes, with retries; the calls of `advance` add up to the file's size."""
     arrived = 0
 
     def count(size: int) -> None:
@@ -230,19 +230,19 @@ def _get(
         arrived += size
         advance(size)
         if arrived > most:
-            raise RemoteError(f"{address}: expected at most {most:,} bytes, the server sent more")
+            raise RemoteError(f"{address}: expected at most {most:,} bytes, but the server sent more")
 
     def attempt() -> Path:
-        count(-arrived)  # the bytes of a failed attempt are sent again
+        count(-arrived)  # a new attempt starts again at the first byte
         return client.get(name, scratch, count)
 
     path = with_retries(address, attempt)
-    advance(path.stat().st_size - arrived)  # what the Hub's cache had under another name
+    advance(path.stat().st_size - arrived)  # bytes that the Hub's cache had under another name
     return path
 
 
 def _remove_from_cache(path: Path) -> None:
-    """Remove a file of the Hub's cache: the link in the snapshot and the content that it points to."""
+    """Remove a file from the Hub's cache: the link in the snapshot and the content that the link points to."""
     path.resolve().unlink(missing_ok=True)
     path.unlink(missing_ok=True)
 
@@ -251,7 +251,7 @@ def check_root(root: Any) -> None:
     """Check that a root is a path, or a text without null characters.
 
     Raises:
-        OptionError: if it is not.
+        OptionError: for any other value.
     """
     if not isinstance(root, (str, Path)) or "\0" in str(root):
         raise OptionError(
@@ -260,7 +260,7 @@ def check_root(root: Any) -> None:
 
 
 def open_root(root: str | Path) -> ReleaseLocation:
-    """Locate a release, a folder or an address; see `check_root` and `open_remote` for the errors."""
+    """Open a release given by a folder or an address; see `check_root` and `open_remote` for the errors."""
     check_root(root)
     if is_address(root):
         return open_remote(str(root))
@@ -268,16 +268,16 @@ def open_root(root: str | Path) -> ReleaseLocation:
 
 
 def open_remote(url: str, to: Path | None = None) -> Remote:
-    """Open a release at an address; fetch its manifest and index.
+    """Open a release at an address, and download the manifest and the index.
 
     Args:
         url: hf://datasets/<org>/<repo>[@<revision>], s3://, https://, or any other address of fsspec.
-        to: folder for its files; see the module for the default.
+        to: folder for the release's files; by default the Hub's cache, or a folder in `system.data_folder`.
 
     Raises:
-        OptionError: if `url` is no address, or `to` has files of something else.
-        RootNotFoundError: if the address has no release.
-        RemoteError: if the remote cannot be reached, or serves something else than its manifest lists.
+        OptionError: if `url` is not an address, or `to` contains other files.
+        RootNotFoundError: if there is no release at the address.
+        RemoteError: if the remote cannot be reached, or a file does not match the manifest.
         OfflineError: if network access is switched off and the index is not downloaded.
     """
     if not is_address(url):
@@ -306,11 +306,11 @@ def _open_address(address: str, to: Path | None) -> Remote:
     check_credentials(address)
     client, url = FsspecClient(address), without_credentials(address).rstrip("/")
     base = data_folder() / f"{re.sub(r'[^A-Za-z0-9.]+', '-', url)[:80]}-{disk.short_hash(url.encode(), 8)}"
-    latest = base / "latest"  # the version that this address had when it was last opened
+    latest = base / "latest"  # names the version that the address had when it was last opened
     if offline_switches():
         path = (to or base / (latest.read_text() if latest.is_file() else "none")) / MANIFEST
         if not path.is_file():
-            raise OfflineError(f"{url}: offline, and no version of it is downloaded to {path.parent}; go online")
+            raise OfflineError(f"{url}: offline, and this release is not downloaded to {path.parent}; go online")
         text = path.read_bytes()
     else:
         with TemporaryDirectory() as scratch:
@@ -325,44 +325,44 @@ def _open_address(address: str, to: Path | None) -> Remote:
 
 
 def _fetch_manifest(client: HubClient | FsspecClient, url: str, scratch: Path | None) -> tuple[Path, bytes]:
-    """Return the path and the content of a release's manifest; a missing one is a missing release."""
+    """Download a release's manifest, and return its path and content; without a manifest there is no release."""
     address = f"{url}/{MANIFEST}"
     try:
         with client.connect():
-            path = _get(client, address, MANIFEST, scratch, lambda size: None, disk.TEXT_BYTES)
+            path = _fetch_with_retries(client, address, MANIFEST, scratch, lambda size: None, disk.TEXT_BYTES)
     except RemoteError as error:
         if error.missing and offline_switches():
-            raise OfflineError(f"{url}: offline, and no version of it is downloaded; go online") from None
+            raise OfflineError(f"{url}: offline, and this release is not downloaded; go online") from None
         if error.missing:
-            raise RootNotFoundError(f"{url}: no release there, expected {MANIFEST} in it: {error}") from None
+            raise RootNotFoundError(f"{url}: no release at this address, expected {MANIFEST}: {error}") from None
         raise
-    disk.plain_size(path, disk.TEXT_BYTES)
+    disk.regular_file_size(path, disk.TEXT_BYTES)
     return path, path.read_bytes()
 
 
 def _parse_manifest(text: bytes, url: str) -> dict[str, str]:
-    # What is not UTF-8 becomes unprintable characters, which no line may have.
+    # Bytes that are not UTF-8 become unprintable characters, which `parse_manifest` refuses.
     return dict(parse_manifest(text.decode(errors="surrogateescape"), f"{url}/{MANIFEST}"))
 
 
 def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) -> None:
-    """Write the manifest into the folder for a release.
+    """Create the folder for a release's files, and write the manifest into it.
 
     Raises:
-        OptionError: if the folder has files of something else, unless it is one of `system.data_folder`.
+        OptionError: if the folder contains other files, unless it belongs to `system.data_folder` (`is_ours`).
     """
     path = folder / MANIFEST
 
-    def is_there() -> bool:
+    def has_manifest() -> bool:
         return path.is_file() and path.stat().st_size == len(text) and path.read_bytes() == text
 
-    if is_there():
+    if has_manifest():
         return
     with disk.process_lock(disk.lock_path(folder)):  # another process may be writing the manifest
-        if is_there():
+        if has_manifest():
             return
         if path.exists() and not is_ours:
-            raise OptionError(f"{folder}: holds another release or version than {url} has now; give another folder")
+            raise OptionError(f"{folder}: contains another release or version than {url} now; give another folder")
         if folder.exists() and any(folder.iterdir()) and not is_ours:
             raise OptionError(f"{folder}: not empty, and not a release; give a new or an empty folder")
         folder.mkdir(parents=True, exist_ok=True)
@@ -372,11 +372,11 @@ def _prepare_folder(folder: Path, text: bytes, url: str, is_ours: bool = False) 
 
 @dataclass(frozen=True)
 class DownloadPlan:
-    """Plan of a download: the files to fetch.
+    """Plan of a download: the files of a release to download.
 
     Args:
         root: the remote release.
-        files: name -> bytes of all files requested.
+        files: name -> size in bytes, for all requested files.
         absent: names of files not downloaded yet.
         changed: names of downloaded files that differ from the manifest.
     """
@@ -388,11 +388,11 @@ class DownloadPlan:
 
     @property
     def size(self) -> int:
-        """Bytes to fetch: the sizes of absent and changed files."""
+        """Number of bytes to download: the sum of the sizes of absent and changed files."""
         return sum(self.files[name] for name in (*self.absent, *self.changed))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the plan as `download --dry-run --json` prints it."""
+        """Return the plan as a JSON object, which `download --dry-run --json` prints."""
         facts = {"root": str(self.root), "folder": str(self.root.folder), "files": self.files}
         return facts | {"absent": self.absent, "changed": self.changed, "bytes": self.size}
 
@@ -404,19 +404,19 @@ def plan_download(
     advance: Callable[[str, int, int], None] = lambda what, done, total: None,
     **wanted: str | Iterable[str] | None,
 ) -> DownloadPlan:
-    """Plan a download: fetch only the index, and compare existing files with the manifest.
+    """Plan a download: compare existing files with the manifest, and download only the index.
 
     Args:
         url: address of the release.
         to: folder for the files, which must be absent, empty or contain this release; by default the Hub's cache, or a
             folder in `system.data_folder`.
         advance: called with the name of a stage, and the bytes compared so far and in total.
-        wanted: filters as in `load_icrl4aht`: only the shards with matching histories are fetched, with their chunk
-            tables and all files that belong to no shard, except the Parquet copy of the episodes.
+        wanted: filters as in `load_icrl4aht`: the plan has the shards with matching histories, their chunk tables, and
+            all files that belong to no shard, except the Parquet copy of the episodes.
 
     Raises:
         OptionError: if `url` is not an address, or `to` contains other files.
-        RemoteError, OfflineError: if the index cannot be fetched.
+        RemoteError, OfflineError: if the index cannot be downloaded.
         EmptySelectionError, UnknownNameError: if no history matches the filters, or a filter has no such value.
     """
     remote = open_remote(url, to)
@@ -426,7 +426,7 @@ def plan_download(
     sizes = present | sizes | remote.sizes(name for name in names if name not in sizes and name not in present)
     compared, changed = counted(advance, "compare", sum(present.values())), []
     for name, size in present.items():
-        if not remote.is_here(name, by_hash=True):
+        if not remote.is_downloaded(name, by_hash=True):
             changed.append(name)
         compared(size)
     return DownloadPlan(remote, sizes, sorted(sizes.keys() - present), changed)
@@ -436,20 +436,20 @@ def fetch_planned(plan: DownloadPlan, advance: Advance | None = None) -> None:
     """Download the files of a plan, and replace changed files.
 
     Raises:
-        RemoteError: if a file cannot be fetched; calling again resumes.
+        RemoteError: if a file cannot be downloaded; another call resumes the download.
         OSError: if the disk is full or not writable.
     """
     plan.root.fetch([*plan.changed, *plan.absent], advance, again=True)
 
 
 def chosen_files(root: ReleaseLocation, **wanted: str | Iterable[str] | None) -> set[str]:
-    """Return the names of a selection's files: shards, their chunk tables, and all files without a shard.
+    """Return the files that a selection needs: shards, chunk tables, and all files that belong to no shard.
 
-    With filters, the Parquet copy of the episodes is left out: it contains all histories.
+    With filters, the Parquet copy of the episodes is left out, since it contains all histories.
 
     Args:
         root: an opened release.
-        wanted: filters as in `load_icrl4aht`. Without filters, all files.
+        wanted: filters as in `load_icrl4aht`; without filters, all files are returned.
     """
     index = read_index(root.folder)
     all_shards = index.values("shard")

@@ -1,4 +1,4 @@
-"""Figures of datasets, histories and layouts, and pictures that notebooks show. They need the extra `plot`."""
+"""Figures of datasets, histories and layouts, and pictures for notebooks; drawing needs the extra `plot`."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".svg", ".pdf")
 """Accepted suffixes of a figure's file name."""
 
-_CURVE_PARTS = 25  # most points of a history's curve
+_CURVE_PARTS = 25  # maximum number of points of a learning curve
 
 MOST_PANELS = 12
-"""Most panels of a figure with one panel per task or cell."""
+"""Number of panels above which a figure draws smaller panels, or averages over layouts."""
 
 
 class Picture:
-    """A figure or an animation, shown by notebooks; `save` writes it to a file.
+    """A figure or an animation that notebooks display; `save` writes the picture to a file.
 
     Args:
         title: what the picture shows, in words.
@@ -54,7 +54,7 @@ class Picture:
 
     @property
     def figure(self) -> Figure | None:
-        """The matplotlib figure, to be changed before the picture is shown; None for an animation."""
+        """The matplotlib figure, which may be changed before the picture is shown; None for an animation."""
         return None if isinstance(self._content, bytes) else self._content
 
     def __repr__(self) -> str:
@@ -87,7 +87,7 @@ class Picture:
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
-    """Return the running mean over `window` values, fewer at the ends: float64 (E,) from real (E,)."""
+    """Return the running mean of real (E,) over `window` values, fewer at both ends, as float64 (E,)."""
     width = max(1, window)
     sums = np.concatenate([[0.0], np.cumsum(values)])
     numbers = np.arange(len(values))
@@ -96,7 +96,7 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def return_limits(values: Iterable[float]) -> tuple[float, float]:
-    """Return the limits of an axis of returns, which includes 0, all values, and the reward of one delivery.
+    """Return the limits of an axis of returns that includes 0, all values, and the reward of one delivery.
 
     Small variations of a constant return are therefore not magnified.
     """
@@ -108,12 +108,12 @@ def return_limits(values: Iterable[float]) -> tuple[float, float]:
 
 
 def plot_history(returns: np.ndarray, title: str, expert_return: float | None = None) -> Figure:
-    """Plot a history's learning curve: the return of each episode, and its mean over a twentieth of the episodes.
+    """Plot a history's learning curve: the return of each episode, and the running mean over 5 % of the episodes.
 
     Args:
         returns: real (E,), each episode's return.
         title: title of the figure.
-        expert_return: return per episode of the expert policy, drawn as a line; None to omit it.
+        expert_return: return per episode of the expert policy, drawn as a line; None draws no line.
 
     Raises:
         OptionError: if matplotlib is not installed.
@@ -141,7 +141,7 @@ def animate_episode(
     Args:
         layout: the layout.
         records: state records uint8 (T, S) in order.
-        rewards: real (T,), the reward of the step from each record.
+        rewards: real (T,), the reward of the step taken in each record's state.
         title: what the animation shows, in words.
         cell: side of a map cell in pixels, 16 to 128.
         fps: frames per second, 1 to 50.
@@ -173,20 +173,20 @@ def plot_learning_curves(dataset: Iterable[Any], path: Path | None = None) -> Fi
 _SPLIT_LINES = {"train": "-", "validation": "--"}
 
 SourceCurves = dict[str, dict[tuple[str, str], list[np.ndarray]]]
-"""source -> layout and split -> returns of each history's episodes, (E,)."""
+"""Source -> (layout, split) -> list with the episode returns (E,) of each history."""
 
 
 def add_curve(curves: SourceCurves, source: str, layout: str, split: str, returns: np.ndarray) -> None:
-    """Add a history's episode returns (E,) to those of its source, layout and split."""
+    """Add a history's episode returns (E,) to the curves of the history's source, layout and split."""
     curves.setdefault(source, {}).setdefault((layout, split), []).append(returns)
 
 
 def plot_source_curves(curves: SourceCurves) -> Figure:
     """Plot mean returns by episode, on a logarithmic axis, with one panel for each source.
 
-    A thin line is the mean of a layout's training histories, the thick one that of all training histories with a band
-    from the 10th to the 90th percentile, dashed ones those of other splits. A mean goes as far as the
-    shortest of its histories. Episodes are averaged in at most 25 blocks of equal length on the axis.
+    A thin line is the mean of a layout's training histories. The thick solid line is the mean of all training
+    histories, with a band from the 10th to the 90th percentile; thick dashed or dotted lines are means of other splits.
+    A mean ends with the shortest history. Episodes are averaged in at most 25 blocks of equal length on the axis.
 
     Raises:
         OptionError: if matplotlib is not installed.
@@ -212,7 +212,7 @@ def plot_source_curves(curves: SourceCurves) -> Figure:
         ends += list(axes.dataLim.intervaly)
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
-        if axes.dataLim.x1 < 10:  # the powers of ten alone would leave one number on the axis
+        if axes.dataLim.x1 < 10:  # with powers of ten only, the axis would have one number
             axes.xaxis.set_minor_formatter("{x:g}")
         axes.set_title(f"source {source}, {counted_histories(sum(map(len, by_split.values())))}", fontsize=9)
         axes.set_xlabel("episode", fontsize=8)
@@ -226,7 +226,7 @@ def plot_source_curves(curves: SourceCurves) -> Figure:
 
 
 def _mean_by_episode(histories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return numbers of episodes, and mean, 10th and 90th percentile of the returns there, each float64 (blocks,)."""
+    """Return centres of blocks of episodes, and mean, 10th and 90th percentile of returns, each float64 (blocks,)."""
     length = min(map(len, histories))
     starts = np.unique(np.geomspace(1, length + 1, _CURVE_PARTS + 1).round().astype(int))
     sizes = np.diff(starts)
@@ -236,11 +236,11 @@ def _mean_by_episode(histories: Sequence[np.ndarray]) -> tuple[np.ndarray, np.nd
 
 
 def plot_layouts(layouts: Sequence[Layout], titles: Sequence[str] | None = None) -> Figure:
-    """Draw the layouts at the start of an episode: agents on their cells in the map, ego blue, teammate red.
+    """Draw layouts at the start of an episode, with the ego in blue and the teammate in red.
 
     Args:
         layouts: the layouts; more than `MOST_PANELS` are drawn smaller.
-        titles: a title for each; by default both names of the layout.
+        titles: a title for each layout; by default both names of the layout.
 
     Raises:
         OptionError: if matplotlib or Pillow is not installed.
@@ -265,7 +265,7 @@ def _check_suffix(path: Path, suffixes: Collection[str]) -> None:
 
 
 def _panels(count: int, size: tuple[float, float], columns: int) -> tuple[Figure, list[Any]]:
-    """Return a figure and its `count` axes, each `size` inches (width, height)."""
+    """Return a figure and a list of `count` axes, each `size` inches (width, height)."""
     rows = -(-count // columns)
     figure = new_figure(size[0] * columns, size[1] * rows)
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
@@ -277,7 +277,7 @@ def can_draw() -> bool:
 
 
 def check_can_draw() -> None:
-    """Check that matplotlib and Pillow are installed, before long work whose results are drawn.
+    """Check that matplotlib and Pillow are installed; call this before long work that ends with a figure.
 
     Raises:
         OptionError: if matplotlib or Pillow is not installed.
@@ -287,7 +287,7 @@ def check_can_draw() -> None:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of a size in inches, with matplotlib's constrained layout.
+    """Return an empty figure of the given size in inches, with matplotlib's constrained layout.
 
     Raises:
         OptionError: if matplotlib is not installed.
@@ -296,7 +296,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def legend_below(figure: Figure) -> None:
-    """Add one legend for all axes below the figure, in as many columns as fit its width."""
+    """Add one legend for all axes below the figure, in as many columns as fit the figure's width."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     entries = {

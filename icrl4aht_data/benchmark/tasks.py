@@ -31,7 +31,7 @@ from icrl4aht_data.benchmark.facts import (
 )
 from icrl4aht_data.errors import Icrl4ahtError, OptionError, TaskFormatError, check_choice, unknown
 from icrl4aht_data.overcooked.layouts import Layout, get_layout, with_recipes
-from icrl4aht_data.utils.files import is_inside, json_hash, parse_json, read_lines
+from icrl4aht_data.utils.files import is_safe_path, json_hash, parse_json, read_lines
 
 Dish = tuple[int, int, int]
 """Ids of the three ingredients of a dish."""
@@ -284,7 +284,7 @@ def check_teammate(teammate: dict[str, Any]) -> None:
         raise unknown(f"{found.kind} family", found.family, kinds)
     if not is_heuristic:
         checkpoint = _convert(found.theta, _RlTheta, "teammate.theta: ").checkpoint
-        if not is_inside(checkpoint):
+        if not is_safe_path(checkpoint):
             raise TaskFormatError(
                 f"teammate.theta.checkpoint: expected a path within the suite, found {checkpoint[:200]!r}"
             )

@@ -1,1 +1,1 @@
-"""HTML pages of `icrl4aht-data browse`, which show histories in a web browser."""
+"""HTML pages that show learning histories in a web browser, written by `icrl4aht-data browse`."""

@@ -1,4 +1,4 @@
-"""Conversion of states to lists of shapes, which a page can draw without knowing the game."""
+"""Conversion of game states to lists of shapes, which a web page can draw without knowing the game."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from icrl4aht_data.overcooked.drawing import FOOTER, PAPER, VIEW, Canvas, Colour
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 
-_DIGITS = 3  # decimals of coordinates, in cells
+_DIGITS = 3  # decimals of coordinates, whose unit is one map cell
 
 Drawings = dict[str, dict[str, list]]
-"""Name of a part -> values of its columns, joined by commas -> shapes, see `layout_drawings`."""
+"""Name of a drawn part -> its state values, joined by commas -> shapes; see `layout_drawings`."""
 
 
 def shape_to_json(shape: tuple[Any, ...]) -> list[str | float]:
-    """Return a shape of a `Canvas` as a list of texts, colours such as "#2b303a", and rounded numbers."""
+    """Return a shape of a `Canvas` as a JSON list; colours become texts such as "#2b303a", numbers are rounded."""
     return [
-        value if isinstance(value, str) else hex_colour(value) if isinstance(value, tuple) else _rounded(value)
+        value if isinstance(value, str) else hex_colour(value) if isinstance(value, tuple) else _round_coordinate(value)
         for value in shape
     ]
 
 
-def _rounded(value: float) -> float:
+def _round_coordinate(value: float) -> float:
     short = round(float(value), _DIGITS)
     return int(short) if short.is_integer() else short
 
 
-def _distinct(rows: np.ndarray) -> list[list[int]]:
-    """Return the distinct rows of uint8 (N, K); much faster than `np.unique` for few columns."""
+def _distinct_rows(rows: np.ndarray) -> list[list[int]]:
+    """Return the distinct rows of a uint8 array (N, K); for few columns this is much faster than `np.unique`."""
     if len(rows) == 1:
         return rows.tolist()
     found = np.zeros((256,) * rows.shape[1], bool)
@@ -44,17 +44,17 @@ def hex_colour(colour: Colour) -> str:
 
 
 def add_drawings(layout: Layout, records: np.ndarray, known: Drawings) -> Drawings:
-    """Add the drawings that states need to `known`, and return those that it did not have.
+    """Add the drawings of the given states to `known`, and return only the new drawings.
 
     Args:
         layout: the layout.
         records: state records uint8 (N, S).
-        known: drawings so far.
+        known: drawings made so far; extended in place.
     """
     new: Drawings = {}
     for part in state_parts(layout):
         of_part = known.setdefault(part.name, {})
-        for values in _distinct(records[:, list(part.columns)]):
+        for values in _distinct_rows(records[:, list(part.columns)]):
             key = ",".join(map(str, values))
             if key not in of_part:
                 canvas = Canvas()
@@ -64,19 +64,19 @@ def add_drawings(layout: Layout, records: np.ndarray, known: Drawings) -> Drawin
 
 
 def layout_drawings(layout: Layout, records: np.ndarray) -> dict[str, Any]:
-    """Return a JSON object with the shapes that a page needs to draw these states of a layout.
+    """Return a JSON object with the shapes that a web page needs to draw the given states of a layout.
 
     Args:
         layout: the layout.
         records: state records uint8 (N, S).
 
     Returns:
-        width, height: of the map, in cells; footer: height of the strip below it; paper: colour of the background.
-        record_size: S.
+        width, height: size of the map in cells; footer: height of the strip below the map; paper: background colour.
+        record_size: S, the number of bytes of a state record.
         view: name of the part that outlines the cells that the ego observes.
         parts: [name, moves, anchor, columns] of each part, in drawing order, see `StatePart`.
-        drawings: name of a part -> values of its columns, joined by commas -> shapes relative to the centre of the
-            cell, see `Canvas`, with colours such as "#2b303a"; only for values in the records.
+        drawings: name of a part -> the part's state values, joined by commas -> shapes, see `Canvas`, with coordinates
+            relative to the centre of the cell; only for values that occur in the records.
     """
     drawings: Drawings = {}
     add_drawings(layout, records, drawings)

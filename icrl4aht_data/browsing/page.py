@@ -32,7 +32,7 @@ from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_histories
 
 PAGE_START = b'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>ICRL4AHT histories</title>'
-"""First bytes of a page, which identify a file that may be replaced."""
+"""First bytes of a page; an output file that starts with them may be replaced."""
 
 PAGE_HISTORIES = 30
 """Default number of histories on a page."""
@@ -50,15 +50,15 @@ _INDEX_FIELDS = ("history_id", "task_id", "layout", "source", "split", "track", 
 
 
 class EmbeddedHistory(NamedTuple):
-    """One history in the form that a page embeds.
+    """One learning history in the form that an HTML page embeds.
 
     Attributes:
-        facts: JSON object: properties to choose a history by; `returns` of all episodes; `shown`, the numbers of the
-            episodes with frames, from 0; `frames` per episode, one more than its steps; `columns`, the names of the
-            columns after those of the state record.
+        facts: JSON object with index fields of the history; `returns`, the return of every episode; `shown`, the
+            numbers (from 0) of the episodes that can be replayed; `frames`, the number of frames of each shown episode,
+            one more than its steps; `columns`, the names of the columns of `data` after the state record.
         records: uint8 (F, S), the state records of all frames.
-        data: columns of F bytes each, compressed by zlib: those of the state record, then `columns`. Rewards are int8.
-            The last frame of an episode has action `NO_ACTION` and reward 0.
+        data: columns of F bytes each, compressed by zlib: the bytes of the state record, then `columns`. Rewards are
+            int8. The last frame of an episode has action `NO_ACTION` and reward 0.
     """
 
     facts: dict[str, Any]
@@ -67,9 +67,9 @@ class EmbeddedHistory(NamedTuple):
 
 
 def spread_histories(dataset: Dataset, count: int) -> list[int]:
-    """Return the ids of at most `count` histories, ascending, spread over layouts, kinds of teammates and sources.
+    """Return at most `count` history ids in ascending order, spread over layouts, kinds of teammates and sources.
 
-    The generated layouts of a family count as one.
+    The generated layouts of a family count as one layout.
     """
     groups: dict[str, dict[str, dict[tuple[str, ...], list[int]]]] = {}
     names = ("layout", "source", "teammate_family", "teammate_kind")
@@ -77,12 +77,12 @@ def spread_histories(dataset: Dataset, count: int) -> list[int]:
     for number, layout, source, *kind in zip(dataset.ids.tolist(), *columns, strict=True):
         of_source = groups.setdefault(layout_title(layout), {}).setdefault(source, {})
         of_source.setdefault(tuple(kind), []).append(number)
-    layouts = (_alternating(_alternating(kinds.values()) for kinds in layout.values()) for layout in groups.values())
-    return sorted(_alternating(layouts)[:count])
+    layouts = (_interleave(_interleave(kinds.values()) for kinds in layout.values()) for layout in groups.values())
+    return sorted(_interleave(layouts)[:count])
 
 
-def _alternating(lists: Iterable[list[int]]) -> list[int]:
-    """Return the first elements of all lists, then the second ones, and so on."""
+def _interleave(lists: Iterable[list[int]]) -> list[int]:
+    """Interleave lists: return the first elements of all lists, then the second elements, and so on."""
     return [number for turn in zip_longest(*lists) for number in turn if number is not None]
 
 
@@ -94,7 +94,7 @@ def spread_episodes(episodes: int, most: int | None) -> np.ndarray:
 
 
 def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
-    """Return a history for embedding, with frames of all its episodes or at most `most` of them.
+    """Return a history in the form that a page embeds, with frames of at most `most` episodes; None for all.
 
     Raises:
         NotStoredError: if the release has no state records.
@@ -102,23 +102,23 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     """
     entry, rewards, dones = history.entry, history.read("rewards"), history.read("dones")
     ends = np.flatnonzero(dones) + 1
-    _check(history, len(ends) == entry.episodes, f"{entry.episodes} episodes", f"{len(ends)} ends of episodes")
+    _require(history, len(ends) == entry.episodes, f"{entry.episodes} episodes", f"{len(ends)} ends of episodes")
     starts, shown = np.concatenate([[0], ends[:-1]]), spread_episodes(len(ends), most)
     steps = np.concatenate(
         [np.arange(int(starts[e]), int(ends[e]) + 1) for e in shown]
-    )  # no step follows the last frame of an episode
+    )  # an episode has one frame more than steps: the state after its last step
     last = np.cumsum(ends[shown] + 1 - starts[shown]) - 1
     steps[last] -= 1
 
     records = history.read("state")[steps]
     records[last] = history.read("episode_end_state")[shown]
     wrong = faults(get_layout(entry.layout), records)
-    _check(history, not wrong, "possible states", "; ".join(wrong))
+    _require(history, not wrong, "possible states", "; ".join(wrong))
     values = {"rewards": rewards[steps].astype(np.int8).view(np.uint8)}
     values["rewards"][last] = 0
     for name in _embedded_actions(entry):
         values[name] = history.read(name)[steps].astype(np.uint8)
-        _check(history, int(values[name].max()) < len(ACTIONS), f"{name} below {len(ACTIONS)}", values[name].max())
+        _require(history, int(values[name].max()) < len(ACTIONS), f"{name} below {len(ACTIONS)}", values[name].max())
         values[name][last] = NO_ACTION
     # Column-major order compresses best, since columns change little over time.
     columns = np.vstack([records.T, *values.values()])
@@ -133,7 +133,7 @@ def embed_history(history: History, most: int | None = None) -> EmbeddedHistory:
     return EmbeddedHistory(facts, records, zlib.compress(np.ascontiguousarray(columns).tobytes(), 9))
 
 
-def _check(history: History, fulfilled: bool, expected: str, found: object) -> None:
+def _require(history: History, fulfilled: bool, expected: str, found: object) -> None:
     if not fulfilled:
         raise ReleaseError(
             f"{history.entry.shard}: history {history.entry.history_id}: expected {expected}, found {found}; "
@@ -142,7 +142,7 @@ def _check(history: History, fulfilled: bool, expected: str, found: object) -> N
 
 
 def _embedded_actions(entry: Entry) -> list[str]:
-    """Return the action fields to show, without `oracle_actions` if they equal `expert_actions`."""
+    """Return the names of the action fields to show, without `oracle_actions` if they equal `expert_actions`."""
     names = [name for name in ACTION_FIELDS if entry.has(FIELDS[name])]
     twice = entry.source == "noise" and "expert_actions" in names
     return [name for name in names if not (twice and name == "oracle_actions")]
@@ -150,12 +150,12 @@ def _embedded_actions(entry: Entry) -> list[str]:
 
 @dataclass(frozen=True)
 class BrowserPage:
-    """HTML page with histories.
+    """An HTML page that shows learning histories.
 
     Attributes:
-        html: the complete file, UTF-8.
+        html: content of the HTML file, in UTF-8.
         histories: number of histories on the page.
-        episodes: number of episodes of these histories.
+        episodes: number of episodes of the histories on the page.
         shown_episodes: number of episodes that the page can replay.
     """
 
@@ -171,13 +171,13 @@ def make_browser_page(
     megabytes: float = PAGE_MEGABYTES,
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> BrowserPage:
-    """Return a page with all histories of a selection; see `spread_histories` for a smaller one.
+    """Return an HTML page with all histories of a selection; `spread_histories` can choose fewer histories.
 
-    Embeds all episodes if the page stays below `megabytes`; else evenly spaced episodes of each history, including the
-    first and the last. The page says which episodes can be watched.
+    The page embeds all episodes if it stays below `megabytes`, otherwise evenly spaced episodes of each history,
+    including the first and the last. The page says which episodes can be watched.
 
     Args:
-        dataset: the histories.
+        dataset: the selection of histories to show.
         megabytes: maximum size of the page, in millions of bytes.
         advance: called with the number of histories read and the total number to read.
 
@@ -212,7 +212,7 @@ def make_browser_page(
 
 
 def save_browser_page(page: BrowserPage, path: Path) -> None:
-    """Write a page atomically."""
+    """Write an HTML page to a file atomically."""
     with atomic_write(path) as partial:
         partial.write_bytes(page.html)
 
@@ -229,21 +229,21 @@ def _render(dataset: Dataset, embedded: Sequence[EmbeddedHistory]) -> bytes:
             layout: layout_drawings(get_layout(layout), np.concatenate([one.records for one in own]))
             for layout, own in by_layout.items()
         },
-        "histories": [one.facts | {"teammate": _teammate(dataset, one.facts["history_id"])} for one in embedded],
+        "histories": [one.facts | {"teammate": _teammate_label(dataset, one.facts["history_id"])} for one in embedded],
     }
     packed = zlib.compress(json.dumps(index, separators=(",", ":")).encode(), 9)
-    data = {"index": _base64(packed), "histories": [_base64(one.data) for one in embedded]}
+    data = {"index": _to_base64(packed), "histories": [_to_base64(one.data) for one in embedded]}
     text = Template(page_source("page.html")).substitute(
         release=escape(name),
         style=page_style(),
         script="\n".join(map(page_source, ("state.js", "curve.js", "page.js"))),
-        data=json.dumps(data),  # base64 cannot contain a closing tag
+        data=json.dumps(data),  # safe in a <script> element: base64 cannot contain a closing tag
     )
     return text.encode()
 
 
-def _teammate(dataset: Dataset, history_id: int) -> str:
-    """Return the family and kind of a history's teammate, with its number if the release has tasks."""
+def _teammate_label(dataset: Dataset, history_id: int) -> str:
+    """Return the family and kind of a history's teammate as text, with the teammate's number if tasks are known."""
     entry = dataset.index.entry(history_id)
     name = f"{entry.teammate_family}/{entry.teammate_kind}"
     return f"{name} t{dataset.recover_teammate(history_id)['theta_id']}" if dataset.has_tasks else name
@@ -255,7 +255,7 @@ def _release_name(dataset: Dataset) -> str:
 
 
 def page_style() -> str:
-    """Return the style sheet of a page, with the colours of the agents as variables."""
+    """Return the CSS style sheet of a page, with the colours of the agents as variables."""
     colours = {"ego": AGENT_COLOURS[EGO], "teammate": AGENT_COLOURS[TEAMMATE]}
     style = "".join(f"--{agent}: {hex_colour(colour)}; " for agent, colour in colours.items())
     return f":root {{ {style}}}\n{page_source('page.css')}"
@@ -266,5 +266,5 @@ def page_source(name: str) -> str:
     return (_FILES / name).read_text(encoding="utf-8")
 
 
-def _base64(content: bytes) -> str:
+def _to_base64(content: bytes) -> str:
     return base64.b64encode(content).decode()

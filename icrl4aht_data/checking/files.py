@@ -15,31 +15,32 @@ from icrl4aht_data.format.index import Index
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.provenance import ProvenanceByTask
 from icrl4aht_data.format.schema import EXPERTS, INFO, MANIFEST, PROVENANCE, TEAMMATES
-from icrl4aht_data.utils.files import LARGEST, file_hash, files_below, plain_size, resolve_inside
+from icrl4aht_data.utils.files import LARGEST, file_hash, files_below, regular_file_size, resolve_inside
 
 _HUB_FILES = (".gitattributes", ".cache/huggingface/")
-"""Files that the Hub and its client add to a repository's."""
+"""Files that the Hugging Face Hub and its client add to a repository."""
 
-_META = re.compile(r"meta/[^/]+")  # checked at every level, because `load_icrl4aht` checks these files, too
+_META = re.compile(r"meta/[^/]+")  # hashed at every level, because `load_icrl4aht` checks these files, too
 
 
 def check_files(
     origin: ReleaseLocation, listed: Mapping[str, str], chosen: set[str], report: Report, advance: NamedProgress
 ) -> None:
-    """Check that the chosen files have the manifest's hashes, and that there are no unlisted files.
+    """Check that the chosen files have the hashes in the manifest, and that the manifest lists all files.
 
     Sizes are compared first, because hashing a sparse file of a terabyte would take hours.
 
     Args:
         origin: the release.
-        listed: the manifest, file -> SHA-256.
+        listed: file -> SHA-256, as in the manifest.
         chosen: the files to check.
         report: receives the problems.
-        advance: progress.
+        advance: called with the name of a stage, the number of files checked, and their total.
     """
     root, quick = origin.folder, report.level == "quick"
     expected, present = listed.keys() & chosen, set(files_below(root))
-    if not quick or not isinstance(origin, Remote):  # a quick check does not download files
+    # A quick check downloads nothing, so a remote release may have files that are not on this machine.
+    if not quick or not isinstance(origin, Remote):
         for name in sorted(expected - present):
             report.add(name, "listed in the manifest, but missing")
     for name in sorted(present - listed.keys() - {MANIFEST}):
@@ -67,12 +68,12 @@ def check_files(
 
 
 def _recorded_sizes(root: Path, listed: Mapping[str, str]) -> dict[str, int]:
-    """Return the sizes of shards in meta/info.json; empty if the file does not match the manifest."""
+    """Return shard -> size as in meta/info.json; an empty dict if that file does not match the manifest."""
     try:
         path = resolve_inside(root, INFO)
-        plain_size(path, LARGEST)
+        regular_file_size(path, LARGEST)
         return read_info(root).shards if file_hash(path) == listed.get(INFO) else {}
-    except (Icrl4ahtError, OSError):  # reported elsewhere
+    except (Icrl4ahtError, OSError):  # other checks report errors of meta/info.json
         return {}
 
 
@@ -88,10 +89,10 @@ def check_references(
     A checkpoint's folder is named by the SHA-256 of its weights. Checkpoints are optional.
 
     Args:
-        listed: the manifest, file -> SHA-256.
+        listed: file -> SHA-256, as in the manifest.
         index: the release's index.
-        played: its tasks, each with every teammate that plays in it.
-        provenance: task id -> how its histories were made; None if unknown.
+        played: the release's tasks, with a copy of the task for each further teammate that plays in it.
+        provenance: task id -> record of how the task's histories were made; None if unknown.
         report: receives the problems.
     """
     shards = index.values("shard")
@@ -116,13 +117,13 @@ def check_references(
 
 
 def check_remote_sizes(remote: Remote, index: Index, shards: list[str], report: Report) -> None:
-    """Check that shards that are not on this machine have the sizes that meta/info.json records."""
+    """Check that shards that are not downloaded have the sizes recorded in meta/info.json."""
     try:
         sizes = remote.sizes(name for name in shards if not remote.path(name).exists())
     except Icrl4ahtError as error:
         report.add("data", str(error))
         return
     for name, found in sizes.items():
-        expected = index.info.shards.get(name, found)  # `check_index` compares the names
+        expected = index.info.shards.get(name, found)  # `check_index` reports unknown names
         if found != expected:
             report.add(name, f"expected {expected:,} bytes, found {found:,}")

@@ -1,4 +1,4 @@
-"""Checks of a release's index against tasks, meta/info.json and names of shards, and of meta/provenance.json."""
+"""Checks of a release's index against its tasks, totals and shard names, and checks of meta/provenance.json."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from icrl4aht_data.utils.files import json_hash, parse_json, read_text, resolve_
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun
 
-_ROUNDING = 1e-3  # tolerance of the mean returns that a stream filter records
-_NAMED = 100  # maximum number of missing shards to report per set
+_ROUNDING = 1e-3  # tolerance for the mean returns that a stream filter records
+_NAMED = 100  # maximum number of missing shards to report for one set of numbered shards
 _OF_A_TASK = (
     *("track", "split", "layout", "teammate_family", "teammate_kind", "seed", "source"),
     *("expert_return", "expert_return_sampled", "expert_step", "label_view"),
@@ -37,13 +37,13 @@ _described = attrgetter("track", "split", "teammate_kind", "teammate_family", "s
 def check_index(
     index: Index, tasks: list[Task], played: Iterable[Task], provenance: ProvenanceByTask | None, report: Report
 ) -> None:
-    """Check that index, tasks, totals and shard names agree.
+    """Check that the index, the tasks, the totals and the names of shards agree.
 
     Args:
         index: the release's index.
-        tasks: its tasks.
-        played: the tasks, each with every teammate that plays in it.
-        provenance: task id -> how its histories were made; None if they cannot be read, which `report` says already.
+        tasks: the release's tasks.
+        played: the release's tasks, with a copy of the task for each further teammate that plays in it.
+        provenance: task id -> record of how the task's histories were made; None if unreadable.
         report: receives the problems.
     """
     _check_tasks(index, tasks, report)
@@ -71,7 +71,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
         where, stream = f"history {entry.history_id}:", (entry.task_id, entry.learner, entry.env_idx)
         task, other = by_id.get(entry.task_id), first.setdefault(entry.task_id, entry)
         if unlike := [name for name in _OF_A_TASK if getattr(entry, name) != getattr(other, name)]:
-            report.add(HISTORIES, f"histories {other.history_id} and {entry.history_id}, of one task: unlike {unlike}")
+            report.add(HISTORIES, f"histories {other.history_id} and {entry.history_id} of one task differ in {unlike}")
         firsts = [episode for episode, _ in entry.teammate_of_episode or ((0, ""),)]
         if firsts[0] != 0 or firsts != sorted(set(firsts)) or firsts[-1] >= entry.episodes:
             expected = f"expected ascending episodes from 0 to {entry.episodes - 1} at most"
@@ -96,7 +96,7 @@ def _check_tasks(index: Index, tasks: list[Task], report: Report) -> None:
 def _check_disjoint_teammates(tasks: Iterable[Task], report: Report) -> None:
     """Check that training and test tasks of a track have no common teammates."""
     seen: dict[tuple[str, str, str], str] = {}
-    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # train before test
+    for task in sorted(tasks, key=lambda task: task.split, reverse=True):  # "train" comes before "test"
         key = (task.track, task.layout.name, json.dumps(task.teammate, sort_keys=True))
         if task.split == "train":
             seen[key] = task.task_id
@@ -128,8 +128,8 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
 
     Args:
         index: the release's index.
-        tasks: its tasks; none in a release that knows them by name only.
-        provenance: task id -> how its histories were made.
+        tasks: the release's tasks; empty if the release has only the names of its tasks.
+        provenance: task id -> record of how the task's histories were made.
         report: receives the problems.
     """
     members = grouped(index.entries, lambda entry: entry.task_id)
@@ -140,7 +140,7 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
         if task_id not in provenance:
             report.add(PROVENANCE, f"task {task_id!r}: missing")
             continue
-        for fault in _faults(provenance[task_id], entries, seeds.get(task_id)):
+        for fault in _contradictions(provenance[task_id], entries, seeds.get(task_id)):
             report.add(PROVENANCE, f"task {task_id!r}: {fault}")
         for entry in entries:
             for name, expected in provenance[task_id].entry_fields(entry.episodes).items():
@@ -149,8 +149,8 @@ def check_provenance(index: Index, tasks: Sequence[Task], provenance: Mapping[st
                     report.add(HISTORIES, f"{where} {value}, but {PROVENANCE} has {expected} of its task")
 
 
-def _faults(made: Provenance, entries: Sequence[Entry], seed: int | None) -> Iterator[str]:
-    """Yield contradictions within a provenance, and to the index and the task's seed."""
+def _contradictions(made: Provenance, entries: Sequence[Entry], seed: int | None) -> Iterator[str]:
+    """Yield each contradiction of a provenance to itself, to the index or to the task's seed."""
     first, count = entries[0], len(entries)
     if first.source in SCRIPTED_SOURCES and made.expert and made.expert.policy_sha256:
         labeller = made.expert.policy_sha256
@@ -163,7 +163,7 @@ def _faults(made: Provenance, entries: Sequence[Entry], seed: int | None) -> Ite
     episodes = noise.get("episodes")
     stream, learner = (max(entries, key=attrgetter(name)) for name in ("env_idx", "learner"))
     other = next((entry for entry in entries if entry.episodes != episodes), first)
-    # Name, value, relation, bound, and the bound in words; a value or bound that is None is unknown.
+    # Each check has a name, a value, a relation, a bound and the bound in words; None means unknown.
     checks: list[tuple[str, Any, Callable[[Any, Any], bool], Any, str]] = [
         ("seed", made.seed, eq, seed, "the task's {}"),
         ("ego_hash", made.ego_hash, eq, made.ego and json_hash(made.ego), "{} of `ego`"),

@@ -22,10 +22,10 @@ _LONG = 2000  # maximum characters of a finding
 
 @dataclass(frozen=True)
 class Finding:
-    """One problem of a release.
+    """One problem found in a release.
 
     Args:
-        file: path below the release's root.
+        file: path of the file in the release's folder.
         problem: description of the problem.
     """
 
@@ -38,7 +38,7 @@ class Report:
     """Result of `verify_release`.
 
     Args:
-        root: the release, folder or address.
+        root: folder or address of the release.
         level: depth of the verification.
         findings: problems, in the order in which they were found.
         notes: remarks that are not problems, such as checks that were impossible and shards that were not selected.
@@ -46,7 +46,7 @@ class Report:
         files: number of files checked.
         chunks: number of chunks decoded.
         histories: number of histories checked.
-        transitions: number of steps of these histories.
+        transitions: number of steps of the checked histories.
     """
 
     root: str
@@ -72,15 +72,15 @@ class Report:
 
     @property
     def files_at_fault(self) -> set[str]:
-        """Paths of the files with a problem."""
+        """Paths of the files in which problems were found."""
         return {finding.file for finding in self.findings}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the report as a JSON object: its fields, `ok`, and booleans `deep` and `quick` for the level."""
+        """Return the report as a JSON object: its fields, `ok`, and `deep` and `quick`, booleans for the level."""
         return {"ok": self.ok, **asdict(self), "deep": self.level == "deep", "quick": self.level == "quick"}
 
     def add(self, file: str, problem: str) -> None:
-        """Add a finding; at 100,000 findings, add a note that there are more and drop the rest."""
+        """Add a finding; after 100,000 findings, add one that says that more were omitted, and drop the rest."""
         if len(self.findings) < _FINDINGS:
             self.findings.append(Finding(_printable(file), _printable(problem)))
         elif len(self.findings) == _FINDINGS:
@@ -88,13 +88,13 @@ class Report:
 
 
 def _printable(text: str) -> str:
-    """Return a text of limited length with control characters escaped, since terminals would interpret them."""
+    """Shorten a text and escape its control characters, which a terminal would interpret."""
     text = text if len(text) <= _LONG else f"{text[:_LONG]}..."
     return text if text.isprintable() else text.encode("unicode_escape").decode()
 
 
 def verdict_in_words(report: Report) -> str:
-    """Return one line with the verdict and the amounts of what was checked."""
+    """Return one line with the verdict and the numbers of files, chunks, histories and transitions checked."""
     verdict = "valid" if report.ok else counted_noun(len(report.findings), "problem")
     if report.level == "quick":
         return f"{verdict}; checked names, sizes and the index of {counted_noun(report.files, 'file')}, no contents"

@@ -1,4 +1,4 @@
-"""Checks of shards: HDF5 structure, and of each history checksums, ranges, episodes, index values and the rules."""
+"""Checks of shards: HDF5 structure, checksums of chunks, and each history's values, index entry and replay."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from icrl4aht_data.reading.shard import Shard
 from icrl4aht_data.utils.system import free_memory
 from icrl4aht_data.writing.published_views import empty_views
 
-_COPIES = 4  # memory of checking a history, in multiples of the size of its arrays
+_COPIES = 4  # memory that checking a history takes, as a multiple of the size of its arrays
 
 
 def check_chunks(shard: Shard, report: Report) -> set[int]:
@@ -56,21 +56,21 @@ def check_chunks(shard: Shard, report: Report) -> set[int]:
 def check_history(
     history: History, layout: Layout, info: ReleaseInfo, contents: dict[tuple[str, bytes], int], report: Report
 ) -> None:
-    """Check one history whose chunks are valid.
+    """Check the content of one history; the chunks must be valid.
 
     Args:
         history: the history.
-        layout: its layout, with the recipes of its task.
+        layout: the history's layout, with the recipes of the task.
         info: the release's info.
-        contents: (task id, hash of the ego's observations and actions) -> history id, of the histories checked so far;
-            receives this one.
+        contents: (task id, hash of the history's records and actions) -> history id, for the histories checked so far;
+            this history is added.
         report: receives the problems.
     """
     entry = history.entry
     try:
         step_bytes = sum(field.element(layout, info.kind).itemsize for field in entry.stored_fields(info.kind))
         if (size := _COPIES * entry.T * step_bytes) > free_memory():
-            raise OptionError(f"takes {size / 1e9:.3g} GB of memory, more than is free")
+            raise OptionError(f"checking this history takes {size / 1e9:.3g} GB of memory, more than is free")
         for fault in _history_faults(history, layout, info.environment.kept_steps, deep=report.level == "deep"):
             report.add(entry.shard, f"history {entry.history_id}: {fault}")
         arrays = (history.read(name) for name in (record_field(info.kind).name, "actions"))
@@ -115,12 +115,12 @@ def _history_faults(history: History, layout: Layout, kept_steps: int, deep: boo
             yield f"{name}: the index says {getattr(entry, name)}, the rewards give {value}"
     if deep and not has_states:
         yield from observation_faults(layout, history)
-    elif deep and possible:  # the rules accept only possible states
+    elif deep and possible:  # the rules are defined only for possible states
         yield from replay_faults(layout, history, dones, rewards)
 
 
 def observation_faults(layout: Layout, history: History) -> Iterator[str]:
-    """Yield a problem if an observation does not match the layout's fixed cells; needs no state records."""
+    """Yield a problem if an observation contradicts the fixed cells of the layout; no state records are needed."""
     fixed = fixed_channels(layout)
     views = {view.tobytes() for view in empty_views(layout)[..., fixed]}
     wrong = [t for t, seen in enumerate(history.read("obs")[..., fixed]) if seen.tobytes() not in views]
@@ -129,12 +129,12 @@ def observation_faults(layout: Layout, history: History) -> Iterator[str]:
 
 
 def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: np.ndarray) -> Iterator[str]:
-    """Replay every step of a history with state records, and yield contradictions to the rules.
+    """Replay every step of a history from its state records, and describe where the history contradicts the rules.
 
     Args:
         layout: the history's layout.
-        history: the history, with possible states only.
-        dones: bool (T,), last steps of episodes.
+        history: the history; all of its states must be possible.
+        dones: bool (T,), True at the last step of each episode.
         rewards: (T,), the recorded rewards.
     """
     states, ends = history.read("state"), history.read("episode_end_state")
@@ -146,7 +146,7 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
     following[dones] = ends
     recipe = columns(layout).recipe
     actions = np.stack([history.read("actions"), history.read("teammate_actions")], axis=-1)
-    # New recipes are random, so the replay takes the recorded ones.
+    # New recipes are random, so the replay uses the recorded recipes.
     played = step(layout, states, np.clip(actions, 0, len(ACTIONS) - 1), following[:, recipe])
     wrong = np.flatnonzero((played.state != following).any(axis=-1))
     if len(wrong):
@@ -168,7 +168,7 @@ def replay_faults(layout: Layout, history: History, dones: np.ndarray, rewards: 
 
 
 def check_structure(shard: Shard, values: bool = False) -> list[str]:
-    """Return faults in the bytes between the chunks, and differences between what libhdf5 and `Shard` read.
+    """Return faults in the bytes between chunks, and differences between libhdf5 and `Shard` in reading the file.
 
     Args:
         shard: the shard.
@@ -181,7 +181,7 @@ def check_structure(shard: Shard, values: bool = False) -> list[str]:
     faults, between = [], np.flatnonzero(shard.table["rows"] == 0).tolist()
     if len(ordered) > most or [0, *stops] != [*starts, size]:
         faults, between = [f"the chunk table does not cover the file's {size} bytes, each once"], []
-        if size > 2 * int(ordered["size"].sum(dtype=np.int64)) + 2**20:  # libhdf5 must not open a sparse terabyte
+        if size > 2 * int(ordered["size"].sum(dtype=np.int64)) + 2**20:  # libhdf5 must not open a huge sparse file
             return faults
     for row in between:
         try:
@@ -246,7 +246,7 @@ def _value_faults(shard: Shard, file: h5py.File) -> Iterator[str]:
             try:
                 ours = shard.read(entry.history_id, field, 0, entry.rows(field))
             except ShardCorruptError:
-                continue  # already reported, and unsafe to inflate with libhdf5
+                continue  # the damage is already reported, and libhdf5 must not inflate the chunk
             theirs = dataset[()] if entry.h5_row is None else dataset[entry.h5_row]
             if not np.array_equal(theirs, ours):
                 yield f"history {entry.history_id}: HDF5 reads other values of {field.name} than we do"

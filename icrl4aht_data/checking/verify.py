@@ -37,7 +37,7 @@ _NOT_RECOMPUTED = {
     "swaps": "changes of teammates, of {} tasks: taken from meta/provenance.json, not compared with their actions",
     "noise": "noise schedules, of {} tasks: taken from meta/provenance.json, not compared with the actions",
 }
-"""Field of a provenance that verification cannot recompute -> note in the report."""
+"""Provenance field whose values verification cannot recompute -> note in the report."""
 
 
 def verify_release(
@@ -52,19 +52,19 @@ def verify_release(
     Args:
         root: a release folder, or an address as in `load_icrl4aht`; the bundled mini release by default. Files of a
             remote release are downloaded before they are checked, except at level "quick".
-        level: "quick" checks names, sizes and the index, no contents. "full" checks every byte, count and range. "deep"
-            also checks that observations are what the states show, that every recorded step follows from the previous
-            one under the rules, with the recorded reward, and that every episode starts as the environment starts.
-            Without state records it checks only that every observation shows the layout, and adds a note to the report.
+        level: "quick" checks names, sizes and the index, but reads no arrays. "full" checks every byte, count and
+            range. "deep" also checks that observations match the states, that every recorded state and reward follows
+            from the previous step under the rules, and that every episode starts in a possible initial state. Without
+            state records, "deep" only checks that every observation shows the layout, and adds a note to the report.
         advance: called with the name of a stage, the number of items done, and their total.
-        wanted: check only the shards of these histories; see `load_icrl4aht`. For a folder with a part of a release,
-            give the filters that it was downloaded with.
+        wanted: filters on index fields as in `load_icrl4aht`; only shards with matching histories are checked. For a
+            partially downloaded release, give the filters of the download.
 
     Raises:
         UnknownNameError: if `level` or a name in `wanted` does not exist.
         EmptySelectionError: if no history matches `wanted`.
-        OptionError: for a root that is neither a path nor an address, or if the user name or password in an address has
-            characters that are not percent-encoded.
+        OptionError: if `root` is neither a path nor an address, or an address has a user name or password that is not
+            percent-encoded.
     """
     check_choice("level", level, get_args(Level))
     root = MINI if root is None else root
@@ -84,7 +84,7 @@ def verify_release(
         _verify(origin, report, advance, wanted)
     except (Icrl4ahtError, OSError) as error:
         if isinstance(error, (EmptySelectionError, UnknownNameError)) and any(wanted.values()):
-            raise  # wrong arguments are raised, not reported
+            raise  # wrong arguments are errors of the caller, not of the release
         report.add("meta", str(error))
     return report
 
@@ -100,7 +100,7 @@ def _verify(origin: ReleaseLocation, report: Report, advance: NamedProgress, wan
         chosen = chosen_files(origin, **wanted)
     except (EmptySelectionError, UnknownNameError):
         raise
-    except Icrl4ahtError as error:  # reported after problems of files, which may be the cause
+    except Icrl4ahtError as error:  # reported later, after problems of files that may be the cause
         unreadable = error
     if report.level != "quick":
         origin.fetch(sorted(chosen))
@@ -148,8 +148,8 @@ def _unchecked_values(index: Index, provenance: Mapping[str, Provenance]) -> Ite
 def _check_shards(
     index: Index, layouts: Mapping[str, Layout], shards: list[str], report: Report, advance: NamedProgress
 ) -> None:
-    """Check shards and their histories; `layouts` are those of the tasks by id, with the tasks' recipes."""
-    local = ReleaseLocation(index.root)  # fetches nothing, since files that could not be fetched are already reported
+    """Check shards and their histories; `layouts` maps task ids to layouts with the tasks' recipes."""
+    local = ReleaseLocation(index.root)  # never downloads: files that could not be fetched are already reported
     members = grouped(index.entries, lambda entry: entry.shard)
     total = sum(len(members[name]) for name in shards)
     for name in shards:

@@ -1,7 +1,7 @@
-"""Entry point of `icrl4aht-data`, which imports a command only when it runs and turns errors into exit codes.
+"""Entry point of `icrl4aht-data`: imports a command only when it runs, and converts errors to exit codes.
 
-Exit codes: 0 success; 1 an error, a problem found, or a closed output pipe; 2 a misused command; 128 + the signal's
-number after a training that a signal stopped and that was saved.
+Exit codes: 0 success; 1 an error, a problem found, or a closed output pipe; 2 a misused command; 128 plus the signal's
+number after a signal stopped a training, which was saved.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ ROOT is a release: its folder, or its address hf://datasets/<org>/<repo>[@<revis
 default is the mini release that is part of the package.
 
 Exit codes: 0 success, 1 a failure or a problem found, 2 a misused command, 130 or 143 training stopped by SIGINT or
-SIGTERM, and saved. Commands that train or generate resume what was stopped. `icrl4aht-data doctor` prints the folders
+SIGTERM, and saved. Commands that train or generate resume an interrupted run. `icrl4aht-data doctor` prints the folders
 and environment variables in use.
 
 \b
@@ -65,16 +65,16 @@ def all_verbs() -> dict[str, Verb]:
     for package in plugins.names:
         for verb in plugins.load(package, tuple):
             if not isinstance(verb, Verb) or verb.name in verbs:
-                raise plugins.error(package, f"expected Verbs with new names, found {verb!r:.100}")
+                raise plugins.error(package, f"expected only Verbs with new names, found {verb!r:.100}")
             verbs[verb.name] = verb
     return verbs
 
 
 class VerbGroup(click.Group):
-    """Command group whose help lists commands under headings, without importing them.
+    """Command group with a help that lists commands under headings, without importing them.
 
     Args:
-        prefix: words before the commands of this group and a space, such as "research "; empty for the program.
+        prefix: start of the names of the group's commands, such as "research "; empty for the program.
     """
 
     def __init__(self, *args: Any, prefix: str = "", **options: Any) -> None:
@@ -109,7 +109,7 @@ class VerbGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def _verbs(self) -> dict[str, Verb]:
-        """Return last word -> `Verb`, for the commands of a group in the order of their headings."""
+        """Return the last word of a name -> `Verb`, for this group's commands in the order of their headings."""
         found = {
             name.removeprefix(self._prefix): verb
             for name, verb in all_verbs().items()
@@ -124,7 +124,7 @@ cli = VerbGroup(
     help="Learning histories of the ICRL4AHT benchmark: read, train on and rebuild them.",
     epilog=_EPILOG,
 )
-"""The program."""
+"""Click group with all commands of `icrl4aht-data`."""
 click.version_option(package_name="icrl4aht-data", message="%(package)s %(version)s")(cli)
 
 
@@ -134,12 +134,12 @@ def main() -> None:
 
 
 def run(command: click.Command) -> None:
-    """Run a command line; errors about its input become one line and an exit code.
+    """Run a command; expected errors are printed on one line and become an exit code.
 
     If the reader of a pipe exits (`| head`), the command stops quietly with exit code 1. Output to a stream that is
     closed from the start (`>&-`) is dropped.
     """
-    for name in ("stdout", "stderr"):  # open closed streams on the null device, so that no file gets their number
+    for name in ("stdout", "stderr"):  # a closed stream becomes the null device, so no file gets its number
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     try:
@@ -147,28 +147,28 @@ def run(command: click.Command) -> None:
     except BrokenPipeError:
         sys.exit(1)
     except UnknownNameError as error:
-        _stop(str(error), 2)
+        _exit_with_error(str(error), 2)
     except Icrl4ahtError as error:
-        _stop(str(error), 1)
+        _exit_with_error(str(error), 1)
     except OSError as error:
-        _stop(_in_words(error), 1)
+        _exit_with_error(_os_error_message(error), 1)
     except ModuleNotFoundError as error:
         if (message := missing_library(error.name or "")) is None:
             raise
-        _stop(message, 1)
+        _exit_with_error(message, 1)
     except SystemExit as stop:
         if message := getattr(stop, "message", None):  # a training was stopped by a signal and saved
             click.echo(message, err=True)
         raise
 
 
-def _stop(message: str, code: int) -> None:
+def _exit_with_error(message: str, code: int) -> None:
     click.echo(f"error: {message}", err=True)
     sys.exit(code)
 
 
-def _in_words(error: OSError) -> str:
-    """Return the message for an OSError, with the user's file name instead of that of a temporary file or lock."""
+def _os_error_message(error: OSError) -> str:
+    """Return the message for an OSError; the name of a temporary file or lock is replaced by the user's file name."""
     if error.errno is None or error.filename is None:
         return str(error)
     path = Path(final_name(os.fsdecode(error.filename)))

@@ -5,7 +5,7 @@
     def run(train: dict[str, Any]) -> None:
         options = replace_options(TrainOptions(), train)
 
-Only values from the command line are passed on, so a command may use other defaults than the class.
+Only values given on the command line are passed to the command, whose defaults may differ from the class's.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def topic(heading: str, *options: Callable[[Any], Any]) -> Callable[[Command], C
 
 
 class OptionValue(click.ParamType):
-    """Type of an option whose values have the type and bounds of an annotation.
+    """Click type of an option, with the type and bounds that an annotation gives.
 
     Args:
         hint: the annotation, such as `Annotated[int, Meta(ge=1)]`.
@@ -69,7 +69,7 @@ class OptionValue(click.ParamType):
             self.fail(str(error), param, ctx)
 
 
-class _Field(NamedTuple):
+class _OptionField(NamedTuple):
     path: tuple[str, ...]
     default: Any
     hint: Any
@@ -78,15 +78,16 @@ class _Field(NamedTuple):
 def dataclass_options(
     kind: type, argument: str, *, exclude: Collection[str] = (), default_text: Mapping[str, str] | None = None
 ) -> Callable[[Command], Command]:
-    """Return a decorator that adds an option for every option field of a dataclass and its nested dataclasses.
+    """Return a decorator that adds a command-line option for every `Option` field of a dataclass, also if nested.
 
     Args:
         kind: the dataclass. Bool fields become flags, with a `--no-` form if their default is True; tuples become
             options that may be repeated.
-        argument: name of the command's argument that receives a dict, field -> value, of the options given by the user,
-            nested like the dataclasses, see `icrl4aht_data.utils.options.replace_options`.
+        argument: name of the command's argument that receives the options given by the user: a dict, field -> value,
+            nested like the dataclasses; see `icrl4aht_data.utils.options.replace_options`.
         exclude: names of fields without an option in this command.
-        default_text: field name -> text shown as its default, if the command uses another default.
+        default_text: field name -> text shown as the option's default, if the command uses another default than the
+            class.
     """
     chosen = [field for field in _all_fields(kind) if field.path[-1] not in exclude]
     texts = default_text or {}
@@ -109,18 +110,18 @@ def dataclass_options(
     return decorate
 
 
-def _all_fields(kind: type, path: tuple[str, ...] = ()) -> Iterator[_Field]:
-    """Yield the option fields of a dataclass, then those of nested dataclasses."""
+def _all_fields(kind: type, path: tuple[str, ...] = ()) -> Iterator[_OptionField]:
+    """Yield the `Option` fields of a dataclass, then the `Option` fields of its nested dataclasses."""
     hints = option_hints(kind)
     for field in dataclasses.fields(kind):
         if field.name in hints:
-            yield _Field((*path, field.name), field.default, hints[field.name])
+            yield _OptionField((*path, field.name), field.default, hints[field.name])
     for field in dataclasses.fields(kind):
         if isinstance(field.default_factory, type):
             yield from _all_fields(field.default_factory, (*path, field.name))
 
 
-def _option(field: _Field, default_text: str | None) -> Callable[[Any], Any]:
+def _option(field: _OptionField, default_text: str | None) -> Callable[[Any], Any]:
     about = next(part for part in get_args(field.hint) if isinstance(part, Option))
     name, hint, default = field.path[-1], get_args(field.hint)[0], field.default
     flag, shown, repeated = "--" + name.replace("_", "-"), default_text or about.default, get_origin(hint) is tuple

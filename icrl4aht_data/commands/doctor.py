@@ -37,7 +37,7 @@ from icrl4aht_data.utils.system import (
 )
 
 _JAX_CODE = "import json, jax; print(json.dumps([jax.default_backend(), [d.device_kind for d in jax.local_devices()]]))"
-_JAX_TIMEOUT = 120  # seconds
+_JAX_TIMEOUT = 120  # maximum seconds to wait until JAX has started
 
 
 Problems = dict[str, str]
@@ -57,8 +57,8 @@ def diagnose() -> dict[str, Any]:
     return {"ok": not problems, **sections, "problems": listed}
 
 
-def in_words(found: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a readable report from the result of `diagnose`."""
+def report_lines(found: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines of a readable report of the result of `diagnose`."""
     for section in (name for name, facts in found.items() if isinstance(facts, dict)):
         yield section.capitalize()
         yield from (
@@ -71,7 +71,7 @@ def in_words(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _packages(problems: Problems) -> dict[str, Any]:
-    """Return the version of each required and optional package; a missing optional one has its install command."""
+    """Return the version of each required or optional package, or the command that installs an optional one."""
     facts: dict[str, Any] = {PACKAGE: _installed(PACKAGE), "folder": str(MINI.parent)}
     if facts[PACKAGE] is None:
         problems[f"{PACKAGE}: not installed"] = f"pip install {PACKAGE}, or -e . in a checkout"
@@ -98,7 +98,7 @@ def _installed(name: str) -> str | None:
 
 
 def _plugins(problems: Problems) -> dict[str, Any]:
-    """Return the objects that other packages register, by entry-point group; teammates and methods are not imported."""
+    """Return the names that other packages register, by entry-point group; only layouts are imported."""
     facts: dict[str, Any] = {}
     for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, Plugins(METHOD_GROUP, ())):
         try:
@@ -125,9 +125,10 @@ def _devices(problems: Problems) -> dict[str, Any]:
 
 
 def _query_jax() -> str:
-    """Return JAX's backend and devices as JSON.
+    """Return JAX's backend and devices as JSON, found by a separate process.
 
-    Runs in a separate process, so that a broken JAX cannot crash this one and no GPU memory stays allocated."""
+    So a broken JAX cannot crash this process, and no GPU memory stays allocated.
+    """
     environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     command = [sys.executable, "-P", "-c", _JAX_CODE]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=_JAX_TIMEOUT, check=True)
@@ -135,7 +136,7 @@ def _query_jax() -> str:
 
 
 def _folders(problems: Problems) -> dict[str, Any]:
-    """Return path and free space of the cache and data folders, which need not exist yet."""
+    """Return the path and free space of the cache and data folders, which need not exist yet."""
     facts: dict[str, Any] = {}
     for name, path, variable in (("cache", cache_folder(), CACHE_VARIABLE), ("data", data_folder(), DATA_VARIABLE)):
         facts[name] = {"path": str(path)}

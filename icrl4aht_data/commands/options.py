@@ -1,4 +1,4 @@
-"""Shared types of arguments and options, and shared options, of the commands."""
+"""Types of arguments and options, and complete options, that several commands share."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from icrl4aht_data.overcooked.layouts import LAYOUT_PLUGINS, LAYOUTS, get_layout
 
 
 class Names(click.ParamType):
-    """Type of a name from a set that is computed when needed; errors suggest the nearest name.
+    """Click type of a name from a set that is computed when needed; errors suggest the nearest name.
 
     Args:
         name: singular noun for the names, such as "layout".
-        valid: returns the names, which completion offers.
-        check: raises `UnknownNameError` for a wrong name; by default for one that `valid` does not return.
+        valid: function that returns the valid names, which shell completion offers.
+        check: function that raises `UnknownNameError` for a wrong name; by default, for a name that `valid` does not
+            return.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class Names(click.ParamType):
 
 
 def checked_later(value: str) -> str:
-    """Return the value: the check of names that depend on other arguments, such as layouts of a release."""
+    """Accept any name: some names, such as the layouts of a release, can only be checked with other arguments."""
     return value
 
 
@@ -59,10 +60,10 @@ FAMILY = Names("family", all_families)
 
 
 class Folder(click.Path):
-    """Type of a folder, which need not exist; an empty text, as from an unset shell variable, is an error.
+    """Click type of a folder, which need not exist; an empty text, as from an unset shell variable, is an error.
 
     Args:
-        made_by: the command that makes such folders; if given, the folder has to exist.
+        made_by: the command that makes such folders, for the message; if given, the folder must exist.
     """
 
     def __init__(self, made_by: str | None = None) -> None:
@@ -79,7 +80,7 @@ class Folder(click.Path):
 
 
 class Root(Folder):
-    """Type of a release: a folder, converted to a path, or an address, kept as text.
+    """Click type of a release: a folder, converted to a path, or an address, which remains a text.
 
     Args:
         remote: accept addresses only.
@@ -102,7 +103,7 @@ class Root(Folder):
 
 
 class NewFile(click.Path):
-    """Type of a file to write in an existing folder.
+    """Click type of a file to write in an existing folder.
 
     Args:
         suffixes: accepted suffixes of the file name; any by default.
@@ -134,19 +135,19 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print problems 
 
 
 _FILTERS: dict[str, tuple[click.ParamType, str | None, str]] = {
-    "layout": (RELEASE_LAYOUT, None, "Only this layout; repeat it for more."),
+    "layout": (RELEASE_LAYOUT, None, "Only this layout; repeat the option for more."),
     "split": (SPLIT, None, "Only this split: train, validation, test or heldout."),
     "track": (TRACK, None, "Only this track: teammate or layout."),
     "teammate-family": (FAMILY, None, "Only this family: rl (learned), H1, H2, H3 or H4."),
     "teammate-kind": (click.STRING, "KIND", "Only this kind, such as utility_greedy or fcp."),
     "source": (click.STRING, "NAME", "Only histories of this source: ppo, noise, agent, search or human."),
-    "label-view": (click.STRING, "VIEW", "Only histories whose expert sees this: ego, as an ego does, or state."),
+    "label-view": (click.STRING, "VIEW", "Only histories whose expert sees the ego's view (ego) or all (state)."),
 }
-"""Option -> type, placeholder and help text."""
+"""Option name -> type, placeholder and help text of the option."""
 
 
 def filter_options(command: Any) -> Any:
-    """Add the options that select histories, with values as `load_icrl4aht` takes them: lists, or None for any."""
+    """Add the options that select histories; their values are lists, or None for any, as in `load_icrl4aht`."""
     for name, (kind, metavar, about) in reversed(_FILTERS.items()):
         settings: dict[str, Any] = {"type": kind, "metavar": metavar, "help": about, "multiple": True}
         command = click.option(f"--{name}", callback=lambda ctx, param, value: list(value) or None, **settings)(command)
@@ -154,7 +155,7 @@ def filter_options(command: Any) -> Any:
 
 
 def print_result(facts: Any, text: str, as_json: bool, quiet: bool = False) -> None:
-    """Print a command's result as JSON, as text, or with `quiet` as nothing."""
+    """Print a command's result as JSON or as text; with `quiet`, print no text."""
     if as_json:
         click.echo(json.dumps(facts, indent=2))
     elif not quiet:

@@ -23,7 +23,7 @@ from icrl4aht_data.browsing.page import (
 )
 from icrl4aht_data.checking.report import verdict_in_words
 from icrl4aht_data.checking.verify import verify_release
-from icrl4aht_data.commands.doctor import diagnose, in_words
+from icrl4aht_data.commands.doctor import diagnose, report_lines
 from icrl4aht_data.commands.options import (
     COUNT,
     COUNT_OR_NONE,
@@ -75,10 +75,11 @@ _root = click.argument("root", required=False, type=Root())
 def list_(root: str | Path | None, as_json: bool, **filters: Any) -> None:
     """List the tasks of a release.
 
-    Prints for each task layout, split, teammate, source, histories, steps, the mean return of an episode at the start
-    and at the end of learning, the labels: expert, with what the policy earns that they come from, acting greedily (if
-    it was measured), and oracle; the end of the task's id, and the ids of its histories, if they are short. Where the
-    output is not a terminal, prints all facts of a task on one line, separated by tabs, below a line with their names.
+    Prints the layout, split, teammate, source, number of histories and number of steps of each task, and the mean
+    return of an episode at the start and at the end of learning. Also prints the kinds of labels, with the return of
+    the expert policy if it was measured, and shortened ids of the task and its histories. If the output is not a
+    terminal, prints one line of tab-separated values for each task, with complete ids, below a line with the names of
+    the values.
     """
     tasks = summarize_tasks(load_icrl4aht(root, **filters).entries)
     if as_json or not is_terminal():
@@ -111,12 +112,12 @@ def show(
 ) -> None:
     """Show a release, a part of it or one history.
 
-    Prints a summary, a table of the layouts with totals, versions, counts, splits, sources and labels; for one history
-    everything in its index entry. Where the output is not a terminal, prints each fact on one line, after its name and
-    a tab. Only --plot writes a file.
+    Prints a summary, a table of the layouts with totals, and versions, counts, splits, sources and labels; for one
+    history, all fields of its index entry. If the output is not a terminal, prints the name of each fact, a tab and its
+    value on one line. Only --plot writes a file.
     """
     if overwrite and plot is None:
-        raise click.UsageError("--overwrite replaces a picture: give --plot FILE with it")
+        raise click.UsageError("--overwrite replaces an existing picture: also give --plot FILE")
     if plot is not None:
         check_output(plot, overwrite)
     if isinstance(root, Path) and str(root).isdecimal() and not root.exists():
@@ -138,7 +139,7 @@ def show(
     console = Console(markup=False, highlight=False)
     if history_id is None:
         console.print(facts.pop("summary"), "", layout_table(dataset), "", sep="\n")
-        del facts["layouts"]  # already in the table
+        del facts["layouts"]  # the table shows the layouts
     else:
         console.print(repr(dataset[0]), "", sep="\n")
     console.print(*fact_lines(facts), sep="\n")
@@ -158,7 +159,7 @@ def show(
     type=COUNT_OR_NONE,
     multiple=True,
     metavar="ID",
-    help="Only this history; repeat for more.",
+    help="Only this history; repeat the option for more.",
 )
 @click.option("--histories", type=COUNT, default=PAGE_HISTORIES, help="Maximum number of histories on the page.")
 @click.option("--megabytes", type=COUNT, default=PAGE_MEGABYTES, help="Maximum size of the page in MB.")
@@ -183,14 +184,14 @@ def browse(
     as_json: bool,
     **filters: Any,
 ) -> None:
-    """Write an HTML page on which to look at histories.
+    """Write an HTML page that shows and replays histories.
 
-    One file that needs no other and no network: choose a layout, a teammate and a history, see its learning curve, and
-    watch its episodes step by step, with the ego's window and the expert's action next to the ego's. Where not all
-    episodes fit, some of each history can be watched, the first and the last among them; the page says which. A release
-    of observations has no states to draw.
+    The page is one file that needs no network. Choose a layout, a teammate and a history, see the learning curve, and
+    watch episodes step by step, with the cells that the ego observes, the ego's action and the expert's action. If not
+    all episodes fit, the page has some episodes of each history, including the first and the last, and says which. A
+    release of observations cannot be shown, since it has no states to draw.
     """
-    with suppress(OSError), out.open("rb") as stream:  # a page written by this command may be replaced
+    with suppress(OSError), out.open("rb") as stream:  # replaces a page that this command wrote earlier
         overwrite = overwrite or stream.read(len(PAGE_START)) == PAGE_START
     check_output(out, overwrite)
     matching = load_icrl4aht(root, **filters)
@@ -225,11 +226,11 @@ def download(
 ) -> None:
     """Download a release, or a part of it.
 
-    ADDRESS is hf://datasets/<org>/<repo>[@<revision>], https://... or s3://...; by default $ICRL4AHT_REMOTE. Each file
-    is checked when it arrives; the same command resumes an interrupted download, and replaces files that have changed.
-    Without --to, a Hub repository goes into the Hub's cache, another release below $ICRL4AHT_DATA_DIR
-    (~/.local/share/icrl4aht); load_icrl4aht(root=ADDRESS) finds either. FOLDER must be new, empty, or have files of
-    this release only.
+    ADDRESS is hf://datasets/<org>/<repo>[@<revision>], https://... or s3://...; by default $ICRL4AHT_REMOTE. Each
+    downloaded file is checked; the same command resumes an interrupted download, and replaces files that have changed.
+    Without --to, a Hub repository is stored in the Hub's cache, another release in $ICRL4AHT_DATA_DIR
+    (~/.local/share/icrl4aht); load_icrl4aht(root=ADDRESS) finds both. FOLDER must be new, empty, or have files of this
+    release only.
     """
     if root is None:
         raise click.UsageError("give the ADDRESS of a release, or set ICRL4AHT_REMOTE")
@@ -247,7 +248,7 @@ def download(
     lines.append(f"folder: {plan.root.folder}")
     chosen = [f"--{name.replace('_', '-')} {value}" for name, values in filters.items() for value in values or ()]
     if chosen:
-        lines.append(f"it is a part: `icrl4aht-data verify {plan.root.folder} {' '.join(chosen)}` checks it")
+        lines.append(f"partial release: `icrl4aht-data verify {plan.root.folder} {' '.join(chosen)}` checks it")
     print_result(facts, "\n".join(lines), as_json, quiet)
 
 
@@ -268,11 +269,12 @@ def verify(
 ) -> None:
     """Verify a release: every byte, count and range.
 
-    Prints one line per problem, and exits with 1 if there is one. A remote release is fetched first, unless --quick.
-    `download` replaces damaged files. For a folder with a part of a release, give the filters of its download.
+    Prints one line per problem, and exits with 1 if a problem is found. A remote release is downloaded first, except
+    with --quick. `download` replaces damaged files. For a partially downloaded release, give the filters of the
+    download.
     """
     if quick and deep:
-        raise click.UsageError("--quick reads no contents: give --deep without it")
+        raise click.UsageError("--quick and --deep exclude each other: give only one of them")
     level = "quick" if quick else "deep" if deep else "full"
     with progress_bars(quiet) as advance:
         report = verify_release(root, level=level, advance=advance, **filters)
@@ -316,16 +318,16 @@ def convert(
 
     SOURCE is a release, by default the bundled mini release, or a folder with the published code's histories.h5 and
     histories_index.jsonl, and with tasks.jsonl if the tasks are known. Writes a release folder (full, lite,
-    observations), a folder with the published code's two files (published), a Minari dataset (minari) in a folder named
-    as in demo_wide-v0, which minari.load_dataset opens, or a Parquet file with the index (parquet). Published files
-    become lite by default or, where they have no state records, observations.
+    observations), a folder with the published code's two files (published), a Minari dataset (minari) in a folder with
+    a name such as demo_wide-v0, which minari.load_dataset opens, or a Parquet file with the index (parquet). By
+    default, published files are converted to lite, or to observations if they have no state records.
     """
     with progress_bars(quiet) as show:
         advance = partial(show, "histories")
         advance(0, None)  # the total is unknown before the first history
         if isinstance(root, Path) and (root / HISTORIES_H5).exists():
             if (form is not None and form not in ALL_KINDS) or any(filters.values()):
-                raise click.UsageError("published files convert to full, lite or observations, without filters")
+                raise click.UsageError("published files convert only to full, lite or observations, without filters")
             form = from_published(
                 root,
                 target,
@@ -337,7 +339,7 @@ def convert(
         else:
             dataset = load_icrl4aht(root, **filters)
             if form is None:
-                raise click.UsageError(f"give the form to convert to: --to {', '.join(_FORMS)}")
+                raise click.UsageError(f"give the format to convert to: --to {', '.join(_FORMS)}")
             if kept_steps != KEPT_STEPS:
                 raise click.UsageError(f"{dataset.root} is a release: --kept-steps is for published files")
             if form in ALL_KINDS:
@@ -354,12 +356,12 @@ def convert(
 
 @click.command(epilog=examples("icrl4aht-data combine path/to/release path/to/another --data-version 1.0.0 --out both"))
 @click.argument("releases", nargs=-1, required=True, type=Root(), metavar="ROOT...")
-@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the combination here.")
+@click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the combined release here.")
 @overwrite_option
 @click.option(
     "--data-version",
     metavar="SEMVER",
-    help="Data version of the combination, such as 1.0.0.",
+    help="Data version of the combined release, such as 1.0.0.",
     show_default="the version of the releases, if they agree",
 )
 @quiet_option
@@ -368,7 +370,7 @@ def combine(
 ) -> None:
     """Combine releases into one.
 
-    They have to be of one kind and share no task. The combination gets a new card.
+    The releases must be of the same kind and have no common task. The combined release gets a new card.
     """
     combine_releases(out, releases, data_version, overwrite=overwrite)
     if not quiet:
@@ -384,10 +386,9 @@ def combine(
 def build(source: Path | None, out: Path, overwrite: bool, quiet: bool, as_json: bool) -> None:
     """Build a release for publication.
 
-    Copies all data of SOURCE, a release folder (by default the bundled mini release), which is verified first, and adds
-    what people and tools look for in a dataset: README.md with a dataset card, figures, the index as Parquet for
-    viewers, croissant.json, LICENSE, CITATION.cff and a new manifest. Needs the extras
-    plot and hf.
+    Verifies SOURCE, a release folder (by default the bundled mini release), copies its data, and adds README.md with a
+    dataset card, figures, Parquet files for viewers, croissant.json, LICENSE, CITATION.cff and a new manifest. Needs
+    the extras plot and hf.
     """
     with progress_bars(quiet) as advance:
         build_release(source, out, overwrite=overwrite, advance=advance)
@@ -407,16 +408,16 @@ def build(source: Path | None, out: Path, overwrite: bool, quiet: bool, as_json:
 def upload(folder: Path, address: str, private: bool, dry_run: bool, quiet: bool, as_json: bool) -> None:
     """Upload a release to the Hugging Face Hub, and tag it.
 
-    FOLDER is a release, as `release build` makes it; ADDRESS is hf://datasets/<org>/<repo>. The release is verified
-    first; a missing repository is created. The same command resumes an interrupted upload. Afterwards the repository's
-    files and manifest are compared with the release's, and only then tagged with the data version. A tag never moves:
-    other data need another version. `hf auth login` stores the token.
+    FOLDER is a release made by `release build`; ADDRESS is hf://datasets/<org>/<repo>. The release is verified first; a
+    missing repository is created. The same command resumes an interrupted upload. After the upload, the repository's
+    files and manifest are compared with the release, and the commit is tagged with the data version. A tag never moves,
+    so changed data need a new version. `hf auth login` stores the token.
     """
     if quiet or not sys.stderr.isatty():
         import_module("huggingface_hub.utils").disable_progress_bars()
     with progress_bars(quiet) as advance:
         done = upload_release(folder, address, private=private, dry_run=dry_run, advance=advance)
-    print_result(done.to_json(), "\n".join(done.in_words()), as_json, quiet)
+    print_result(done.to_json(), "\n".join(done.report_lines()), as_json, quiet)
 
 
 @click.command()
@@ -425,9 +426,9 @@ def doctor(as_json: bool) -> None:
     """Examine this installation, and report problems.
 
     Prints versions, optional packages and the extras that install them, devices, the folders in use (their settings,
-    contents and permissions), environment variables, and the state of the bundled release. Writes nothing, and does
-    not use the network. Exits with 1 and a next step for each problem if there is one.
+    contents and permissions), environment variables, and the state of the bundled release. Writes nothing, and does not
+    use the network. Prints a next step for each problem, and exits with 1 if any is found.
     """
     found = diagnose()
-    print_result(found, "\n".join(in_words(found)), as_json)
+    print_result(found, "\n".join(report_lines(found)), as_json)
     sys.exit(0 if found["ok"] else 1)

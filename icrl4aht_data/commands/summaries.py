@@ -1,4 +1,4 @@
-"""Summaries of selections and their tasks, which `list` and `show` print."""
+"""Summaries of selections and tasks, which the commands `list` and `show` print."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from icrl4aht_data.reading.history import LABELS
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.text import counted_noun
 
-_IDS_SHOWN = 11  # maximum characters of a task's history ids in the table
+_IDS_SHOWN = 11  # maximum number of characters of a task's history ids in the table
 
 
 def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """Return the facts of each task with histories among `entries`, as JSON."""
+    """Return a JSON object with facts for each task that has histories among `entries`."""
     return [
         {
             "task_id": task_id,
@@ -47,10 +47,10 @@ def summarize_tasks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 
 def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
-    """Return a table of the result of `summarize_tasks`, with two lines per task and a last one with totals.
+    """Return a table of the result of `summarize_tasks`, with two lines per task and a last row with totals.
 
-    Fits 80 columns: names of teammates wrap, and the column `task` has only the end of the id, and the ids of histories
-    if they are short. `list | cat` prints the complete ids.
+    The table fits 80 columns: names of teammates wrap, ids of tasks are shortened to their end, and long lists of
+    history ids are omitted. `list | cat` prints the complete ids.
     """
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), show_footer=True, row_styles=("", "dim"))
     steps, histories = (sum(task[name] for task in tasks) for name in ("transitions", "histories"))
@@ -63,7 +63,7 @@ def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
     table.add_column("task\nhist. ids", no_wrap=True)
     for task in tasks:
         earned = "" if task["expert_return"] is None else f" {task['expert_return']:.1f}"
-        seen = "" if task["label_view"] is None else f"\n of {task['label_view']}"  # a line of its own is narrower
+        seen = "" if task["label_view"] is None else f"\n of {task['label_view']}"  # a new line keeps the column narrow
         ids = id_ranges(task["history_ids"])
         table.add_row(
             f"{task['layout']}\n{task['split']}",
@@ -78,7 +78,7 @@ def task_table(tasks: Sequence[dict[str, Any]]) -> Table:
 
 
 def id_ranges(ids: Sequence[int]) -> str:
-    """Return ids as ranges in ascending order, such as 3,158-163."""
+    """Return ids as a text of ranges in ascending order, such as "3,158-163"."""
     numbers = set(ids)
     firsts = sorted(number for number in numbers if number - 1 not in numbers)
     lasts = sorted(number for number in numbers if number + 1 not in numbers)
@@ -87,7 +87,7 @@ def id_ranges(ids: Sequence[int]) -> str:
 
 
 def layout_table(dataset: Dataset) -> Table:
-    """Return a table of a selection that fits 80 columns, with one row per layout and a last one with totals."""
+    """Return a table of a selection that fits 80 columns, with one row per layout and a last row with totals."""
     table = Table(box=None, pad_edge=False, show_footer=True)
     columns = [dataset.column(name) for name in ("return_start", "return_end", "T", "episodes")]
     numbers, tasks = dataset.layout_numbers, dataset.column_codes("task_id")
@@ -106,7 +106,7 @@ def layout_table(dataset: Dataset) -> Table:
 
 
 def fact_lines(facts: Mapping[str, Any], indent: str = "") -> Iterator[str]:
-    """Yield facts as lines for a terminal; those of a nested mapping are indented."""
+    """Yield a mapping as lines of text for a terminal; nested mappings are indented."""
     for name, value in facts.items():
         label = indent + name.replace("_", " ")
         if isinstance(value, dict):

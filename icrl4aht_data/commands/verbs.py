@@ -1,6 +1,6 @@
-"""Table of the commands of `icrl4aht-data`, from which `--help` lists them without importing them.
+"""Table of the commands of `icrl4aht-data`, so that `--help` lists all commands without importing any.
 
-Another package adds commands by an entry point to its own table, in a module that imports little:
+Another package adds commands by an entry point that names a table, in a module that is fast to import:
 
     [project.entry-points."icrl4aht_data.commands"]
     my_package = "my_package.verbs:VERBS"
@@ -15,7 +15,7 @@ VERB_GROUP = "icrl4aht_data.commands"
 
 
 class Verb(NamedTuple):
-    """Command or group of commands of the program.
+    """A command of the program, or a group of commands.
 
     Attributes:
         name: words that run the command, such as "list" or "release build".
@@ -31,14 +31,14 @@ class Verb(NamedTuple):
 
 
 SECTIONS = ("Look", "Fetch and convert", "Train and evaluate", "Generate", "Publish", "Research")
-"""Headings in the order of the program's help; those of other packages follow."""
+"""Headings of the program's help, in order; headings of other packages follow."""
 
 _CLI = "icrl4aht_data.commands.release_commands"
 
 VERBS = (
     Verb("list", f"{_CLI}:list_", "Look", "List the tasks of a release."),
     Verb("show", f"{_CLI}:show", "Look", "Show a release, a part of it or one history."),
-    Verb("browse", f"{_CLI}:browse", "Look", "Write an HTML page on which to look at histories."),
+    Verb("browse", f"{_CLI}:browse", "Look", "Write an HTML page that shows and replays histories."),
     Verb("verify", f"{_CLI}:verify", "Look", "Verify a release: every byte, count and range."),
     Verb("doctor", f"{_CLI}:doctor", "Look", "Examine this installation, and report problems."),
     Verb("download", f"{_CLI}:download", "Fetch and convert", "Download a release, or a part of it."),
@@ -47,5 +47,5 @@ VERBS = (
     Verb("release", "", "Publish", "Prepare a release for publication."),
     Verb("release build", f"{_CLI}:build", "Publish", "Build a release for publication."),
     Verb("upload", f"{_CLI}:upload", "Publish", "Upload a release to the Hugging Face Hub, and tag it."),
-    Verb("research", "", "Research", "Make what the package comes with, and the paper's experiments."),
+    Verb("research", "", "Research", "Rebuild the bundled data, and repeat the paper's experiments."),
 )

@@ -40,7 +40,7 @@ from icrl4aht_data.format.layouts_file import PUBLISHED, ReleaseLayouts, check_l
 from icrl4aht_data.format.schema import ENCODED, ENTRY_HINTS, HISTORIES, INFO, KINDS, TEXTS, Entry, as_json, check_name
 from icrl4aht_data.overcooked.actions import ACTIONS
 from icrl4aht_data.overcooked.layouts import get_layout
-from icrl4aht_data.utils.files import LARGEST, plain_size, read_lines, resolve_inside, wrap_read_errors
+from icrl4aht_data.utils.files import LARGEST, read_lines, regular_file_size, resolve_inside, wrap_read_errors
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_data.utils.options import check_int
 from icrl4aht_data.utils.text import counted_histories, listed_names
@@ -111,7 +111,7 @@ def read_columns(path: Path) -> Columns:
         IndexFormatError: if a line is malformed; the message has the file and the line number.
     """
     with wrap_read_errors(path):
-        plain_size(path, LARGEST)
+        regular_file_size(path, LARGEST)
     # The default of these dictionaries gives each new value the next code.
     codes = {name: defaultdict[str, int](count().__next__) for name in _STRINGS}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in (*_NUMBERS, *_STRINGS)}

@@ -29,9 +29,9 @@ from icrl4aht_data.utils.files import (
     LARGEST,
     atomic_write,
     file_hash,
-    is_inside,
-    plain_size,
+    is_safe_path,
     read_text,
+    regular_file_size,
     resolve_inside,
     wrap_read_errors,
 )
@@ -87,7 +87,7 @@ def parse_manifest(text: str, path: Path | str) -> Mapping[str, str]:
         if match is None:
             raise IndexFormatError(f"{path}, line {number}: expected '<sha256>  <path>', found {line[:200]!r}")
         digest, name = match.groups()
-        if not is_inside(name):
+        if not is_safe_path(name):
             raise UnsafePathError(
                 f"{path}, line {number}: {name!r} leads out of the release: do not use it, and warn the publisher"
             )
@@ -128,7 +128,7 @@ def check_against_manifest(root: Path, names: Iterable[str]) -> None:
         kind = ChunkTableError if name.startswith("meta/chunks/") else IndexFormatError
         try:
             with wrap_read_errors(path):
-                plain_size(path, LARGEST)
+                regular_file_size(path, LARGEST)
                 found = file_hash(path) if name in listed else None
         except IndexFormatError as error:
             raise kind(str(error)) from error

@@ -20,7 +20,7 @@ from icrl4aht_data.overcooked.channels import observation_shape
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import fixed_channels, observe
 from icrl4aht_data.overcooked.state import columns, possible_recipes, record_size
-from icrl4aht_data.utils.system import in_slices
+from icrl4aht_data.utils.system import run_in_slices
 
 _SLAB = 8192  # steps rendered at a time: in smaller blocks, function calls cost more time than the cache saves
 _IMPOSSIBLE = -(2**40)  # so low that any sum with this table entry is negative
@@ -59,7 +59,7 @@ def fast_observe(
             last = min(first + _SLAB, stop)
             renderer.render(records[first:last], flat[first:last])
 
-    in_slices(part, len(records), threads, least=_SLAB)
+    run_in_slices(part, len(records), threads, least=_SLAB)
     return out
 
 

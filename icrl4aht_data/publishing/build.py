@@ -1,4 +1,4 @@
-"""Preparation of a release for publication: card, figures, Parquet files and Croissant added to its data."""
+"""Preparation of a release for publication: adds a card, figures, Parquet files and Croissant metadata."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ def build_release(
     published: datetime.date | None = None,
     advance: NamedProgress = lambda what, done, total: None,
 ) -> Path:
-    """Copy a release and add the files of a published release.
+    """Copy a release, and add the card, figures and metadata of a published release.
 
     Args:
         source: a release folder; the bundled mini release by default.
-        target: the folder to write, which appears when it is complete.
+        target: the folder to write; it appears only when it is complete.
         overwrite: replace a release at `target`.
         published: date of publication for Croissant; today by default.
         advance: called with the name of a stage, the number of items done, and their total.
 
     Raises:
         OptionError: if `target` may not be written, see `release_folder.check_target`, or a library is not installed.
-        ReleaseError: if `source` is not valid; names the first problems.
+        ReleaseError: if `source` is not valid; names the first three problems.
     """
     source, target = as_path(MINI if source is None else source).resolve(), as_path(target)
     check_target(target, overwrite, [source])
@@ -63,7 +63,7 @@ def build_release(
     if missing:
         raise OptionError(f"building a release needs {', '.join(missing)}: {install_command('plot', 'hf')}")
     check_valid(source, advance)
-    kept = {name: digest for name, digest in read_manifest(source).items() if not _is_made_here(name)}
+    kept = {name: digest for name, digest in read_manifest(source).items() if not _is_built(name)}
     with atomic_folder(target, overwrite=overwrite, sources=[source]) as root:
         for number, name in enumerate(kept, start=1):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -88,27 +88,27 @@ def build_release(
 
 
 def check_valid(root: Path, advance: NamedProgress = lambda what, done, total: None) -> None:
-    """Verify a release.
+    """Verify a release, and raise an error if a problem is found.
 
     Raises:
-        ReleaseError: if there is any problem; names the first ones.
+        ReleaseError: if a problem is found; names the first three.
     """
     if not (root / MANIFEST).exists():
         read_info(root)  # raises a helpful error if the folder is not a release
     report = verify_release(root, advance=advance)
     if not report.ok:
-        found = first_of([f"{finding.file}: {finding.problem}" for finding in report.findings])
+        found = first_problems([f"{finding.file}: {finding.problem}" for finding in report.findings])
         raise ReleaseError(f"{root}: not valid: {found}; see `icrl4aht-data verify`")
 
 
-def first_of(problems: Sequence[str]) -> str:
-    """Return the first three problems as text, and the number of others."""
+def first_problems(problems: Sequence[str]) -> str:
+    """Return a text with the first three problems and the number of further problems."""
     more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
     return "; ".join(problems[:3]) + more
 
 
-def _is_made_here(name: str) -> bool:
-    """Return whether building writes this file, so that the source's version is not copied."""
+def _is_built(name: str) -> bool:
+    """Return whether building a release writes this file, which is then not copied from the source."""
     folders = ("figures/", f"{PARQUET_INDEX}/", f"{PARQUET_EPISODES}/")
     is_card = name == RELEASE_CARD or name.endswith(f"/{RELEASE_CARD}")
     return is_card or name in (CARD_TABLES, CROISSANT, *_COPIED_TEXTS) or name.startswith(folders)

@@ -1,5 +1,4 @@
-"""Description of a release in Croissant 1.1, the metadata format of dataset search engines and loaders, and in its
-responsible-AI vocabulary 1.0.
+"""Description of a release in Croissant 1.1, a metadata format for datasets, and its responsible-AI vocabulary 1.0.
 
 Every file is a FileObject with its SHA-256 and an address relative to croissant.json. The Parquet copies of the index
 and of the episodes are RecordSets with a description of every field. Croissant does not support HDF5, so the
@@ -36,7 +35,7 @@ _FORMATS = {
     ".parquet": "application/x-parquet",
     ".safetensors": "application/vnd.safetensors",
 }
-_TYPES = {"bool": "BOOL", "string": "TEXT", "float": "FLOAT", "double": "FLOAT"}  # of Arrow; others are integers
+_TYPES = {"bool": "BOOL", "string": "TEXT", "float": "FLOAT", "double": "FLOAT"}  # of Arrow types; others: INTEGER
 _TERMS_OF_1_1 = {
     "arrayShape": "cr:arrayShape",
     "containedIn": "cr:containedIn",
@@ -44,7 +43,7 @@ _TERMS_OF_1_1 = {
     "description": {"@container": "@language"},
     "name": {"@container": "@language"},
 }
-"""JSON-LD terms of Croissant 1.1 that mlcroissant's default context (1.0) lacks."""
+"""JSON-LD terms of Croissant 1.1 that are missing in mlcroissant's default context (1.0)."""
 
 
 def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) -> dict[str, Any]:
@@ -65,7 +64,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
     terms = mlc.Rdf(context=mlc.Rdf().context | _TERMS_OF_1_1)
     context = mlc.Context(rdf=terms, conforms_to=_STANDARD)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # raised by libraries that mlcroissant is built on
+        warnings.simplefilter("ignore", DeprecationWarning)  # raised by dependencies of mlcroissant
         files = [
             mlc.FileObject(
                 ctx=context,
@@ -78,7 +77,7 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
             )
             for name in sorted(digests)
         ]
-        sets, records = zip(*_tables(context, root), strict=True)
+        sets, records = zip(*_file_sets(context, root), strict=True)
         return mlc.Metadata(
             ctx=context,
             conforms_to=[_STANDARD, _RAI_STANDARD],
@@ -102,8 +101,8 @@ def croissant(root: Path, digests: Mapping[str, str], published: datetime.date) 
         ).to_json()
 
 
-def _tables(context: mlcroissant.Context, root: Path) -> Iterator[tuple[mlcroissant.FileSet, mlcroissant.RecordSet]]:
-    """Yield file and record sets of the Parquet index and, if there are any, of the Parquet episodes."""
+def _file_sets(context: mlcroissant.Context, root: Path) -> Iterator[tuple[mlcroissant.FileSet, mlcroissant.RecordSet]]:
+    """Yield the file set and record set of the Parquet index and, if present, of the Parquet episodes."""
     import mlcroissant as mlc
     import pyarrow.parquet as pq
 
@@ -135,14 +134,14 @@ def _tables(context: mlcroissant.Context, root: Path) -> Iterator[tuple[mlcroiss
                 array_shape=shape,
                 source=mlc.Source(ctx=context, file_set=files.id, extract=mlc.Extract(ctx=context, column=column)),
             )
-            for column, kind, shape in map(_column, pq.read_schema(path))
+            for column, kind, shape in map(_column_type, pq.read_schema(path))
         ]
         keys = [f"{name}/{column}" for column in key]
         yield files, mlc.RecordSet(ctx=context, id=name, name=name, description=said, key=keys, fields=fields)
 
 
-def _column(field: Any) -> tuple[str, str, str | None]:
-    """Return name, data type and, if it has lists, their lengths such as "100,36" of an Arrow field."""
+def _column_type(field: Any) -> tuple[str, str, str | None]:
+    """Return the name and data type of an Arrow field, and the lengths of nested lists as text, such as "100,36"."""
     kind, lengths = field.type, []
     while hasattr(kind, "list_size"):
         lengths.append(str(kind.list_size))

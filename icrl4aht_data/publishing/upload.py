@@ -1,4 +1,4 @@
-"""Upload of a release to a dataset repository of the Hugging Face Hub, with a comparison and a tag."""
+"""Upload of a release to the Hugging Face Hub: uploads and compares the files, and tags the commit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from icrl4aht_data.errors import Icrl4ahtError, OptionError, UploadError
 from icrl4aht_data.format.info import read_info
 from icrl4aht_data.format.manifest import read_manifest
 from icrl4aht_data.format.schema import MANIFEST
-from icrl4aht_data.publishing.build import check_valid, first_of
+from icrl4aht_data.publishing.build import check_valid, first_problems
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -26,7 +26,7 @@ _KEPT = "files sent so far are kept: run the same command to resume"
 
 @dataclass(frozen=True)
 class Upload:
-    """Result of `upload_release`, or its plan in a dry run.
+    """Result of `upload_release`; in a dry run, the plan of the upload.
 
     Args:
         repo: ORG/REPO.
@@ -34,7 +34,7 @@ class Upload:
         url: address of the repository's page.
         files: path -> size in bytes, for all files of the release.
         done: "already there" if the tag has this content; otherwise "uploaded", or "nothing" in a dry run.
-        creates: whether the repository is new.
+        creates: whether a new repository is created.
         private: whether a private repository was requested.
         deletes: files of another version, which are removed from the repository.
         commit: the tagged commit; None in a dry run.
@@ -53,8 +53,8 @@ class Upload:
     def to_json(self) -> dict[str, Any]:
         return asdict(self) | {"bytes": sum(self.files.values())}
 
-    def in_words(self) -> list[str]:
-        """Return printable lines: all files in a dry run, else a summary."""
+    def report_lines(self) -> list[str]:
+        """Return lines of text for printing: all files in a dry run, otherwise a summary."""
         total = f"{len(self.files)} files, {sum(self.files.values()):,} bytes"
         if self.done != "nothing":
             return [f"{self.url}: {self.done}, {total}; tag {self.tag} is commit {self.commit}"]
@@ -72,42 +72,42 @@ def upload_release(
     dry_run: bool = False,
     advance: NamedProgress = lambda what, done, total: None,
 ) -> Upload:
-    """Upload a release, compare the names of the repository's files and its manifest, and tag the commit.
+    """Upload a release, compare file names and manifest of the repository with the release, and tag the commit.
 
     Files that are already in the repository are not sent again, so repeating the call resumes an interrupted upload.
 
     Args:
         folder: the release; it is verified first.
         address: hf://datasets/ORG/REPO; a missing repository is created.
-        private: make a new repository private, and accept an existing one only if it is private.
-        dry_run: only make the plan.
+        private: make a new repository private, and accept an existing repository only if it is private.
+        dry_run: only return the plan, and change nothing.
         advance: called while verifying, with the name of a stage, the number of items done, and their total.
 
     Raises:
         ReleaseError: if the release is not valid.
-        OptionError: if the address has another form.
-        UploadError: if the Hub refuses or cannot be reached, the tag has other content, the repository has files that
-            belong to no release, or its content differs from the manifest after the upload.
+        OptionError: if the address is not of the form hf://datasets/ORG/REPO.
+        UploadError: if the Hub refuses the upload or cannot be reached, if the tag exists with other content, if the
+            repository has files that belong to no release, or if it differs from the release after the upload.
     """
     from huggingface_hub import HfApi
 
     found, folder = re.fullmatch(r"hf://datasets/([\w.-]+/[\w.-]+)/?", str(address)), Path(folder)
     if found is None:
-        raise OptionError(f"{address!r}: expected hf://datasets/ORG/REPO; the revision is the data version's tag")
+        raise OptionError(f"{address!r}: expected hf://datasets/ORG/REPO; the data version gives the tag")
     check_valid(folder, advance)
     api, repo, version = HfApi(), found[1], read_info(folder).data_version
     sizes = {name: (folder / name).stat().st_size for name in sorted([*read_manifest(folder), MANIFEST])}
     plan = Upload(repo, f"v{version}", f"{api.endpoint}/datasets/{repo}", sizes)
     with _wrap_hub_errors(plan, api, _NOTHING_SENT):
-        plan = _plan(api, plan, folder, private)
+        plan = _complete_plan(api, plan, folder, private)
     if dry_run or plan.done == "already there":
         return plan
     with _wrap_hub_errors(plan, api, _KEPT):
-        return _send(api, plan, folder)
+        return _upload_and_tag(api, plan, folder)
 
 
-def _plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upload:
-    """Complete the plan with the repository's state, without changing the repository."""
+def _complete_plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upload:
+    """Complete a plan of an upload with the state of the repository, which is not changed."""
     from huggingface_hub.errors import RepositoryNotFoundError
 
     try:
@@ -118,17 +118,17 @@ def _plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upload:
     if commit is not None:
         if differences := _differences(api, plan, commit, folder):
             raise UploadError(
-                f"{plan.repo}: tag {plan.tag} has other content: {first_of(differences)}; tags do not move: give the "
-                "data another data version"
+                f"{plan.repo}: tag {plan.tag} exists with other content: {first_problems(differences)}; tags do not "
+                "move: give the data another data version"
             )
         return replace(plan, done="already there", commit=commit)
     if private and not api.repo_info(plan.repo, repo_type="dataset").private:
-        raise UploadError(f"{plan.repo}: is public; make it private in its settings, or give another repository")
-    present = _present(api, plan.repo, "main")
+        raise UploadError(f"{plan.repo}: is a public repository; make it private in its settings, or give another one")
+    present = _repository_files(api, plan.repo, "main")
     foreign = sorted(present - plan.files.keys())
     listed: Mapping[str, str] = {}
     if foreign and MANIFEST in present:
-        listed = read_manifest(_manifest(api, plan.repo, "main").parent)
+        listed = read_manifest(_get_manifest(api, plan.repo, "main").parent)
     if unknown := [name for name in foreign if name not in listed]:
         raise UploadError(
             f"{plan.repo}: has {len(unknown)} files that belong to no release, such as {unknown[0]}: expected an empty "
@@ -137,7 +137,7 @@ def _plan(api: HfApi, plan: Upload, folder: Path, private: bool) -> Upload:
     return replace(plan, private=private, deletes=foreign)
 
 
-def _send(api: HfApi, plan: Upload, folder: Path) -> Upload:
+def _upload_and_tag(api: HfApi, plan: Upload, folder: Path) -> Upload:
     """Upload the files of a plan, compare the repository with the release, and tag the commit."""
     repo = plan.repo
     if plan.creates:
@@ -148,8 +148,8 @@ def _send(api: HfApi, plan: Upload, folder: Path) -> Upload:
     commit = api.repo_info(repo, repo_type="dataset").sha or "main"
     if differences := _differences(api, plan, commit, folder):
         raise UploadError(
-            f"{repo}: after the upload, commit {commit} is not the release: {first_of(differences)}; it was not "
-            "tagged; run the same command again"
+            f"{repo}: after the upload, commit {commit} differs from the release: {first_problems(differences)}; "
+            "the commit was not tagged; run the same command again"
         )
     api.create_tag(repo, tag=plan.tag, revision=commit, repo_type="dataset")
     return replace(plan, done="uploaded", commit=commit)
@@ -157,20 +157,20 @@ def _send(api: HfApi, plan: Upload, folder: Path) -> Upload:
 
 def _differences(api: HfApi, plan: Upload, revision: str, folder: Path) -> list[str]:
     """Return the differences between a revision of the repository and the release, by names and by the manifest."""
-    present = _present(api, plan.repo, revision)
+    present = _repository_files(api, plan.repo, revision)
     differences = [f"{name}: not in the release" for name in sorted(present - plan.files.keys())]
     differences += [f"{name}: missing" for name in plan.files if name not in present]
-    if MANIFEST in present and _manifest(api, plan.repo, revision).read_bytes() != (folder / MANIFEST).read_bytes():
+    if MANIFEST in present and _get_manifest(api, plan.repo, revision).read_bytes() != (folder / MANIFEST).read_bytes():
         differences.append(f"{MANIFEST}: has other hashes")
     return differences
 
 
-def _present(api: HfApi, repo: str, revision: str) -> set[str]:
-    """Return the paths of the repository's files."""
+def _repository_files(api: HfApi, repo: str, revision: str) -> set[str]:
+    """Return the paths of the repository's files, without files that the Hub adds."""
     return {name for name in api.list_repo_files(repo, revision=revision, repo_type="dataset") if name != _HUB_FILE}
 
 
-def _manifest(api: HfApi, repo: str, revision: str) -> Path:
+def _get_manifest(api: HfApi, repo: str, revision: str) -> Path:
     """Return the path of the repository's manifest, fetched into the Hub's cache."""
     return Path(api.hf_hub_download(repo, MANIFEST, revision=revision, repo_type="dataset"))
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 EpisodeColumn = tuple[str, *tuple[Literal["steps", "width"], ...]]
-"""NumPy dtype of the elements, or "str", and the lengths of the nested lists of a row, from the outermost."""
+"""NumPy dtype of a column's elements, or "str", then the lengths of nested lists in a row, outermost first."""
 
 _NAMES = ("task_id", "track", "split", "layout", "teammate_family", "teammate_kind", "source")
 
@@ -78,11 +78,11 @@ def episode_schema(dataset: Selection) -> pa.Schema:
 
 
 def episode_table(history: History, schema: pa.Schema) -> pa.Table:
-    """Return a table of a history's episodes, one row each, in order.
+    """Return an Arrow table with one row for each episode of a history, in order.
 
     Args:
         history: a history of a release with state records; all of its arrays are read.
-        schema: the `episode_schema` of a selection with the history.
+        schema: the `episode_schema` of a selection that contains the history.
 
     Raises:
         IndexFormatError: if the history does not consist of episodes of the schema's number of steps.
@@ -126,6 +126,6 @@ def import_pyarrow() -> Any:
     """Return the module pyarrow.
 
     Raises:
-        OptionError: if it is not installed; names the command that installs it.
+        OptionError: if pyarrow is not installed; names the command that installs pyarrow.
     """
     return import_optional("pyarrow", "Parquet")

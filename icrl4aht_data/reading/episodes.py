@@ -1,4 +1,4 @@
-"""Episodes of a history, whose arrays are read on access."""
+"""Episodes of a learning history; arrays are read when they are accessed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class FieldArrays:
     """Fields of a history, or of one of its episodes, as NumPy arrays: `x.actions` is the same as `x["actions"]`.
 
-    T is the number of steps, E that of episodes.
+    T is the number of steps, E the number of episodes.
     """
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -28,7 +28,7 @@ class FieldArrays:
 
     @property
     def obs(self) -> np.ndarray:
-        """(T, 5, 5, C) float32 or uint8: observations; or (T, S) uint8: state records, if the dataset's obs="state".
+        """Observations, float32 or uint8 (T, 5, 5, C); with obs="state", state records, uint8 (T, S).
 
         With channels="canonical", C is 46 on every layout.
         """
@@ -36,50 +36,50 @@ class FieldArrays:
 
     @property
     def state(self) -> np.ndarray:
-        """(T, S) uint8: the state record before each step; see `overcooked.state`."""
+        """State record before each step, uint8 (T, S); see `overcooked.state`."""
         return self["state"]
 
     @property
     def actions(self) -> np.ndarray:
-        """(T,) int32: the ego's actions, 0..5."""
+        """The ego's actions, int32 (T,), from 0 to 5."""
         return self["actions"]
 
     @property
     def rewards(self) -> np.ndarray:
-        """(T,) float32: the team's reward of each step, without shaping."""
+        """The team's reward for each step, without shaping, float32 (T,)."""
         return self["rewards"]
 
     @property
     def dones(self) -> np.ndarray:
-        """(T,) bool: True at the last kept step of each episode."""
+        """True at the last kept step of each episode, bool (T,)."""
         return self["dones"]
 
     @property
     def teammate_actions(self) -> np.ndarray:
-        """(T,) int32: the teammate's actions, 0..5."""
+        """The teammate's actions, int32 (T,), from 0 to 5."""
         return self["teammate_actions"]
 
     @property
     def expert_actions(self) -> np.ndarray:
-        """(T,) int32: greedy actions of one policy at the same steps, 0..5; its return is `entry.expert_return`.
+        """Greedy actions of the expert policy at each step, int32 (T,), from 0 to 5.
 
-        The policy is the learner's last checkpoint, as in the paper (App. D.1), or an earlier one that earns more: see
-        `entry.expert_step`.
+        The expert policy is the learner's last checkpoint, as in the paper (App. D.1), or an earlier checkpoint with a
+        higher return; see `entry.expert_step` and `entry.expert_return`.
         """
         return self["expert_actions"]
 
     @property
     def oracle_actions(self) -> np.ndarray:
-        """(T,) int32: actions of the scripted oracle at the same steps, 0..5; it knows the full state.
+        """Actions of the scripted oracle, which knows the full state, at each step, int32 (T,), from 0 to 5.
 
-        In a history of source "noise" these are the ego's actions without the noise. They equal `expert_actions`, so a
-        release need not store them.
+        In a history of source "noise", oracle actions are the ego's actions without the noise. They equal
+        `expert_actions`, so a release need not store both.
         """
         return self["oracle_actions"]
 
     @property
     def episode_end_state(self) -> np.ndarray:
-        """(E, S) uint8, or (S,) for one episode: the state after each episode's last kept step."""
+        """State record after the last kept step of each episode, uint8 (E, S); of a single episode, uint8 (S,)."""
         return self["episode_end_state"]
 
 
@@ -90,7 +90,7 @@ class Episode(FieldArrays):
     `episode["actions"]` is the same as `episode.actions`.
 
     Args:
-        history: the history that contains it.
+        history: the history that contains the episode.
         number: number of the episode in its history, from 0.
 
     Attributes:
@@ -126,9 +126,9 @@ class Episode(FieldArrays):
 
 
 class Episodes(Sequence[Episode]):
-    """Sequence of the episodes of a history, or of a part of them, in order.
+    """Sequence of all or some episodes of a history, in order.
 
-    `episodes[i]` is the i-th `Episode`, `episodes[a:b]` a part of the sequence. Only the episode ends are read before
+    `episodes[i]` is the i-th `Episode`, `episodes[a:b]` a shorter sequence. Only the ends of episodes are read before
     an episode's arrays are accessed.
 
     Args:
@@ -166,5 +166,5 @@ class Episodes(Sequence[Episode]):
         return (self[position] for position in range(len(self)))
 
     def returns(self) -> np.ndarray:
-        """Return the return of each episode, float64 (E,): the sum of its rewards."""
+        """Return the return of each episode, which is the sum of the episode's rewards, as float64 (E,)."""
         return self._history.returns()[np.array(self.numbers, np.int64)]

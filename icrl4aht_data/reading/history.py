@@ -27,26 +27,26 @@ state records, which `icrl4aht_data.overcooked.observe` renders as observations.
 
 Labels = Literal["expert", "oracle"]
 LABELS: tuple[Labels, ...] = ("expert", "oracle")
-"""Kinds of labels, actions that a model learns to predict: "expert" (field `expert_actions`), greedy actions of the
-policy with return `Entry.expert_return`, or "oracle" (field `oracle_actions`), actions of the scripted oracle, which
-knows the full state."""
+"""Kinds of labels, the actions that a model learns to predict: "expert" (field `expert_actions`), greedy actions of a
+policy with the return `Entry.expert_return`, or "oracle" (field `oracle_actions`), actions of the scripted oracle,
+which knows the full state."""
 
 
 class History(FieldArrays):
     """One learning history: an ego that learns with one fixed teammate, T steps in E episodes.
 
-    `history.actions`, `.rewards`, `.obs` and so on are read-only NumPy arrays, read on first access and kept;
+    `history.actions`, `.rewards`, `.obs` and so on are read-only NumPy arrays, read on first access and then cached;
     `history["actions"]` is the same as `history.actions`. `history.read("obs", 0, 100)` reads only some rows;
     `history.episodes[-1].actions` are the actions of the last episode.
 
     Args:
         entry: the history's entry of the index.
         open_shard: function from a shard's name to the opened shard, called on first access of a field.
-        obs: presentation of observations in `History.obs`; see `OBS`.
-        channels: channels of `History.obs`, the layout's own or the canonical ones; see `channels.CHANNELS`.
+        obs: form of the observations in `History.obs`; see `OBS`.
+        channels: channels of `History.obs`, "own" (of the layout) or "canonical"; see `channels.CHANNELS`.
 
     Attributes:
-        entry: the history's index entry: ids, layout, teammate, T, returns and others.
+        entry: the history's index entry, with ids, layout, teammate, T, returns and other fields.
     """
 
     def __init__(self, entry: Entry, open_shard: Callable[[str], Shard], obs: Obs, channels: Channels = "own") -> None:
@@ -73,7 +73,7 @@ class History(FieldArrays):
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
-            array = self.rows(name, 0, self.entry.T if name == "obs" else self.entry.rows(self._field(name)))
+            array = self.rows(name, 0, self.entry.T if name == "obs" else self.entry.rows(self._checked_field(name)))
             array.flags.writeable = False  # every later access returns the same array
             self._arrays[name] = array
         return self._arrays[name]
@@ -86,7 +86,7 @@ class History(FieldArrays):
     def read(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Return rows start..stop of a field as stored; see `schema.FIELDS` for names, dtypes and shapes.
 
-        Observations that a lite release does not store are rendered, with the layout's own channels.
+        Observations that a lite release does not store are rendered, with channels="own".
 
         Args:
             name: the field.
@@ -95,11 +95,11 @@ class History(FieldArrays):
         Raises:
             UnknownNameError: for a name that is not a field.
             OptionError: if `start` or `stop` is not an integer.
-            LabelsMissingError: for expert, oracle or teammate actions of a history without them.
+            LabelsMissingError: if the history does not have the expert, oracle or teammate actions asked for.
             NotStoredError: for states of a release without state records.
             ShardCorruptError: if the checksum of a chunk is wrong; the message names the chunk.
         """
-        field = self._field(name)
+        field = self._checked_field(name)
         try:
             if isinstance(start, bool) or isinstance(stop, bool):
                 raise TypeError
@@ -108,11 +108,11 @@ class History(FieldArrays):
             raise OptionError(f"rows {start!r} to {stop!r} of {name}: expected integers, as in a slice") from error
         stop = max(start, stop)
         if self.kind in field.absent:
-            return self._rendered(start, stop, np.uint8, canonical=False)
+            return self._render_rows(start, stop, np.uint8, canonical=False)
         return self._shard.read(self.entry.history_id, field, start, stop)
 
     def rows(self, name: str, start: int, stop: int) -> np.ndarray:
-        """Return rows start..stop of a field; like `read`, but "obs" follows the options `obs` and `channels`."""
+        """Return rows start..stop of a field as `read` does; "obs" has the form of the options `obs` and `channels`."""
         if name in self._arrays:
             return self._arrays[name][start:stop]
         if name != "obs":
@@ -120,18 +120,18 @@ class History(FieldArrays):
         if self._obs == "state":
             return self.read("state", start, stop)
         if self.kind in FIELDS["obs"].absent:
-            return self._rendered(start, stop, self._obs, self._canonical)
+            return self._render_rows(start, stop, self._obs, self._canonical)
         rows = self.read("obs", start, stop)
         return (to_canonical(self._shard.layout, rows) if self._canonical else rows).astype(self._obs, copy=False)
 
-    def _rendered(self, start: int, stop: int, dtype: DTypeLike, canonical: bool) -> np.ndarray:
+    def _render_rows(self, start: int, stop: int, dtype: DTypeLike, canonical: bool) -> np.ndarray:
         """Render observations (stop - start, 5, 5, C) of a release without stored observations."""
         layout = self._shard.layout
         what = f"{self._shard.path}: history {self.entry.history_id}: obs"
         out = new_array((stop - start, *observation_shape(layout, canonical)), dtype, what)
         return fast_observe(layout, self.read("state", start, stop), out, canonical=canonical)
 
-    def _field(self, name: str) -> Field:
+    def _checked_field(self, name: str) -> Field:
         check_choice("field", name, FIELDS)
         field = FIELDS[name]
         if field.row == "state" and self.kind in field.absent:
@@ -147,7 +147,7 @@ class History(FieldArrays):
         return field
 
     def returns(self) -> np.ndarray:
-        """Return the learning curve, float64 (E,): each episode's return over its kept steps."""
+        """Return the learning curve: the return of each episode over the kept steps, as float64 (E,)."""
         return episode_returns(self.read("rewards"), self.read("dones"))
 
     @property
@@ -157,7 +157,7 @@ class History(FieldArrays):
 
     @cached_property
     def episode_ends(self) -> np.ndarray:
-        """int64 (E,): the end (exclusive) of each episode."""
+        """End (exclusive) of each episode, int64 (E,)."""
         return np.flatnonzero(self.read("dones")) + 1
 
     def plot(self) -> Picture:
@@ -180,8 +180,7 @@ class History(FieldArrays):
 
         Raises:
             PositionError: for an episode that the history does not have.
-            OptionError: for an episode that is not an integer, an impossible `cell` or `fps`, or if Pillow is not
-                installed.
+            OptionError: if `episode` is not an integer, `cell` or `fps` is out of range, or Pillow is not installed.
             NotStoredError: for a release without state records.
         """
         chosen = self.episodes[check_int("episode", episode, -(2**63))]

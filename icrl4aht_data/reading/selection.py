@@ -1,4 +1,4 @@
-"""Selections of a release's learning histories, and the options of reading them."""
+"""Selections of a release's learning histories, and options for reading them."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ FilterValues = str | Sequence[str] | None
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Options of reading histories.
+    """Options for reading histories.
 
     Args:
         obs: form of observations; see `history.OBS`.
@@ -61,7 +61,7 @@ class ReadOptions:
         channels: channels of observations; see `channels.CHANNELS`.
 
     Raises:
-        UnknownNameError, OptionError: for values that do not exist.
+        UnknownNameError, OptionError: for an unknown name or an impossible number of threads.
     """
 
     obs: Obs = "float32"
@@ -79,11 +79,11 @@ class ReadOptions:
 class Selection:
     """An ordered selection of a release's histories. Opening reads only the index; arrays are read on access.
 
-    `len(selection)` counts histories, `selection[i]` is the i-th, `selection[a:b]` a smaller selection.
-    Selections of one release share its index and opened shards.
+    `len(selection)` is the number of histories, `selection[i]` is the i-th history, `selection[a:b]` a smaller
+    selection. Selections of one release share its index and opened shards.
 
     Args:
-        location: the release.
+        location: location of the release.
         index: the release's index.
         shards: the release's opened shards.
         options: reading options.
@@ -93,15 +93,15 @@ class Selection:
         ids: int (H,), ids of the histories in the release, in the order of the selection.
         index: the release's index.
         info: the release's versions, kind, environment and totals, as in meta/info.json.
-        origin: the release, a `fetch.Remote` if it is at an address.
+        origin: location of the release, a `fetch.Remote` for a remote release.
         root: the release's folder on this machine; for a remote release the folder of downloaded files.
         options: form and channels of observations, cache mode, threads.
         obs: form of observations: "float32", "uint8" or "state"; see `history.OBS`.
-        channels: channels of observations: each layout's own, or the canonical ones; see `channels.CHANNELS`.
+        channels: channels of observations, "own" (of each layout) or "canonical"; see `channels.CHANNELS`.
         threads: number of threads that decode and render.
 
     Raises:
-        OptionError: for obs="state" of a release without state records.
+        OptionError: if obs="state" and the release has no state records.
     """
 
     def __init__(
@@ -121,10 +121,10 @@ class Selection:
         self._source: HistorySource | None = None
         if self.obs == "state" and not self.has_states:
             raise OptionError(
-                f'obs = "state": {location} has observations only, no state records; take float32 or uint8'
+                f'obs = "state": {location} has observations only, no state records; use float32 or uint8'
             )
 
-    # Workers of a data loader get a pickle without the decoded arrays, and open their own source.
+    # The pickle for workers of a data loader omits decoded arrays: each worker opens a new source.
     def __getstate__(self) -> tuple:
         return self.origin, self.index, self._shards, self.options, self.ids
 
@@ -133,29 +133,29 @@ class Selection:
 
     @property
     def obs_shape(self) -> tuple[int, int, int]:
-        """Shape of one observation, (5, 5, C), also with obs="state", where it applies to rendered records.
+        """Shape of one observation, (5, 5, C); with obs="state", the shape after rendering a state record.
 
         Raises:
-            OptionError: if the selection's layouts have different numbers of own channels.
+            OptionError: if the selection's layouts have different numbers of channels, unless channels are canonical.
         """
         # Layouts may share a shape, so the first layout of each shape is enough for the message.
         shapes = {observation_shape(layout, self.channels == "canonical"): layout for layout in self.layouts}
         if len(shapes) > 1:
             raise OptionError(
-                f"the selection spans layouts {listed_names([layout.name for layout in self.layouts])}, whose own "
-                f"observations are of unequal shape ({', '.join(map(str, shapes))}): take "
-                f'channels="canonical", which all layouts share, or add layout={self.layouts[0].name!r}'
+                f"the selection has layouts {listed_names([layout.name for layout in self.layouts])}, and their "
+                f"observations have different shapes ({', '.join(map(str, shapes))}): choose "
+                f'channels="canonical", which all layouts share, or one layout: layout={self.layouts[0].name!r}'
             )
         return next(iter(shapes))
 
     @cached_property
     def provenance(self) -> ProvenanceByTask:
-        """Origin of each task's histories, as in meta/provenance.json: task id -> record."""
+        """Task id -> record of how the task's histories were made, as in meta/provenance.json."""
         return read_provenance(self.origin.file(PROVENANCE))
 
     @property
     def has_states(self) -> bool:
-        """Whether the release has state records, which releases of kind `observations` do not."""
+        """Whether the release has state records; releases of kind `observations` have none."""
         return self.info.kind in KINDS
 
     def __len__(self) -> int:
@@ -217,7 +217,7 @@ class Selection:
         field = ALIASES.get(name, name)
         if ENTRY_HINTS.get(field) not in TEXTS:
             raise unknown("field of names", name, ("labels", *(one for one, of in ENTRY_HINTS.items() if of in TEXTS)))
-        # Codes are positions in the values of the whole release, so some of them may be absent from this selection.
+        # Codes are positions in the values of the release, so some values may be absent from this selection.
         numbers = np.bincount(self.column_codes(field), minlength=1).tolist()
         found = zip(self.index.values(field), numbers, strict=False)
         return {value: number for value, number in found if value and number}
@@ -225,19 +225,19 @@ class Selection:
     def has_labels(self, labels: Labels) -> np.ndarray:
         """Return bool (H,), True for histories with labels of a kind; see `history.LABELS`.
 
-        For noise histories the oracle labels are the expert actions, even if `has_oracle_actions` is False because they
-        are not stored twice; see `Entry.stored_field`.
+        In noise histories, oracle labels are equal to expert actions, and exist even if `has_oracle_actions` is False,
+        since equal actions need not be stored twice; see `Entry.stored_field`.
         """
         # In noise histories oracle and expert labels are equal, and stored once, as expert labels.
         has = self.column(f"has_{labels}_actions")
         return has if labels == "expert" else has | ((self.column("source") == "noise") & self.has_labels("expert"))
 
     def describe(self) -> str:
-        """Return the selection as text, one fact per line: numbers of histories by split, source, layout and others."""
+        """Describe the selection as text, with the numbers of histories by split, source, layout, teammate, labels."""
         return "\n".join([repr(self), *(f"{name}: {self.counts_text(name)}" for name in COUNTED)])
 
     def history(self, history_id: int) -> History:
-        """Return one history of the release, whether selected or not.
+        """Return the history of the release with the given id, even if this history is not selected.
 
         Raises:
             UnknownNameError: if the release has no history with that id.
@@ -253,21 +253,21 @@ class Selection:
 
         Returns:
             Array (H,) of strings, int64, float64 or bool, with "", -1 or NaN for None; (H, 3) for `obs_shape`, the
-            shape with the layout's own channels. `teammate_of_episode` is JSON text.
+            shape with channels="own". `teammate_of_episode` is JSON text.
 
         Raises:
-            UnknownNameError: if there is no such field; names the nearest one.
+            UnknownNameError: if there is no such field; suggests the nearest name.
         """
         name = ALIASES.get(name, name) if isinstance(name, str) else name
         if not isinstance(name, str) or name not in ENTRY_HINTS:
             raise unknown("column", name, (*ENTRY_HINTS, *ALIASES))
-        # Ids and shapes are functions of the position and the layout, so the index has no columns of them.
+        # The index has no columns of ids and shapes, which follow from the position and the layout.
         if name == "history_id":
             return self.ids.astype(np.int64)
         if name == "obs_shape":
             return np.array([layout.obs_shape for layout in self.layouts])[self.layout_numbers]
         if ENTRY_HINTS[name] in TEXTS or name in ENCODED:
-            # An empty array would be of floats; a release without histories has no values.
+            # A release without histories has no values, and NumPy would make an array of floats of an empty list.
             return np.array(self.index.values(name) or [""])[self.column_codes(name)]
         return self.index.entries.column(name)[self.ids]
 
@@ -297,9 +297,9 @@ class Selection:
 
     @cached_property
     def layout_numbers(self) -> np.ndarray:
-        """int32 (H,): the index of each history's layout in `layouts`."""
+        """Index of each history's layout in `layouts`, int32 (H,)."""
         names = self.index.values("layout")
-        # A table from the release's codes to the selection's numbers: one lookup per history, and no comparison.
+        # A table from the release's codes to the selection's numbers takes one lookup per history, and no comparison.
         number = np.zeros(len(names), np.int32)
         number[[names.index(layout.name) for layout in self.layouts]] = np.arange(len(self.layouts))
         return number[self.column_codes("layout")]
@@ -318,7 +318,7 @@ class Selection:
     @cached_property
     def cache(self) -> CacheChoice:
         """The cache mode that samplers use for this selection, and the reason; see `sources.CACHE_MODES`."""
-        # From columns, since an entry of each of 82,000 histories would take longer than opening the release.
+        # Sizes come from columns, since making 82,000 entries would take longer than opening the release.
         size = 0
         for number, layout in enumerate(self.layouts):
             members = self.layout_numbers == number
@@ -329,12 +329,12 @@ class Selection:
     @property
     def storage(self) -> HistorySource:
         """Source of the selection's rows in cache mode `cache`; `ram` and `mmap` decode all rows on first access."""
-        if self._source is None:  # without a lock, which a fork could leave held; concurrent first accesses both decode
+        if self._source is None:  # no lock, since a fork could leave it locked; parallel first accesses both decode
             self._source = open_source(self.cache.cache, self.entries, self._shards, self.threads)
         return self._source
 
-    def forget_chunks(self) -> None:
-        """Clear the cache of decoded chunks that all selections of this release share."""
+    def clear_chunk_cache(self) -> None:
+        """Clear the cache of decoded chunks, which all selections of this release share."""
         self._shards.cache.clear()
 
     def with_options(
@@ -351,7 +351,7 @@ class Selection:
             UnknownNameError, OptionError: for impossible options, such as obs="state" for a release of observations.
         """
         changed: dict[str, Any] = {"obs": obs, "cache": cache, "threads": threads, "channels": channels}
-        # `replace` checks the new options as the class does.
+        # `replace` creates new options, which check themselves.
         options = replace(self.options, **{name: value for name, value in changed.items() if value is not None})
         return type(self)(self.origin, self.index, self._shards, options, self.ids)
 
@@ -367,63 +367,63 @@ class Selection:
         """Return the histories of this selection whose index fields have one of the wanted values.
 
         Args:
-            predicate: only histories for whose index entry this function returns true, such as
-                `lambda entry: entry.return_end > 30`. It reads no arrays; to filter by array content, pass `select` one
-                bool per history: `ds.select([history.returns().max() > 40 for history in ds])`.
-            min_expert_return: only histories whose labels come from a policy that earned at least this much, acting
-                greedily: `Entry.expert_return`.
-            learner: only histories of these learners, numbered from 0 within each task: `Entry.learner`.
+            predicate: function of an index entry that returns True for histories to keep, such as `lambda entry:
+                entry.return_end > 30`. To filter by the content of arrays, pass one bool per history to `select`:
+                `ds.select([history.returns().max() > 40 for history in ds])`.
+            min_expert_return: minimum of `Entry.expert_return`, the return of the policy that gives the labels, acting
+                greedily.
+            learner: number or numbers of the learners to keep (`Entry.learner`), counted from 0 within each task.
             wanted: values of split, layout, track, teammate_family, teammate_kind (alias algorithm), source, label_view
                 or task_id: one value, several values, or None for any, as in `load_icrl4aht`.
 
         Raises:
             UnknownNameError: for a field or value that does not exist.
             EmptySelectionError: if no history is left.
-            OptionError: if `predicate` is not a function that returns a bool, or `min_expert_return` not a number.
+            OptionError: if `predicate` is not a function that returns a bool, or `min_expert_return` is not a number.
             NotStoredError: for `min_expert_return`, if the expert return of a remaining history is unknown.
         """
-        # The index answers for the release; isin keeps the order of this selection, and repeated histories.
-        found = self._keep(np.isin(self.ids, self.index.query(**wanted)), f"has {wanted}")
+        # The query covers the release; `isin` keeps this selection's order and repeated histories.
+        found = self._select_if(np.isin(self.ids, self.index.query(**wanted)), f"has {wanted}")
         if learner is not None:
             learners = found.column("learner")
             known = ", ".join(map(str, np.unique(learners).tolist()))
-            found = found._keep(np.isin(learners, learner), f"has learner = {learner!r}; its learners: {known}")
+            found = found._select_if(np.isin(learners, learner), f"has learner = {learner!r}; its learners: {known}")
         if min_expert_return is not None:
             least, returns = check_number("min_expert_return", min_expert_return), found.column("expert_return")
             if np.isnan(returns).any():
                 raise NotStoredError(
-                    f"min_expert_return: {self.origin} does not say what the policies behind the labels of "
-                    f"{np.isnan(returns).sum()} of {len(found)} histories earn; leave them out by "
+                    f"min_expert_return: {self.origin} does not have the returns of the policies behind the labels of "
+                    f"{np.isnan(returns).sum()} of {len(found)} histories; leave these histories out by "
                     f'ds.select(~np.isnan(ds.column("expert_return")))'
                 )
-            found = found._keep(returns >= least, f"has expert_return >= {least:g}; the highest is {returns.max():g}")
+            found = found._select_if(returns >= least, f"has expert_return >= {least:g}; highest: {returns.max():g}")
         if predicate is not None:
             if not callable(predicate):
                 raise OptionError(
                     f"filter: expected a function of an index entry, such as lambda entry: entry.return_end > 30, "
-                    f"found {predicate!r}; values have names: filter(layout={str(predicate)!r})"
+                    f"found {predicate!r}; give a value with its field: filter(layout={str(predicate)!r})"
                 )
             kept = [predicate(entry) for entry in found.entries]
             if others := {type(one).__name__ for one in kept if not isinstance(one, bool | np.bool_)}:
                 raise OptionError(f"filter: expected the function to return True or False, found {', '.join(others)}")
-            found = found._keep(np.array(kept), "passes the function")
+            found = found._select_if(np.array(kept), "passes the function")
         return found
 
-    def _keep(self, kept: np.ndarray, condition: str) -> Self:
+    def _select_if(self, kept: np.ndarray, condition: str) -> Self:
         """Return the histories of this selection for which `kept`, bool (H,), is True.
 
         Raises:
-            EmptySelectionError: if there are none; with the condition in words.
+            EmptySelectionError: if no history is left; the message has the condition.
         """
         if not kept.any():
-            raise EmptySelectionError(f"{self.root}: no history of this selection {condition}; it is {self!r}")
+            raise EmptySelectionError(f"{self.root}: no history of this selection {condition}: {self!r}")
         return self.select(kept)
 
     def select(self, ids: Sequence[int] | np.ndarray) -> Self:
-        """Return the histories of this selection with these ids, in this order.
+        """Return the histories of this selection with the given ids, in the given order.
 
         Args:
-            ids: history ids; or bool (H,), such as `ds.column("layout") == "demo_wide"`, True for those to keep.
+            ids: history ids; or bool (H,), such as `ds.column("layout") == "demo_wide"`, True for histories to keep.
 
         Raises:
             EmptySelectionError: if no id is given.
@@ -431,13 +431,13 @@ class Selection:
             OptionError: for anything but integers, and for a bool array of another length.
         """
         try:
-            given = np.asarray(ids)  # also of a list of bools, as a comprehension over histories gives
-        except (TypeError, ValueError) as error:  # nested lists of unequal length
+            given = np.asarray(ids)  # accepts a list of bools, for example from a comprehension
+        except (TypeError, ValueError) as error:  # raised for nested lists of unequal length
             raise OptionError(f"select: expected a list of history ids, found {ids!r:.200}") from error
-        if given.dtype == bool and given.shape == self.ids.shape:  # first, since bools would index like 0 and 1
+        if given.dtype == bool and given.shape == self.ids.shape:  # a mask, replaced by the ids that it keeps
             given = self.ids[given]
         if not given.size:
-            raise EmptySelectionError(f"{self.root}: select was given no history id")
+            raise EmptySelectionError(f"{self.root}: select: expected at least one history id, found none")
         if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer):
             raise OptionError(
                 f"select: expected a list of history ids, or a bool for each of {counted_histories(len(self))}, found "
@@ -448,6 +448,6 @@ class Selection:
         if len(absent):
             within = f"{self.ids.min()}..{self.ids.max()}"
             raise UnknownNameError(
-                f"{self.root}: this selection has no history {absent.tolist()}, ids are within {within}; it is {self!r}"
+                f"{self.root}: this selection has no history {absent.tolist()}, its ids are within {within}: {self!r}"
             )
         return type(self)(self.origin, self.index, self._shards, self.options, chosen)

@@ -1,7 +1,8 @@
-"""Reads an HDF5 shard at the offsets of its chunk table and checks each chunk's hash; see `writing.shard_writer`.
+"""Reader of HDF5 shards, which finds chunks by a chunk table and checks their hashes; see `writing.shard_writer`.
 
-Chunks are plain HDF5 ones (shuffle + deflate), so any HDF5 tool reads a shard. This reader does not use libhdf5: it
-reads a chunk's bytes at the offset in the chunk table, checks their hash and inflates them, without a global lock.
+Chunks are ordinary HDF5 chunks (shuffle + deflate), so any HDF5 tool can read a shard. This reader does not use
+libhdf5: it reads a chunk's bytes at the offset in the chunk table, checks their hash and inflates them, without a
+global lock.
 """
 
 from __future__ import annotations
@@ -39,10 +40,10 @@ _CACHE_BYTES = 256 * 2**20
 
 
 class ChunkCache:
-    """Cache of a release's decoded chunks of limited size; drops the least recently used. Thread-safe.
+    """Thread-safe cache of a release's decoded chunks, of limited size; drops the least recently used chunks.
 
     Args:
-        size: limit in bytes. The newest chunk is kept even if it alone is larger.
+        size: limit in bytes; the newest chunk remains in the cache even if it is larger than the limit.
     """
 
     def __init__(self, size: int = _CACHE_BYTES) -> None:
@@ -50,7 +51,7 @@ class ChunkCache:
         self.clear()
 
     def clear(self) -> None:
-        """Drop all chunks."""
+        """Remove all chunks from the cache."""
         self._chunks: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
         self._bytes, self._process, self._lock = 0, os.getpid(), threading.Lock()
 
@@ -61,7 +62,7 @@ class ChunkCache:
         self.__init__(size)
 
     def get(self, key: tuple[str, int]) -> np.ndarray | None:
-        """Return the chunk with the key (shard, row of its chunk table), or None."""
+        """Return the chunk with the key (shard, row of its chunk table), or None if it is not cached."""
         if self._process != os.getpid():  # after a fork, a thread that no longer exists may hold the lock
             self.clear()
         with self._lock:
@@ -71,7 +72,7 @@ class ChunkCache:
             return rows
 
     def put(self, key: tuple[str, int], rows: np.ndarray) -> None:
-        """Add a chunk."""
+        """Add a chunk; if the cache is full, drop the least recently used chunks."""
         with self._lock:
             if key not in self._chunks:
                 self._chunks[key] = rows
@@ -81,7 +82,7 @@ class ChunkCache:
 
 
 class Shard:
-    """One shard of a release, which reads rows of its histories. Thread-safe; can be pickled.
+    """One shard of a release; reads rows of the histories in the shard. Thread-safe; can be pickled.
 
     Args:
         location: the release. If it is remote, opening downloads the shard and its chunk table.
@@ -120,7 +121,7 @@ class Shard:
         location.fetch([chunk_table_name(name), name])
         self.table = read_table(location.file(chunk_table_name(name)))
         self._check_table()
-        self.table = np.array(self.table)  # after the check, since the file could be too large for memory
+        self.table = np.array(self.table)  # loaded after the check, since the file could be too large for memory
         self._check_size()
 
     def _check_table(self) -> None:
@@ -149,7 +150,7 @@ class Shard:
         wrong = np.flatnonzero((stored > raw + raw // 1000 + 64) | (raw > DEFLATE_RATIO * stored))
         if len(wrong):
             raise ShardMismatchError(
-                f"{self.path}: {self.describe(int(wrong[0]))} cannot be {raw[wrong[0]]} bytes deflated; "
+                f"{self.path}: {self.describe(int(wrong[0]))} cannot be {raw[wrong[0]]} bytes, compressed; "
                 f"fetch meta/ and the shard again"
             )
 
@@ -158,10 +159,10 @@ class Shard:
         try:
             size = self.path.stat().st_size
         except OSError as error:
-            raise self._unreadable(error) from error
+            raise self._read_error(error) from error
         offset, length = self.table["offset"], self.table["size"]
         if int(length.sum(dtype=np.int64)) > size >= int((offset + length).max(initial=0)):
-            raise ShardMismatchError(f"{self.path}: has {size} bytes, of which the chunk table gives some twice")
+            raise ShardMismatchError(f"{self.path}: has {size} bytes, and the chunk table uses some of them twice")
         beyond = np.flatnonzero((offset > size) | (length > np.maximum(size, offset) - offset))
         if len(beyond):
             raise ShardTruncatedError(
@@ -169,7 +170,7 @@ class Shard:
                 f"fetch the shard again, then run `icrl4aht-data verify`"
             )
 
-    def _unreadable(self, error: OSError) -> ReleaseError:
+    def _read_error(self, error: OSError) -> ReleaseError:
         if isinstance(error, FileNotFoundError):
             return ShardMissingError(f"{self.path}: the index names this shard, but there is no such file")
         return ShardUnreadableError(
@@ -180,7 +181,7 @@ class Shard:
         """Return rows start..stop of a field, in the field's dtype. The range must be within the history.
 
         Raises:
-            ShardCorruptError: names the chunk whose hash or size is wrong.
+            ShardCorruptError: if the hash or size of a chunk is wrong; names the chunk.
         """
         what = f"{self.path}: history {history_id}: {field.name}"
         rows = new_array((stop - start, *self._elements[field.name].shape), field.dtype, what)
@@ -188,15 +189,15 @@ class Shard:
         return rows
 
     def read_into(self, history_id: int, field: Field, start: int, out: np.ndarray, *, keep: bool = True) -> None:
-        """Fill `out` with rows from `start` on, cast to its dtype; see `read`.
+        """Fill `out` with the rows of a field from row `start` on, converted to the dtype of `out`; see `read`.
 
         Args:
-            history_id, field, start: the rows.
+            history_id, field, start: history, field and first row to read.
             out: (rows, ...) of any dtype.
             keep: add decoded chunks to the cache; False for rows that are read once.
 
         Raises:
-            ShardCorruptError: names the chunk whose hash or size is wrong.
+            ShardCorruptError: if the hash or size of a chunk is wrong; names the chunk.
             ShardMismatchError: if the dtype of `out` cannot represent a value.
         """
         stored, length = self.entries[history_id].stored_field(field), self._chunk_rows(history_id, field)
@@ -212,7 +213,7 @@ class Shard:
             low, high = max(start, begin), min(stop, begin + length)
             part, wanted = out[low - start : high - start], rows[low - begin : high - begin]
             part[...] = wanted
-            # A forged release may have 300 as an action, which fits into its own int32 but not into the samplers' int8.
+            # A forged release may store the action 300, which fits into int32 but not into the int8 arrays of samplers.
             if not np.can_cast(rows.dtype, part.dtype) and not np.array_equal(part, wanted):
                 raise ShardMismatchError(
                     f"{self.path}: {self.describe(first + number)} has values that {part.dtype} cannot hold; "
@@ -237,10 +238,10 @@ class Shard:
         return rows
 
     def checked_bytes(self, row: int) -> bytes:
-        """Return the stored bytes of the chunk in one row of the chunk table.
+        """Return the stored bytes of the chunk in one row of the chunk table, after checking their hash.
 
         Raises:
-            ShardCorruptError: if they are damaged; names the chunk.
+            ShardCorruptError: if the bytes are damaged; names the chunk.
         """
         offset, size = self.table[row].item()[:2]
         try:
@@ -249,7 +250,7 @@ class Shard:
                 data = stream.read(size)
             check_chunk(data, self.table[row])
         except OSError as error:
-            raise self._unreadable(error) from error
+            raise self._read_error(error) from error
         except ValueError as error:
             raise ShardCorruptError(
                 f"{self.path}: {self.describe(row)}: {error}; the file is damaged: `icrl4aht-data download` replaces it"
@@ -274,7 +275,7 @@ class Shard:
                 yield first + number, history_id, FIELDS[name]
 
     def describe(self, row: int) -> str:
-        """Describe a chunk for messages: its number, field, history and bytes."""
+        """Return a text that identifies a chunk in messages, with number, field, history and bytes."""
         offset, size = int(self.table["offset"][row]), int(self.table["size"][row])
         if not self.table["rows"][row]:
             return f"bytes {offset}..{offset + size}, between the chunks"
@@ -298,7 +299,7 @@ class Shards:
         self.cache = ChunkCache()
 
     def open(self, name: str) -> Shard:
-        """Return the shard with a path in the release; it is fetched if the release is remote."""
+        """Return the shard with this path in the release; a shard of a remote release is downloaded first."""
         if name not in self._open:
             entries = self._index.entries
             members = [entries[row] for row in np.flatnonzero(entries.matches("shard", [name])).tolist()]
@@ -306,6 +307,6 @@ class Shards:
         return self._open[name]
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Fetch shards of a remote release and their chunk tables in parallel."""
+        """Download shards of a remote release and their chunk tables in parallel."""
         closed = [name for name in dict.fromkeys(names) if name not in self._open]
         self._location.fetch([*map(chunk_table_name, closed), *closed])

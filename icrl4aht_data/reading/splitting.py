@@ -1,4 +1,4 @@
-"""Choice of teammates and histories to hold out of training, a function of names and a seed.
+"""Choice of teammates and histories to hold out of training, determined by names and a seed.
 
 Each name has a random rank, so the choice between two histories does not depend on the rest of the selection.
 """
@@ -20,7 +20,7 @@ SPLIT_BY: tuple[SplitBy, ...] = ("teammate", "history")
 
 
 def choose_teammates(teammates: np.ndarray, share: float, seed: int) -> np.ndarray:
-    """Choose a share of the teammates to hold out, at least one unless there is only one.
+    """Choose a share of the teammates to hold out: at least one teammate, but none if there is only one teammate.
 
     Args:
         teammates: strings (H,), the name of each history's teammate.
@@ -31,11 +31,11 @@ def choose_teammates(teammates: np.ndarray, share: float, seed: int) -> np.ndarr
         bool (H,): True for the histories with a chosen teammate.
     """
     names = sorted(set(teammates.tolist()), key=lambda name: _rank(seed, name))
-    return np.isin(teammates, names[: _count(share, len(names)) if len(names) > 1 else 0])
+    return np.isin(teammates, names[: _held_out_count(share, len(names)) if len(names) > 1 else 0])
 
 
 def choose_histories(selection: Selection, share: float, seed: int) -> np.ndarray:
-    """Choose a share of the histories to hold out, at least one; every task keeps at least one history.
+    """Choose a share of the histories to hold out: at least one history, but never all histories of a task.
 
     Args:
         selection: the histories to divide.
@@ -51,22 +51,22 @@ def choose_histories(selection: Selection, share: float, seed: int) -> np.ndarra
     names, of_task = selection.index.values("task_id"), defaultdict(list)
     columns = [selection.column_codes("task_id"), selection.column("env_idx"), selection.column("learner")]
     for row, (code, stream, learner) in enumerate(np.stack(columns, axis=1).tolist()):
-        # The rank depends on the learner only if it is not 0, as before releases had several.
+        # Names omit learner 0, so ranks remain as they were when releases had one learner per task.
         name = (names[code], stream, learner) if learner else (names[code], stream)
         of_task[code].append((_rank(seed, *name), row))
-    # One history per task stays in training.
+    # The history with the highest rank in each task always stays in training.
     candidates = sorted(one for ranked in of_task.values() for one in sorted(ranked)[:-1])
     if not candidates:
         raise OptionError(
-            f"every task of {selection!r} has one history: expected a task with two or more, one to train on and one "
-            f"to hold out"
+            f"every task of {selection!r} has one history: expected a task with two or more histories, one to train "
+            f"on and one to hold out"
         )
     chosen = np.zeros(len(selection), bool)
-    chosen[[row for _, row in candidates[: _count(share, len(selection))]]] = True
+    chosen[[row for _, row in candidates[: _held_out_count(share, len(selection))]]] = True
     return chosen
 
 
-def _count(share: float, total: int) -> int:
+def _held_out_count(share: float, total: int) -> int:
     return max(1, min(round(share * total), total - 1))
 
 

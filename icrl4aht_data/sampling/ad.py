@@ -24,7 +24,7 @@ from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.options import check_int
 
 if TYPE_CHECKING:
-    import jax  # noqa: F401 - in the sampler's base class
+    import jax  # noqa: F401 - used by a type argument of the base class
     import torch  # noqa: F401
 
 A = TypeVar("A")
@@ -36,21 +36,22 @@ class ADBatch(NamedTuple, Generic[A]):
 
     Rows are padded with zeros if the history, or the part selected by `episodes` or `curriculum`, is shorter than L.
     The `prev_*` fields hold the values of the previous step of the history, also at the first step of a window or of an
-    episode. Where `is_first` is True there is no previous step: the zeros are fillers, although 0 is the action "up".
+    episode. Where `is_first` is True there is no previous step: zeros are placeholders, although 0 is the action "up".
 
     Attributes:
         obs: float32 or uint8 (B, L, 5, 5, C): the ego's observations; with obs="state" uint8 (B, L, S): state records.
         prev_actions: int32 (B, L): the ego's actions in the previous steps, 0..5; 0 at a history's first step.
         prev_rewards: float32 (B, L): the team's rewards in the previous steps; 0 at a history's first step.
-        target_actions: int64 (B, L): what a model learns to predict, 0..5: the ego's actions, or with `labels` those of
-            the expert or the oracle. The actions taken are then in the next column of `prev_actions`.
+        target_actions: int64 (B, L): the actions that a model learns to predict, 0..5: the ego's actions, or with the
+            option `labels` the actions of the expert or the oracle. In both cases, the next column of `prev_actions`
+            has the actions taken by the ego.
         dones: bool (B, L): True at the last step of an episode.
         attention_mask: bool (B, L): False on padding.
         prev_teammate_actions: int32 (B, L): the teammate's actions in the previous steps, 0..5, and 0 at a history's
             first step; None unless the sampler was made with teammate_actions=True.
         layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
             several layouts.
-        is_first: bool (B, L): True at the first step of a history, where the `prev_*` fields are fillers.
+        is_first: bool (B, L): True at the first step of a history, where the `prev_*` fields are placeholders.
         families: int32 (B,): index of the family of each row's teammate in `benchmark.facts.all_families()`; None
             unless the sampler was made with families=True.
     """
@@ -63,7 +64,7 @@ class ADBatch(NamedTuple, Generic[A]):
     attention_mask: A
     prev_teammate_actions: A | None = None
     layouts: A | None = None
-    is_first: A = cast(Any, None)  # needs a default after others; samplers always set it
+    is_first: A = cast(Any, None)  # a default is required after others; samplers always set it
     families: A | None = None
 
     describe = describe_batch
@@ -71,14 +72,14 @@ class ADBatch(NamedTuple, Generic[A]):
 
 
 class _Windows(NamedTuple):
-    """The drawn windows of a batch.
+    """The randomly drawn windows of a batch.
 
     Attributes:
-        position: int64 (B,), positions in the selection.
-        starts: int64 (B,), first steps.
-        rows: the steps of each window as in `ReadRequest`: `starts`, or every step, int64 (B, L).
-        previous: the step before each of `rows`; -1 before the first step of a history.
-        valid: int64 (B,), number of steps of each window; padding follows them.
+        position: int64 (B,), position of each window's history in the selection.
+        starts: int64 (B,), first step of each window.
+        rows: the rows to read as in `ReadRequest`: first steps, int64 (B,), or all steps, int64 (B, L).
+        previous: the step before each element of `rows`; -1 before the first step of a history.
+        valid: int64 (B,), number of steps of each window before padding.
     """
 
     position: np.ndarray
@@ -91,37 +92,41 @@ class _Windows(NamedTuple):
 class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torch.Tensor]"]):
     """A sequence of batches for Algorithm Distillation, each a pure function of (selection, options, seed, i).
 
-    A history is drawn uniformly from the selection (or by `weights`), a start uniformly from 0..T - L. Windows cross
-    episode boundaries. Rows are padded with zeros at the end if the history, or the part selected by `episodes` or
-    `curriculum`, is shorter than L.
+    For each row, a history is drawn uniformly from the selection (or by `weights`), and the first step of a window
+    uniformly from 0..T - L. Windows cross episode boundaries. Rows are padded with zeros at the end if the history, or
+    the part selected by `episodes` or `curriculum`, is shorter than L.
 
     `sampler[i]` does not depend on the process, the number of workers and threads, the cache, or whether the release is
     lite or full. To resume, continue with the next i.
 
     Args:
-        dataset: a selection with observations of one shape: layouts with as many channels, or channels="canonical".
-        batch_size: B, over all processes.
-        length: L, in steps.
-        every: windows consist of every n-th episode of a history, so a window of few episodes spans learning. The first
-            episode is drawn for each window; `prev_*` come from the previous episode of the window.
+        dataset: a selection with observations of one shape: layouts with equally many channels, or
+            channels="canonical".
+        batch_size: B, the number of rows of a batch over all processes.
+        length: L, the number of steps of a window.
+        every: n; windows consist of every n-th episode of a history, so few episodes show much of the learning. The
+            first episode is drawn at random for each window; at the first step of later episodes, `prev_*` come from
+            the previous episode of the window.
         labels: targets are labels of this kind, "expert" or "oracle", instead of the actions taken; see
             `history.LABELS`.
-        families: whether batches have `families`, which a model may learn to predict.
-        seed: any non-negative integer below 2**63.
-        teammate_actions: whether batches have `prev_teammate_actions`.
+        families: whether batches have the field `families`, from which a model can learn to predict the teammate's
+            family.
+        seed: seed of the random draws, a non-negative integer below 2**63.
+        teammate_actions: whether batches have the field `prev_teammate_actions`.
         weights: probabilities of the histories: "uniform", "length" (proportional to the steps that windows may
             contain) or one non-negative number per history, float (H,).
-        episodes: windows stay inside these episodes of each history, such as (0, 10) or (-10, None).
-        curriculum: windows stay inside a part of each history that moves with i; see `Curriculum`.
-        process_index, process_count: number of this process and of all processes; each gets batch_size / process_count
-            rows of every batch.
+        episodes: range of episodes of each history to which windows are limited, such as (0, 10) or (-10, None).
+        curriculum: part of each history to which windows are limited, which moves with i; see `Curriculum`.
+        process_index, process_count: index of this process, and number of processes; each process gets batch_size /
+            process_count rows of every batch.
 
     Warns:
-        WeakLabelsWarning: with `labels`, for the same tasks as in `DPTSampler`.
+        WeakLabelsWarning: with `labels`, for tasks whose labels come from a policy or an oracle that earns less than
+            half of what the histories earn at the end; see `DPTSampler`.
 
     Raises:
         OptionError: for impossible options, or a selection with observations of several shapes.
-        LabelsMissingError: with teammate_actions=True, or with `labels`, if some history does not have them.
+        LabelsMissingError: if some history does not have the labels, or with teammate_actions=True no teammate actions.
     """
 
     batch_type = ADBatch
@@ -145,7 +150,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
             warn_of_weak_labels(dataset, labels)
 
     def options(self) -> dict[str, Any]:
-        # Options at their defaults are left out: positions stored before an option existed can still be resumed.
+        # Options with default values are left out, so a position stored before an option existed can be resumed.
         chosen = {"every": self.every > 1, "labels": self.labels is not None, "families": self.families}
         return super().options() | {name: getattr(self, name) for name, differs in chosen.items() if differs}
 
@@ -167,12 +172,12 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
 
     @cached_property
     def _family_numbers(self) -> np.ndarray:
-        """Index of each history's family in `all_families()`, int32 (H,)."""
+        """Index of the family of each history's teammate in `all_families()`, int32 (H,)."""
         families = all_families()
         return np.array([families.index(str(name)) for name in self.dataset.column("teammate_family")], np.int32)
 
     def windows(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the windows of batch i: history ids and first steps, int64 (B,) each."""
+        """Return the history ids and the first steps of the windows of batch i, int64 (B,) each."""
         drawn = self._draw(i)
         return self.dataset.ids[drawn.position].astype(np.int64), drawn.starts
 
@@ -182,7 +187,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         position = weighted_choice(for_history, self._draws.history_weights(low, high), 0, len(low))
         low, high, steps = low[position], high[position], self._draws.kept_steps
         # A window is drawn from the `total` steps of every n-th episode of a history's range, or without `every` from
-        # all steps of the range. An unfinished episode is never one of the n-th: its missing steps would be a gap.
+        # all steps of the range. With `every`, an unfinished episode is excluded: its missing steps would be a gap.
         first, total = np.zeros_like(low), high - low
         if self.every > 1:
             episodes = total // steps
@@ -191,9 +196,9 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         start = scale_to_range(for_start, np.maximum(total - self.length, 0) + 1)
         valid = np.minimum(total - start, self.length)
         if self.every == 1:
-            # A window is given by its first row: sources then copy it as a block, ten times faster than L single rows.
+            # A window given by its first row is copied as a block, ten times faster than L single rows.
             return _Windows(position, low + start, low + start, low + start - 1, valid)
-        # Step t of these episodes is step t % steps of episode first + n * (t // steps) of the range. The row of step
+        # Step t of a window is step t % steps of episode first + n * (t // steps) of the range. The row of step
         # -1 comes first, for `prev_*`. Padding repeats the last step, since all rows must exist.
         t = np.minimum(start[:, None] + np.arange(-1, self.length), total[:, None] - 1)
         rows = low[:, None] + (first[:, None] + self.every * (t // steps)) * steps + t % steps
@@ -233,7 +238,7 @@ class ADSampler(Sampler[ADBatch[np.ndarray], "ADBatch[jax.Array]", "ADBatch[torc
         batch.attention_mask[...] = True
         if valid.min() < self.length:
             np.less(np.arange(self.length), valid[:, None], out=batch.attention_mask)
-            # Padding was filled with rows of later episodes, or with observations rendered from zeros.
+            # Padding has rows of later episodes, or observations rendered from zeros, which are replaced by zeros.
             for array in (batch.obs, *(read.out for read in reads[1:])):
                 array[~batch.attention_mask] = 0
         return batch

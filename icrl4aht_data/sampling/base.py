@@ -51,12 +51,12 @@ class Sampler(Generic[B, D, T]):
 
     Attributes:
         dataset: the selection.
-        layouts: its layouts, in order of first appearance.
+        layouts: the selection's layouts, in order of first appearance.
         batch_size: rows of a batch, over all processes.
         length: steps of a window, or transitions of a context.
-        seed: seed of the draws.
+        seed: seed of the random draws.
         teammate_actions: whether batches have the teammate's actions.
-        process_index, process_count: number of this process and of all processes.
+        process_index, process_count: index of this process, and number of processes.
         local_size: rows of each batch in this process: batch_size / process_count.
     """
 
@@ -88,19 +88,19 @@ class Sampler(Generic[B, D, T]):
             )
         self.local_size = batch_size // process_count
         self.dataset, self.layouts, self._observer = dataset, dataset.layouts, Observer(dataset)
-        # Here, not at the first batch: a training that fails after an hour of compiling is worse.
+        # Checked before the first batch, which a training may need only after an hour of compilation.
         if teammate_actions and not dataset.column("has_teammate_actions").all():
-            raise LabelsMissingError("teammate_actions = True, but some histories have none")
+            raise LabelsMissingError("teammate_actions = True: some histories have no teammate actions")
         self.teammate_actions = teammate_actions
         self._draws = HistoryDraws(dataset, weights, episodes, curriculum)
 
     @cached_property
     def specs(self) -> dict[str, ArraySpec]:
-        """Field -> dtype and shape of the array in every batch."""
+        """Field of a batch -> dtype and shape of the field's array."""
         raise NotImplementedError
 
     def __len__(self) -> int:
-        # A pass is defined by steps, since windows are drawn with replacement and visit no history exactly once.
+        # A pass is defined by a number of steps, since windows are drawn with replacement.
         return max(1, int(self._draws.lengths.sum()) // (self.batch_size * self.length))
 
     def __getitem__(self, index: SupportsIndex) -> B:
@@ -119,10 +119,10 @@ class Sampler(Generic[B, D, T]):
         return (self[i] for i in range(len(self)))
 
     def batch(self, i: int, out: B | None = None) -> B:
-        """Return batch i, written into `out`, a batch from `empty()`, if given.
+        """Return batch number `i`; if `out`, a batch from `empty()`, is given, its arrays are filled and returned.
 
         Raises:
-            OptionError: if `out` is of another kind, shape or dtype, or the batch is larger than the free memory.
+            OptionError: if `out` has another type, shape or dtype, or the batch is larger than the free memory.
         """
         raise NotImplementedError
 
@@ -130,7 +130,7 @@ class Sampler(Generic[B, D, T]):
         """Return a batch of uninitialised arrays to pass to `batch` as `out`: reusing memory is faster.
 
         Raises:
-            OptionError: if one of them is larger than the free memory.
+            OptionError: if an array is larger than the free memory.
         """
         what = f"batch_size = {self.batch_size}, {self.length_option} = {self.length}: "
         arrays = {name: new_array(spec.shape, spec.dtype, what + name) for name, spec in self.specs.items()}
@@ -151,10 +151,10 @@ class Sampler(Generic[B, D, T]):
         return Batches(self, start, stop, **options)
 
     def options(self) -> dict[str, Any]:
-        """Return the options that determine the batches, as JSON; `Batches` compares them on resuming."""
+        """Return the options that determine the batches, as JSON; `Batches` compares the options when it resumes."""
         return {
             "sampler": type(self).__name__,
-            # A hash, since the ids of 82,000 histories would fill every checkpoint.
+            # A hash is shorter: the ids of 82,000 histories would fill every checkpoint.
             "selection": hashlib.blake2b(self.dataset.ids.astype("<i8").tobytes(), digest_size=16).hexdigest(),
             "data_version": self.dataset.info.data_version,
             "obs": self.dataset.obs,
@@ -167,14 +167,14 @@ class Sampler(Generic[B, D, T]):
         }
 
     def _random(self, i: int, count: int) -> np.ndarray:
-        """Return this process's share of batch i's random integers below 2**32, uint64 (count, local_size)."""
+        """Return random integers below 2**32 for this process's rows of batch i, uint64 (count, local_size)."""
         # Every process draws all rows, so a batch does not depend on the number of processes.
         first = self.process_index * self.local_size
         return random_uint32(self.seed, i, count, self.batch_size)[:, first : first + self.local_size]
 
     def _layout_specs(self) -> dict[str, ArraySpec]:
-        """Return the spec of the field `layouts`, present in batches of state records of several layouts."""
-        # Rendered observations can be read without their layout, state records cannot.
+        """Return the spec of the field `layouts`, which only batches of state records of several layouts have."""
+        # A state record cannot be interpreted without its layout, a rendered observation can.
         several = self.dataset.obs == "state" and len(self.layouts) > 1
         return {"layouts": ArraySpec("int32", (self.local_size,))} if several else {}
 
@@ -188,7 +188,7 @@ class Sampler(Generic[B, D, T]):
         for array in arrays.values():
             if not (isinstance(array, np.ndarray) and array.flags.c_contiguous and array.flags.writeable):
                 raise OptionError("out: expected writeable, C-contiguous arrays; take a batch from sampler.empty()")
-        # A narrower dtype would change values without an error, and a larger buffer would keep old ones.
+        # A narrower dtype would change values without an error, and a larger buffer would keep old values.
         found = {name: ArraySpec(str(array.dtype), array.shape) for name, array in arrays.items()}
         if found != self.specs:
             raise OptionError(f"out: expected {self.specs}, found {found}; take a batch from sampler.empty()")
@@ -201,7 +201,7 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
     if "train" in counts and len(counts) > 1:
         warnings.warn(
             f"the histories are of several splits, {dataset.counts_text('split')}: a model trained on them has seen "
-            f'the teammates that it is judged with. Choose the training histories: load_icrl4aht(split="train"), or '
+            f'the teammates that it is tested with. Choose the training histories: load_icrl4aht(split="train"), or '
             f'ds.filter(split="train")',
             MixedSplitsWarning,
             stacklevel=3,  # the line that called Dataset.ad or Dataset.dpt
@@ -209,14 +209,14 @@ def warn_of_mixed_splits(dataset: Selection) -> None:
 
 
 def check_labels(dataset: Selection, labels: Labels) -> Labels:
-    """Check that all histories of a selection have these labels.
+    """Check that all histories of a selection have labels of the given kind.
 
     Returns:
         The labels.
 
     Raises:
-        UnknownNameError: for labels that do not exist.
-        LabelsMissingError: if a history does not have them; names the labels that the selection has.
+        UnknownNameError: if `labels` is not a kind of labels.
+        LabelsMissingError: if a history does not have the labels; names the labels that the selection has.
     """
     check_choice("labels", labels, LABELS)
     has = {name: dataset.has_labels(name) for name in LABELS}
@@ -228,16 +228,16 @@ def check_labels(dataset: Selection, labels: Labels) -> Labels:
     raise LabelsMissingError(
         f"labels = {labels}: {len(missing)} of {len(dataset)} histories have no {labels} actions, those of "
         f"{counted_noun(len(np.unique(tasks)), 'task')} (first: history {dataset.ids[missing[0]]} of task {tasks[0]}); "
-        f"{counts}: take labels that all have, or ds.select(ds.has_labels({labels!r}))"
+        f"{counts}: use labels that all have, or ds.select(ds.has_labels({labels!r}))"
     )
 
 
 def warn_of_weak_labels(dataset: Selection, labels: Labels) -> None:
-    """Warn of tasks whose labels come from a policy that earns less than half of what their histories earn at the end.
+    """Warn of tasks whose labels come from a policy that earns less than half of the final return of their histories.
 
-    The end is the mean of `return_end` over a task's selected histories, see `schema.are_labels_weak`.
+    The final return is the mean of `return_end` over a task's selected histories; see `schema.are_labels_weak`.
     """
-    # Labels and their returns belong to a task, so one history of each task is enough to look them up.
+    # All histories of a task have labels with the same return, so one history of each task is enough.
     codes, first, task = np.unique(dataset.column_codes("task_id"), return_index=True, return_inverse=True)
     ends = np.bincount(task, dataset.column("return_end")) / np.bincount(task)
     values = dataset.index.values("task_id")
@@ -278,5 +278,5 @@ def _array_lines(arrays: Mapping[str, Any]) -> str:
 
 
 def batch_repr(self: Any) -> str:
-    """Return a batch's type, and the dtype and shape of each field."""
+    """Return a batch's type, and the dtype and shape of each field, as text."""
     return f"{type(self).__name__}(\n{indent(describe_batch(self), '    ')}\n)"

@@ -1,4 +1,4 @@
-"""Prefetching of batches on a thread, and optionally copies on a JAX device."""
+"""Prefetching of batches on a thread, with optional copies to a JAX device."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ B = TypeVar("B")
 
 
 class Batches(Iterator[B], Generic[B]):
-    """An iterator over `sampler[start]`, `sampler[start + 1]`, .., prefetched by a thread.
+    """An iterator over a sampler's batches from number `start` on, prefetched by a thread.
 
     After `break`, a new loop continues with the next batch. `len(sampler)` batches have as many steps as the selection:
     one pass over the data on average. With `stop`, a loop ends after batch `stop - 1`, and each further loop has the
@@ -30,14 +30,14 @@ class Batches(Iterator[B], Generic[B]):
     the end of the iterator. Threads do not survive a fork: make a new iterator in the forked process.
 
     Args:
-        sampler: makes the batches.
+        sampler: the sampler that makes the batches.
         start: number of the first batch.
         stop: number after the last batch of the first loop; None for an endless iterator.
         prefetch: number of batches prepared in advance; with 0, `next` makes each batch itself, without a thread.
         device: a jax.Device or Sharding to which batches are copied as JAX arrays, while the previous batch is in use.
             If a sharding spans processes, each process contributes its share of the rows. Needs JAX.
-        reuse: fill the same few buffers, which is faster than allocating memory. A batch is then valid only until
-            the next one is taken. With a device, host buffers are always reused.
+        reuse: fill the same few buffers again and again, which is faster than allocating memory. A batch is then valid
+            only until the next one is taken. With a device, host buffers are always reused.
 
     Attributes:
         next: number of the next batch.
@@ -45,7 +45,7 @@ class Batches(Iterator[B], Generic[B]):
         waited: seconds that `next` has waited for batches.
 
     Raises:
-        OptionError: for impossible options, a device without JAX, or `next` in a forked process.
+        OptionError: for impossible options, for a device if JAX is not installed, or for `next` in a forked process.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Batches(Iterator[B], Generic[B]):
         self._lent: B | None = None  # buffer of the batch in use by the consumer
 
     def __iter__(self) -> Batches[B]:
-        # Another pass starts only if iteration reached the end: a position loaded at the end means a finished training.
+        # A new pass starts only after iteration reached the end: a position loaded at the end is a finished training.
         if self._ended and self._stop is not None and self._per_pass:
             self._stop += (self.next - self._stop) // self._per_pass * self._per_pass + self._per_pass
             self._closed = self._ended = False
@@ -110,10 +110,10 @@ class Batches(Iterator[B], Generic[B]):
         return batch
 
     def _take(self) -> B:
-        """Return the next batch; the thread prepares the following ones."""
+        """Return the next batch; the thread prepares the following batches."""
         if not self._prefetch:
             buffer = self._buffer()
-            batch = _make(self._sampler, self.next, buffer, self._put)
+            batch = _make_batch(self._sampler, self.next, buffer, self._put)
         else:
             # A batch is taken before another is submitted, so `prefetch + 1` buffers are enough.
             self._submit(self.next + self._prefetch)
@@ -125,23 +125,23 @@ class Batches(Iterator[B], Generic[B]):
         return batch
 
     def _submit(self, stop: int) -> None:
-        """Submit the next batches below `stop` to the thread."""
+        """Submit all further batches with numbers below `stop` to the thread."""
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, thread_name_prefix="icrl4aht-prefetch")
             self._submitted = self.next
         stop = stop if self._stop is None else min(stop, self._stop)
         for i in range(self._submitted, stop):
             buffer = self._buffer()
-            self._pending.append((self._pool.submit(_make, self._sampler, i, buffer, self._put), buffer))
+            self._pending.append((self._pool.submit(_make_batch, self._sampler, i, buffer, self._put), buffer))
             self._submitted = i + 1
 
     def _buffer(self) -> B | None:
-        """Return a free buffer; None if the batch is to allocate new memory."""
+        """Return a free buffer, or None if a new batch allocates its memory."""
         if not self._reuse:
             return None
         buffer = self._free.pop() if self._free else self._sampler.empty()
         if self._put is not None:
-            self._free.append(buffer)  # the thread copies a batch to the device before it makes the next one
+            self._free.append(buffer)  # the thread copies a batch to the device before it makes the next batch
         return buffer
 
     def close(self) -> None:
@@ -171,7 +171,8 @@ class Batches(Iterator[B], Generic[B]):
         """Continue from the position at which `state_dict` was called.
 
         Raises:
-            OptionError: if the state comes from a sampler with other options or another selection; names them.
+            OptionError: if the state comes from a sampler with other options or another selection; names the
+                differences.
         """
         if not isinstance(state, Mapping):
             raise OptionError(f"state = {state!r:.100}: expected the result of state_dict()")
@@ -179,7 +180,7 @@ class Batches(Iterator[B], Generic[B]):
         if "channels" in expected:
             given.setdefault("channels", "own")  # states of version 0.1 do not contain this option
         if "order" in expected:
-            given.setdefault("labels", "expert")  # older DPT states do not contain `labels`, which had one value
+            given.setdefault("labels", "expert")  # older DPT states do not contain `labels`, always "expert"
         wrong = [name for name in expected.keys() | given.keys() if expected.get(name) != given.get(name)]
         if wrong or "next" not in state:
             found = ", ".join(f"{name} = {given.get(name)!r}, not {expected.get(name)!r}" for name in sorted(wrong))
@@ -190,7 +191,7 @@ class Batches(Iterator[B], Generic[B]):
 
 
 # A function, not a method: a reference from the thread to the iterator would keep an abandoned iterator alive.
-def _make(sampler: Sampler[Any, Any, Any], i: int, buffer: B | None, put: Callable[[B], B] | None) -> B:
+def _make_batch(sampler: Sampler[Any, Any, Any], i: int, buffer: B | None, put: Callable[[B], B] | None) -> B:
     batch = sampler.batch(i, buffer)
     return batch if put is None else put(batch)
 
@@ -201,13 +202,13 @@ def _device_put(device: Any) -> Callable[[Any], Any]:
     if not isinstance(device, (jax.Device, jax.sharding.Sharding)):
         raise OptionError(f"device = {device!r}: expected a device or a sharding of JAX, such as jax.devices()[0]")
 
-    def one(x: Any) -> Any:
+    def put_array(x: Any) -> Any:
         if getattr(device, "is_fully_addressable", True):
             return jax.numpy.array(x, copy=True, device=device)
         return jax.make_array_from_process_local_data(device, x.copy())
 
-    def put(batch: Any) -> Any:
-        # jax.device_put may keep using the host buffer, on a CPU forever, but the buffer is refilled when this returns.
-        return jax.block_until_ready(jax.tree.map(one, batch))
+    def put_batch(batch: Any) -> Any:
+        # jax.device_put may use the host buffer later, but the buffer is refilled as soon as this function returns.
+        return jax.block_until_ready(jax.tree.map(put_array, batch))
 
-    return put
+    return put_batch

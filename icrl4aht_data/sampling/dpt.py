@@ -24,7 +24,7 @@ from icrl4aht_data.sampling.observer import ArraySpec
 from icrl4aht_data.utils.options import check_int
 
 if TYPE_CHECKING:
-    import jax  # noqa: F401 - in the sampler's base class
+    import jax  # noqa: F401 - used by a type argument of the base class
     import torch  # noqa: F401
 
 A = TypeVar("A")
@@ -32,11 +32,11 @@ A = TypeVar("A")
 
 ContextOrder = Literal["contiguous", "random"]
 CONTEXT_ORDERS: tuple[ContextOrder, ...] = ("contiguous", "random")
-"""Valid orders of a context's transitions: consecutive steps (as published), or independent draws."""
+"""Valid orders of a context's transitions: consecutive steps (as in the published code), or independent draws."""
 
 
 class DPTBatch(NamedTuple, Generic[A]):
-    """Queries with contexts (paper, App. D.4).
+    """Batch of queries with contexts (paper, App. D.4).
 
     With obs="state", observations are state records: uint8 (B, S) and (B, K, S) instead of (B, 5, 5, C) and
     (B, K, 5, 5, C). With several queries per context, the query arrays have an axis Q after B.
@@ -44,12 +44,13 @@ class DPTBatch(NamedTuple, Generic[A]):
     Attributes:
         query_obs: float32 or uint8 (B, 5, 5, C): the ego's observation at the query step.
         query_target: int64 (B,): the label to predict at the query step: the action 0..5 of the expert or the oracle.
-        context_obs: float32 or uint8 (B, K, 5, 5, C): observations of transitions of the same task.
-        context_actions: int32 (B, K): the ego's actions in these transitions, 0..5.
-        context_next_obs: float32 or uint8 (B, K, 5, 5, C): the next observations in the same episode.
-        context_rewards: float32 (B, K): the team's rewards in these transitions.
-        context_teammate_actions: int32 (B, K): the teammate's actions in these transitions, 0..5; None unless the
-            sampler was made with teammate_actions=True.
+        context_obs: float32 or uint8 (B, K, 5, 5, C): observations at the context's transitions.
+        context_actions: int32 (B, K): the ego's actions in the context's transitions, 0..5.
+        context_next_obs: float32 or uint8 (B, K, 5, 5, C): observations after the context's transitions, in the same
+            episode.
+        context_rewards: float32 (B, K): the team's rewards in the context's transitions.
+        context_teammate_actions: int32 (B, K): the teammate's actions in the context's transitions, 0..5; None unless
+            the sampler was made with teammate_actions=True.
         layouts: int32 (B,): index of each row's layout in `sampler.layouts`; None unless obs="state" and there are
             several layouts.
     """
@@ -68,12 +69,12 @@ class DPTBatch(NamedTuple, Generic[A]):
 
 
 class _Contexts(NamedTuple):
-    """The drawn queries and contexts of a batch.
+    """The randomly drawn queries and contexts of a batch.
 
     Attributes:
-        query: int64 (B,), histories of the queries as positions in the selection.
+        query: int64 (B,), position of each query's history in the selection.
         query_steps: int64 (B, Q), steps of the queries.
-        context: int64 (B,), histories of the contexts as positions in the selection.
+        context: int64 (B,), position of each context's history in the selection.
         steps: int64 (B, K), the steps of the contexts' transitions.
     """
 
@@ -86,22 +87,23 @@ class _Contexts(NamedTuple):
 class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[torch.Tensor]"]):
     """A sequence of batches of queries with contexts, each a pure function of (selection, options, seed, i).
 
-    For each row a task is drawn uniformly, then two of its histories independently (uniformly or by `weights`): one for
-    the query, whose step is drawn uniformly, and one for the context of K transitions. These are `contiguous` (as
-    published) or `random` (independent and unordered, as in the original DPT). With `queries` = Q > 1, Q steps are
-    drawn independently from the query's history, and a context teaches Q answers instead of one.
+    For each row a task is drawn uniformly, then two histories of the task independently (uniformly or by `weights`):
+    one for the query, whose step is drawn uniformly, and one for the context of K transitions. Transitions are
+    `contiguous` (as in the published code) or `random` (independent and unordered, as in the original DPT). With
+    `queries` = Q > 1, Q steps are drawn independently from the query's history, so one context is used for Q
+    predictions.
 
     In releases of kind `observations`, contexts skip the last kept step of each episode, whose next observation is not
-    stored, so in contiguous contexts the second to last step is followed by the first step of the next episode.
+    stored. In contiguous contexts, the first step of the next episode therefore follows the second to last step.
 
     Args:
         dataset: a selection whose histories all have the labels, with observations of one shape: layouts with equally
             many channels, or channels="canonical".
-        batch_size: B, over all processes.
-        context: K, in transitions.
+        batch_size: B, the number of rows of a batch over all processes.
+        context: K, the number of transitions of a context.
         order: "contiguous" or "random".
         labels: "expert" or "oracle"; see `history.LABELS`.
-        queries: Q, number of queries with each context.
+        queries: Q, the number of queries for each context.
         options: options shared with `ADSampler`: `seed`; `teammate_actions`, whether batches have
             `context_teammate_actions`; `weights`, probabilities of the histories of a task; `episodes` and
             `curriculum`, the part of each history that queries and contexts are drawn from; `process_index` and
@@ -112,7 +114,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
             the histories earn at the end. Tasks without measured returns are not checked.
 
     Raises:
-        LabelsMissingError: if a history does not have these labels; says which labels the selection has.
+        LabelsMissingError: if a history does not have the labels; names the labels that the selection has.
         OptionError: for impossible options, a selection with observations of several shapes, or contiguous contexts
             longer than some history or than its part selected by `episodes` or `curriculum`.
     """
@@ -134,11 +136,11 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         super().__init__(dataset, batch_size=batch_size, length=context, **options)
         check_choice("order", order, CONTEXT_ORDERS)
         self.labels = check_labels(dataset, labels)
-        # The shortest part of a curriculum is its first or its last one, which a batch of any large number has.
-        ranges = (map(self._transitions, self._draws.steps(i)) for i in (0, 2**62))
+        # The shortest part of a curriculum is its first or its last part; batch 2**62 has the last part.
+        ranges = (map(self._count_transitions, self._draws.steps(i)) for i in (0, 2**62))
         shortest = min(int((high - low).min()) for low, high in ranges)
         if (self.length if order == "contiguous" else 1) > shortest:
-            raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; take fewer")
+            raise OptionError(f"context = {context}: the shortest history has {shortest} transitions; give fewer")
         self.order: ContextOrder = order
         warn_of_weak_labels(dataset, labels)
 
@@ -170,10 +172,10 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         query_records = observer.records(batch.query_obs)
         records, next_records = observer.records(batch.context_obs), observer.records(batch.context_next_obs)
         if self.order == "contiguous" and self.dataset.has_states:
-            # Windows given by their first row are copied as blocks. The row after a history's end reads as zeros.
+            # Windows given by their first row are copied as blocks. The row after the end of a history has zeros.
             rows, next_rows = steps[:, 0], steps[:, 0] + 1
         else:
-            # Single rows must exist: at the end of a history its last row is read twice, and replaced below.
+            # Single rows must exist, so the last row of a history is read in place of the next, and replaced below.
             rows, next_rows = steps, np.minimum(steps + 1, self._draws.lengths[context][:, None] - 1)
         # Requests need the axis Q, which arrays with one query do not have.
         queries, record = query_steps.shape, records.shape[2:]
@@ -187,7 +189,7 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         ]
         if batch.context_teammate_actions is not None:
             reads.append(ReadRequest("teammate_actions", context, rows, batch.context_teammate_actions))
-        # The observation after an episode's last step is its end state, not the next episode's first one.
+        # After an episode's last step comes the episode's end state, not the first state of the next episode.
         episodes = steps // kept_steps
         ends = np.nonzero((steps == episodes * kept_steps + kept_steps - 1) & self.dataset.has_states)
         end_records = np.empty((len(ends[0]), 1, *record), next_records.dtype)
@@ -222,13 +224,13 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
         query_steps = low[query][:, None] + scale_to_range(for_query_steps, (high - low)[query][:, None])
         # Each number drawn is the start of a window of K transitions, or with random order a single transition.
         window = self.length // drawn
-        low, high = self._transitions(low)[context][:, None], self._transitions(high)[context][:, None]
+        low, high = self._count_transitions(low)[context][:, None], self._count_transitions(high)[context][:, None]
         transitions = low + scale_to_range(for_steps, high - low - window + 1) + np.arange(window)
-        return _Contexts(query, query_steps, context, self._step_of(transitions))
+        return _Contexts(query, query_steps, context, self._transition_steps(transitions))
 
     @cached_property
     def _tasks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions in the selection (H,) sorted by task, and begin and end of each task."""
+        """Positions in the selection sorted by task, int64 (H,), and the start and end of each task in them."""
         _, first, task = np.unique(self.dataset.column_codes("task_id"), return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
         rank[np.argsort(first)] = np.arange(len(first))
@@ -238,10 +240,10 @@ class DPTSampler(Sampler[DPTBatch[np.ndarray], "DPTBatch[jax.Array]", "DPTBatch[
     # Transitions are the steps whose next observation is stored: all steps in a release with states, otherwise all but
     # the last one of each episode. They are drawn by number and mapped to steps.
 
-    def _transitions(self, steps: np.ndarray) -> np.ndarray:
+    def _count_transitions(self, steps: np.ndarray) -> np.ndarray:
         """Return the number of transitions among a history's first `steps` steps."""
         return steps if self.dataset.has_states else steps - -(-steps // self._draws.kept_steps)
 
-    def _step_of(self, transition: np.ndarray) -> np.ndarray:
+    def _transition_steps(self, transition: np.ndarray) -> np.ndarray:
         """Return the step of each transition; steps and transitions are numbered from the start of the history."""
         return transition if self.dataset.has_states else transition + transition // (self._draws.kept_steps - 1)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.random import Philox  # np.random is imported late, on first use; a fork must not interrupt that
+from numpy.random import Philox  # imported early: a fork must not interrupt the import of np.random
 
 from icrl4aht_data.errors import OptionError, check_choice
 from icrl4aht_data.reading.selection import Selection
@@ -18,7 +18,7 @@ from icrl4aht_data.utils.options import check_int
 
 Weights = Literal["uniform", "length"] | Sequence[float] | np.ndarray
 WEIGHTS = ("uniform", "length")
-"""Named weights of histories in a draw: equal, or proportional to the steps to draw from."""
+"""Names of weights of histories in random draws: equal, or proportional to the number of steps to draw from."""
 
 EpisodeRange = tuple[int | None, int | None]
 """Range of episodes as in a slice: (None, 10) are the first ten, (-10, None) the last ten."""
@@ -26,7 +26,7 @@ EpisodeRange = tuple[int | None, int | None]
 
 @dataclass(frozen=True)
 class Curriculum:
-    """A part of every history from which windows are drawn; it moves linearly with the batch number.
+    """The part of every history from which windows are drawn, which moves linearly with the batch number.
 
     Parts are fractions of a history's episodes, or of the range `episodes` of the sampler. The part
     moves from `first` at batch 0 to `last` at batch `batches` and does not change afterwards.
@@ -95,7 +95,7 @@ def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, 
     Args:
         random: uint64 (B,), integers below 2**32.
         weights: float64 (N,), not negative, with a finite sum; None for equal weights.
-        first, stop: the range of each draw, numbers or int (B,).
+        first, stop: start and end (exclusive) of the range of each draw, numbers or int (B,).
 
     Returns:
         int64 (B,).
@@ -106,21 +106,21 @@ def weighted_choice(random: np.ndarray, weights: np.ndarray | None, first: Any, 
     edges = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
     low, high = edges[first], edges[stop]
     position = np.searchsorted(edges, low + random.astype(np.float64) / 2**32 * (high - low), side="right") - 1
-    return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding can leave the range
+    return np.clip(position, first, np.asarray(stop) - 1).astype(np.int64)  # rounding may exceed the range
 
 
 class HistoryDraws:
-    """Range of steps of each history to draw from at batch i, and the weights of the histories.
+    """Ranges of steps from which samplers draw in each batch, and weights of the histories.
 
     Args:
         selection: the histories.
-        weights: see `WEIGHTS`.
-        episodes: see `EpisodeRange`; None for all.
-        curriculum: None for the same episodes in every batch.
+        weights: a name in `WEIGHTS`, or one number for each history.
+        episodes: range of episodes to draw from, see `EpisodeRange`; None for all episodes.
+        curriculum: part of each history to draw from, by batch; None for the same episodes in every batch.
 
     Attributes:
-        lengths: int64 (H,), steps of each history.
-        kept_steps: steps of an episode.
+        lengths: int64 (H,), number of steps of each history.
+        kept_steps: number of steps of an episode.
 
     Raises:
         UnknownNameError, OptionError: for impossible options, or episodes that do not all have `kept_steps` steps.
@@ -143,12 +143,12 @@ class HistoryDraws:
         self._range = _episode_range(episodes, self._counts)
 
     def steps(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the first step of each history's range at batch i and its end (exclusive), int64 (H,) each."""
+        """Return the first step and the end (exclusive) of each history's range at batch i, int64 (H,) each."""
         first, stop = self._range
         if self.curriculum is not None:
             low, high = self.curriculum.part(i)
             count = stop - first
-            # Complete episodes, at least one. The small number prevents 0.3 * 10 episodes from becoming 4.
+            # The part has complete episodes, at least one. Without 1e-9, rounding could make 0.3 * 10 episodes 4.
             low = np.minimum(np.floor(low * count + 1e-9).astype(np.int64), count - 1)
             high = np.maximum(np.ceil(high * count - 1e-9).astype(np.int64), low + 1)
             first, stop = first + low, first + high
@@ -156,14 +156,14 @@ class HistoryDraws:
         return first * self.kept_steps, np.where(stop == self._counts, self.lengths, stop * self.kept_steps)
 
     def history_weights(self, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
-        """Return the weight of each history, which has steps low..high to draw from, float64 (H,); None if equal."""
+        """Return the weights of histories with steps low..high to draw from, float64 (H,); None for equal weights."""
         if isinstance(self.weights, str):
             return None if self.weights == "uniform" else (high - low).astype(np.float64)
         # Sums of weights near 1e308 would be infinite. Scaling by a power of 2 is exact and changes no draw.
         return np.ldexp(self.weights, -np.frexp(self.weights.max())[1])
 
     def options(self) -> dict[str, Any]:
-        """Return the options as JSON."""
+        """Return the options that determine the draws, as JSON."""
         curriculum = self.curriculum
         return {
             "weights": self.weights if isinstance(self.weights, str) else self.weights.tolist(),
@@ -176,7 +176,7 @@ def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
     """Return the name of the weights, or the numbers as float64 (H,).
 
     Raises:
-        UnknownNameError, OptionError: unless they are a known name, or H numbers, none negative and not all 0.
+        UnknownNameError, OptionError: unless `weights` is a known name, or H numbers, none negative and not all 0.
     """
     if isinstance(weights, str):
         check_choice("weights", weights, WEIGHTS)
@@ -194,7 +194,7 @@ def _check_weights(weights: Weights, histories: int) -> str | np.ndarray:
 
 
 def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return first episode and end (exclusive) of a range in histories of `counts` episodes, int64 (H,) each.
+    """Return the first episode and the end (exclusive) of a range in histories of `counts` episodes, int64 (H,) each.
 
     Raises:
         OptionError: if the range is malformed, or some history has no episode in it.
@@ -217,5 +217,5 @@ def _episode_range(episodes: EpisodeRange | None, counts: np.ndarray) -> tuple[n
         ) from error
     if (first >= stop).any():
         fewest = int(counts[first >= stop].min())
-        raise OptionError(f"episodes = {episodes!r}: a history of {fewest} episodes has none of them")
+        raise OptionError(f"episodes = {episodes!r}: a history with {fewest} episodes has no episode in this range")
     return first, stop

@@ -1,4 +1,4 @@
-"""Renders stored records as the observations chosen by the `obs` option of a selection."""
+"""Rendering of stored records as observations, in the form of a selection's option `obs`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from icrl4aht_data.overcooked.fast_observe import fast_observe
 from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.state import record_size
 from icrl4aht_data.reading.selection import Selection
-from icrl4aht_data.utils.system import in_slices
+from icrl4aht_data.utils.system import run_in_slices
 
 _STEPS = 8192  # steps rendered at a time if there are several layouts, which keeps temporary copies small
 
@@ -31,7 +31,7 @@ class ArraySpec(NamedTuple):
 
 
 class Observer:
-    """Renders the records of a selection as observations.
+    """Renderer of the records of a selection as observations.
 
     A record is a state record, or in a release without states the stored observation. `R` denotes the shape of one
     record: (S,) with the longest state record of the selection, or (5, 5, C) with the most channels of its layouts.
@@ -40,7 +40,7 @@ class Observer:
         selection: histories whose observations have one shape (5, 5, C).
 
     Attributes:
-        field: the field that stores records.
+        field: name of the field that stores the records.
 
     Raises:
         OptionError: if observations have several shapes.
@@ -58,13 +58,13 @@ class Observer:
         self._renders = selection.obs != "state" and (selection.has_states or self._canonical)
 
     def spec(self, *shape: int) -> ArraySpec:
-        """Return dtype and shape of observations (*shape, 5, 5, C), or of state records (*shape, S) for "state"."""
+        """Return dtype and shape of observations (*shape, 5, 5, C), or of state records (*shape, S) if obs="state"."""
         if self._selection.obs == "state":
             return ArraySpec("uint8", (*shape, *self._record_shape))
         return ArraySpec(self._selection.obs, (*shape, *self._shape))
 
     def records(self, out: np.ndarray) -> np.ndarray:
-        """Return the array to read records of observations into: uint8 (..., *R), or `out` if nothing is rendered."""
+        """Return an array to read records into, uint8 (..., *R); `out` itself if nothing has to be rendered."""
         return np.empty((*out.shape[:-3], *self._record_shape), np.uint8) if self._renders else out
 
     def observe(self, histories: np.ndarray, records: np.ndarray, out: np.ndarray) -> None:
@@ -72,7 +72,7 @@ class Observer:
 
         Args:
             histories: int (B,), positions in the selection.
-            records: the array from `records`, filled: uint8 (B, ..., *R).
+            records: the filled array from `records`, uint8 (B, ..., *R).
             out: (B, ..., 5, 5, C), float32 or uint8, C-contiguous.
         """
         threads = self._selection.threads
@@ -82,7 +82,7 @@ class Observer:
             fast_observe(self._layouts[0], records, out, threads, self._canonical)
             return
         slab = max(1, _STEPS // math.prod(out.shape[1:-3]))
-        # Each layout has its own channels, so its rows of the batch are rendered apart and copied into place.
+        # Layouts differ in their channels, so the rows of each layout are rendered separately and then copied.
         numbers = self._selection.layout_numbers[histories]
         for number in np.unique(numbers).tolist():
             layout, rows = self._layouts[number], np.flatnonzero(numbers == number)
@@ -92,12 +92,12 @@ class Observer:
                 for first in range(start, stop, slab):
                     part = rows[first : min(first + slab, stop)]
                     shown = np.zeros((len(part), *out.shape[1:]), out.dtype)
-                    out[part] = self._rendered(layout, records[part], shown)
+                    out[part] = self._render_layout(layout, records[part], shown)
 
-            in_slices(render, len(rows), threads, least=slab)
+            run_in_slices(render, len(rows), threads, least=slab)
 
-    def _rendered(self, layout: Layout, records: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Write the observations of records of one layout into `out`, which is zero."""
+    def _render_layout(self, layout: Layout, records: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """Render records of one layout into `out`, which must contain zeros, and return `out`."""
         if self._selection.has_states:
             return fast_observe(layout, records[..., : record_size(layout)], out, canonical=self._canonical)
         out[..., canonical_positions(layout)] = records[..., : layout.channels]

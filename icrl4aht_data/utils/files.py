@@ -22,19 +22,19 @@ from filelock import FileLock
 from icrl4aht_data.errors import DiskFullError, IndexFormatError, OptionError, UnsafePathError
 
 TEXT_BYTES = 64 * 2**20
-"""Maximum bytes of a text file: six times the provenance of ten thousand tasks, our largest one."""
+"""Maximum bytes of a text file: six times our largest text file, the provenance of ten thousand tasks."""
 
 LINE_BYTES = 2**20
-"""Maximum bytes of a line."""
+"""Maximum bytes of a line of a text file."""
 
 _DEPTH = 64  # maximum nesting of JSON, well below the depth of Python's stack
 
 
-def plain_size(path: Path, most: int) -> int:
+def regular_file_size(path: Path, most: int) -> int:
     """Return the size in bytes of a regular file.
 
     Raises:
-        IndexFormatError: if it is missing, not a regular file, or larger than `most`.
+        IndexFormatError: if the file is missing, not a regular file, or larger than `most`.
     """
     with wrap_read_errors(path):
         status = path.stat()
@@ -49,9 +49,9 @@ def read_text(path: Path) -> str:
     """Return the content of a text file.
 
     Raises:
-        IndexFormatError: if it is missing, unreadable, too large or not UTF-8.
+        IndexFormatError: if the file is missing, unreadable, too large or not UTF-8.
     """
-    plain_size(path, TEXT_BYTES)
+    regular_file_size(path, TEXT_BYTES)
     with wrap_read_errors(path):
         return path.read_text(encoding="utf-8")
 
@@ -62,7 +62,7 @@ def read_lines(path: Path) -> Iterator[str]:
     Raises:
         IndexFormatError: if the file is missing, unreadable or not UTF-8, or a line is too long.
     """
-    plain_size(path, 2**62)
+    regular_file_size(path, 2**62)
     with wrap_read_errors(path), path.open("rb") as stream:
         for number, line in enumerate(iter(lambda: stream.readline(LINE_BYTES), b""), start=1):
             if len(line) == LINE_BYTES:
@@ -91,11 +91,11 @@ def parse_json(text: str) -> Any:
     """Parse a JSON text.
 
     Raises:
-        IndexFormatError: without file and line, which the caller adds.
+        IndexFormatError: if the text is not JSON; the caller adds the file and the line to the message.
     """
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:  # raised for too many digits or levels, too
+    except (ValueError, RecursionError) as error:  # also raised for too many digits or levels
         raise IndexFormatError(f"not JSON: {error}") from error
     level = [value]
     for _ in range(_DEPTH):
@@ -107,7 +107,7 @@ def parse_json(text: str) -> Any:
 
 
 def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
-    """Write JSON, indented or on one line."""
+    """Write a JSON file, indented or on one line."""
     path.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
 
 
@@ -117,7 +117,7 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
+def have_hashes(folder: Path, files: Mapping[str, str]) -> bool:
     """Return whether all files of a folder (path -> SHA-256) have the given hashes.
 
     Raises:
@@ -127,7 +127,7 @@ def hashes_hold(folder: Path, files: Mapping[str, str]) -> bool:
 
 
 def short_hash(data: bytes, digits: int = 16) -> str:
-    """Return the first hexadecimal digits of a text's SHA-256."""
+    """Return the first hexadecimal digits of the SHA-256 of some bytes."""
     return hashlib.sha256(data).hexdigest()[:digits]
 
 
@@ -138,7 +138,7 @@ def json_hash(content: Any) -> str:
 
 @contextmanager
 def add_filename(path: Path) -> Iterator[None]:
-    """Add the file's name to an OSError without one, which operations on open files raise."""
+    """Add the file's name to an OSError without a file name, which operations on open files raise."""
     try:
         yield
     except OSError as error:
@@ -148,7 +148,7 @@ def add_filename(path: Path) -> Iterator[None]:
 
 
 def allocate(stream: BinaryIO, size: int) -> None:
-    """Extend a new file to `size` bytes and allocate them on the disk.
+    """Extend a new file to `size` bytes, and allocate these bytes on the disk.
 
     On a full disk, writing to the memory map of a sparse file would kill the process by a signal.
 
@@ -161,7 +161,7 @@ def allocate(stream: BinaryIO, size: int) -> None:
     except (AttributeError, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL):
             raise
-        for start in range(stream.tell(), size, LINE_BYTES):  # the system cannot allocate disk space
+        for start in range(stream.tell(), size, LINE_BYTES):  # for systems that cannot allocate disk space
             stream.write(bytes(min(LINE_BYTES, size - start)))
         stream.flush()
 
@@ -170,7 +170,7 @@ def sync(path: Path) -> None:
     """Wait until the content of a file is on the disk.
 
     Raises:
-        OSError: if it cannot be written.
+        OSError: if the content cannot be written.
     """
     with add_filename(path), path.open("r+b") as stream:
         os.fsync(stream.fileno())
@@ -183,9 +183,9 @@ def final_name(name: str) -> str:
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a temporary path to write to, then sync the file and rename it to `path`. An error changes nothing."""
+    """Yield a temporary path to write to, then sync and rename the file to `path`, which an error leaves unchanged."""
     partial = path.with_name(f".{path.name}.partial")
-    partial.unlink(missing_ok=True)  # writing would follow a symbolic link
+    partial.unlink(missing_ok=True)  # otherwise writing would follow a symbolic link
     try:
         with add_filename(path):
             yield partial
@@ -202,7 +202,7 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
 
     Args:
         path: the file to write; with `names`, the folder.
-        overwrite: replace existing files. Other files in a folder are kept.
+        overwrite: accept existing files, which the command replaces. Other files in the folder are kept.
         names: names of the files to write into the folder.
 
     Raises:
@@ -220,8 +220,8 @@ def check_output(path: Path, overwrite: bool, names: Iterable[str] | None = None
             raise OptionError(f"{file}: exists; give another name, or replace it by --overwrite")
 
 
-def check_own_folder(folder: Path, names: Collection[str], what: str) -> None:
-    """Check that a folder is missing or contains no files other than those to write.
+def check_folder_content(folder: Path, names: Collection[str], what: str) -> None:
+    """Check that a folder is missing, or contains no files except files that will be written.
 
     Args:
         folder: the folder to write to.
@@ -229,7 +229,7 @@ def check_own_folder(folder: Path, names: Collection[str], what: str) -> None:
         what: the expected content in words, such as "a run", for the message.
 
     Raises:
-        OptionError: if it is not a folder or has other files; lists some of them.
+        OptionError: if `folder` is not a folder or has other files; the message lists some of the other files.
     """
     if os.path.lexists(folder) and not folder.is_dir():
         raise OptionError(f"{folder}: a file is where a folder is needed; give another folder")
@@ -258,7 +258,7 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
 
     Raises:
         filelock.Timeout: if another process holds the lock and `wait` is False.
-        OSError: if the file cannot be created.
+        OSError: if the lock file cannot be created.
     """
     lock = FileLock(path, timeout=-1 if wait else 0)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -266,7 +266,7 @@ def process_lock(path: Path, *, wait: bool = True) -> Iterator[None]:
     try:
         yield
     finally:
-        with suppress(OSError):  # Windows cannot remove an open file; there, `release` removes it
+        with suppress(OSError):  # Windows cannot remove an open file: there, `release` removes the file
             path.unlink()
         lock.release()
 
@@ -281,19 +281,19 @@ LARGEST = 4 * 2**30
 
 _WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _RESERVED = re.compile(r'[\\:*?"<>|]')
-_PART_BYTES = 200  # bytes of a path component; leaves room for the longer names of temporary files
+_PART_BYTES = 200  # maximum bytes of a path component; temporary files have longer names
 
 
 def files_below(folder: Path) -> Iterator[str]:
     """Yield the relative paths of all files below a folder; symbolic links are not followed."""
-    folders = [""]  # not `os.walk`, which fails on folders that are deeper than Python's recursion limit
+    folders = [""]  # instead of `os.walk`, which fails on folders deeper than Python's recursion limit
     while folders:
         prefix = folders.pop()
         try:
             with os.scandir(folder / prefix) as found:
                 entries = [(prefix + entry.name, entry.is_dir(follow_symlinks=False)) for entry in found]
         except OSError:
-            if prefix:  # a folder that cannot be listed is itself reported
+            if prefix:  # a folder that cannot be listed is yielded itself
                 yield prefix
             continue
         for name, is_folder in entries:
@@ -303,7 +303,7 @@ def files_below(folder: Path) -> Iterator[str]:
                 yield name
 
 
-def is_inside(name: str) -> bool:
+def is_safe_path(name: str) -> bool:
     """Return whether a relative path is safe on every system: no "..", drive, backslash or control character."""
     if len(name) >= 1024 or not name.isprintable() or _RESERVED.search(name):
         return False
@@ -323,7 +323,7 @@ def resolve_inside(folder: Path, name: str) -> Path:
         IndexFormatError: if a folder on the path cannot be read.
     """
     path = folder / name
-    if not is_inside(name):
+    if not is_safe_path(name):
         raise UnsafePathError(f"{folder}: {name[:200]!r} leads out of the release; do not use this release")
     allowed = [folder.resolve()]
     if folder.parent.name == "snapshots" and (folder.parent.parent / "blobs").is_dir():

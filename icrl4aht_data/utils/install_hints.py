@@ -1,6 +1,6 @@
-"""Facts of the installed distribution: its address, and commands that install missing optional packages.
+"""Address of the project, and commands that install missing optional packages.
 
-pip adds an extra to the installed copy, wherever it came from.
+The commands add an extra to the installed copy of this package, from any source.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ RESTORE = f"pip install --force-reinstall --no-deps {PACKAGE}, or in a checkout 
 
 
 def project_url() -> str | None:
-    """Return the address of the repository, `Repository` in pyproject.toml; None as long as it has none."""
-    with suppress(PackageNotFoundError):  # a folder of sources that was not installed
+    """Return the address of the repository, `Repository` in pyproject.toml; None if no address is given there."""
+    with suppress(PackageNotFoundError):  # raised if the sources are not installed as a package
         urls = dict(line.split(", ", 1) for line in metadata(PACKAGE).get_all("Project-URL") or [])
         return urls.get("Repository")
     return None
@@ -55,10 +55,10 @@ def import_optional(module: str, purpose: str) -> Any:
 
     Args:
         module: name of the module, such as "pyarrow.parquet".
-        purpose: what needs it, in words, for the message.
+        purpose: what needs the module, in words, such as "a data frame", for the message.
 
     Raises:
-        OptionError: if it is not installed; with the command that installs it.
+        OptionError: if the module is not installed; the message has the command that installs the module.
     """
     try:
         return import_module(module)
@@ -74,6 +74,6 @@ def missing_library(module: str) -> str | None:
 
 
 def _extra(module: str) -> str:
-    """Return the extra that installs a module; empty if there is none."""
+    """Return the name of the extra that installs a module; an empty text if no extra does."""
     top = module.partition(".")[0].lower()
     return EXTRAS.get(_DISTRIBUTIONS.get(top, top), "")

@@ -1,7 +1,8 @@
-"""Option classes, whose annotations give types, bounds and help texts, and checks of single arguments.
+"""Option classes, whose annotations define types, bounds and help texts, and checks of single arguments.
 
 An option class is a dataclass that checks itself, so the command line (`icrl4aht_data.commands.dataclass_options`),
-TOML and JSON files and Python code have the same bounds. Its module does not import JAX, to keep `--help` fast.
+TOML and JSON files and Python code have the same bounds. Modules with option classes do not import JAX, to keep
+`--help` fast.
 
     @dataclass(frozen=True)
     class Options:
@@ -42,8 +43,8 @@ class Option(NamedTuple):
     """Annotation that makes a field an option of the command line.
 
     Attributes:
-        help: one sentence.
-        flags: additional names of the option, such as "--ta", besides the field's name with dashes.
+        help: help text of the option, one sentence.
+        flags: names of the option in addition to the field's name with dashes, such as "--ta".
         default: text to show in place of an uninformative default, such as None.
     """
 
@@ -70,13 +71,13 @@ def _checked_hints(kind: type) -> dict[str, Any]:
 
 
 def check_options(options: Any) -> None:
-    """Check the values of a dataclass against those annotations that are options, choices or bounds.
+    """Check the values of a dataclass against annotations that are options, choices or bounds.
 
-    Lists become tuples.
+    Lists are converted to tuples.
 
     Raises:
         OptionError: if a value has another type or is out of bounds.
-        UnknownNameError: if a value is not among the choices; lists them.
+        UnknownNameError: if a value is not among the choices; the message lists the choices.
     """
     for name, hint in _checked_hints(type(options)).items():
         value = getattr(options, name)
@@ -127,7 +128,7 @@ def replace_options(options: Options, values: Mapping[str, Any], where: str = ""
 
     Args:
         options: an instance.
-        values: field -> value, as in JSON or TOML; a mapping for a nested dataclass.
+        values: field -> value, as in JSON or TOML; the value for a nested dataclass is a mapping.
         where: prefix of field names in messages, such as "ego.".
 
     Raises:
@@ -152,7 +153,7 @@ def replace_options(options: Options, values: Mapping[str, Any], where: str = ""
 
 
 def _as_int(value: Any) -> int | None:
-    """Return an integer of any library as an int; None for bools and other types."""
+    """Convert an integer of any library to an int; return None for bools and other types."""
     try:
         return None if isinstance(value, bool) else operator.index(value)
     except TypeError:
@@ -163,7 +164,7 @@ def check_int(name: str, value: Any, least: int) -> int:
     """Return the value as an int after checking that it is an integer from `least` to 2**63 - 1.
 
     Raises:
-        OptionError: if it is not; with the option's name.
+        OptionError: if the value is not such an integer; the message has the option's name.
     """
     if (number := _as_int(value)) is None:
         raise OptionError(f"{name} = {value!r}: expected an integer")
@@ -176,7 +177,7 @@ def check_number(name: str, value: Any, hint: Any = float) -> float:
     """Return the value, a number of Python or NumPy, as a float after checking its bounds; see `convert_option`.
 
     Raises:
-        OptionError: if it is not a finite number within the bounds; with the option's name.
+        OptionError: if the value is not a finite number within the bounds; the message has the option's name.
     """
     return convert_option(name, value.item() if isinstance(value, np.generic) else value, hint)
 

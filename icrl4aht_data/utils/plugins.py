@@ -37,36 +37,36 @@ class Plugins:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Sorted registered names; nothing is imported.
+        """Names of the registered objects in sorted order; no object is imported.
 
         Raises:
-            PluginError: if this package or two others use the same name, or a name has characters other than letters,
-                digits, "_" and "-".
+            PluginError: if two packages, or this package and another one, use the same name, or a name has characters
+                other than letters, digits, "_" and "-".
         """
-        return tuple(self._found)
+        return tuple(self._entry_points)
 
     @property
     def packages(self) -> dict[str, str]:
-        """Registered name -> name and version of its package.
+        """Registered name -> name and version of the package that registers this name.
 
         Raises:
-            PluginError: see `names`.
+            PluginError: if names collide or are invalid, see `names`.
         """
-        return {name: _package(point) for name, point in self._found.items()}
+        return {name: _package_id(point) for name, point in self._entry_points.items()}
 
     def load(self, name: str, kind: Any) -> Any:
         """Return a registered object; the first call imports it.
 
         Args:
             name: one of `names`.
-            kind: the expected class, or `Callable`.
+            kind: the expected class of the object, or `Callable`.
 
         Raises:
-            PluginError: if it cannot be imported or has another class; with the package and the entry point.
+            PluginError: if the object cannot be imported or has another class; names the package and the entry point.
         """
         if name not in self._loaded:
             try:
-                loaded = self._found[name].load()
+                loaded = self._entry_points[name].load()
             except Exception as error:  # importing another package may raise any exception
                 reason = f"cannot be imported ({type(error).__name__}: {error}): correct the package, or uninstall it"
                 raise self.error(name, reason) from error
@@ -76,26 +76,26 @@ class Plugins:
         return self._loaded[name]
 
     def error(self, name: str, problem: str) -> PluginError:
-        """Return a `PluginError` with the package and the entry point of a registered object."""
-        point = self._found[name]
-        return PluginError(f"package {_package(point)}, entry point {self.group}: {name} = {point.value}: {problem}")
+        """Return a `PluginError` whose message names the package and the entry point of a registered object."""
+        point = self._entry_points[name]
+        return PluginError(f"package {_package_id(point)}, entry point {self.group}: {name} = {point.value}: {problem}")
 
     @cached_property
-    def _found(self) -> dict[str, EntryPoint]:
+    def _entry_points(self) -> dict[str, EntryPoint]:
         found: dict[str, EntryPoint] = {}
         for point in sorted(entry_points(group=self.group), key=lambda one: one.name):
-            where = f"package {_package(point)}, entry point {self.group}: {point.name}"
+            where = f"package {_package_id(point)}, entry point {self.group}: {point.name}"
             if not re.fullmatch("[A-Za-z][A-Za-z0-9_-]*", point.name):
                 raise PluginError(f"{where}: expected a name of letters, digits, _ and -: rename it")
             if point.name in self._own:
-                raise PluginError(f"{where}: {PACKAGE} has this name itself: rename it, or uninstall the package")
+                raise PluginError(f"{where}: {PACKAGE} itself uses this name: rename it, or uninstall the package")
             if point.name in found:
-                other = _package(found[point.name])
-                raise PluginError(f"{where}: package {other} registers this name, too: uninstall one of them")
+                other = _package_id(found[point.name])
+                raise PluginError(f"{where}: package {other} also registers this name: uninstall one of them")
             found[point.name] = point
         return found
 
 
-def _package(point: EntryPoint) -> str:
+def _package_id(point: EntryPoint) -> str:
     """Return name and version of the package that registers an entry point."""
     return f"{point.dist.name} {point.dist.version}" if point.dist else "of unknown name"

@@ -1,4 +1,4 @@
-"""Progress display: bars on a terminal, and one plain line a minute in a file or pipe."""
+"""Progress display: bars on a terminal, or one line of text per minute in a file or pipe."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.progress import DownloadColumn, Progress, Task, TaskID, TextColumn, Tr
 from rich.text import Text
 
 FIRST_LINE_SECONDS, LINE_SECONDS = 10.0, 60.0
-"""Seconds before the first plain line and between lines."""
+"""Seconds before the first line of text, and between two lines."""
 
 
 @contextmanager
@@ -24,8 +24,8 @@ def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -
 
     Args:
         quiet: show nothing.
-        unit: unit of the numbers in plain lines, such as "steps".
-        of_bytes: whether the numbers are bytes; shows sizes and speed.
+        unit: unit of the numbers in lines of text, such as "steps".
+        of_bytes: whether the numbers are bytes, which are shown as sizes with a speed.
     """
     console = Console(stderr=True)
     bars = Progress(
@@ -34,7 +34,7 @@ def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -
         *((DownloadColumn(), TransferSpeedColumn()) if of_bytes else ()),
         console=console,
         transient=True,
-        # Lines show the mean speed, since updates may be minutes apart; rich leaves out what the first update had done.
+        # Lines show the mean speed, since updates may be minutes apart; rich ignores work before the first update.
         speed_estimate_period=30 if console.is_terminal else math.inf,
     )
     numbers: dict[str, TaskID] = {}
@@ -50,7 +50,7 @@ def progress_bars(quiet: bool = False, unit: str = "", of_bytes: bool = False) -
 
 
 def counted(show: Callable[..., None], name: str, total: int) -> Callable[[int], None]:
-    """Return a function that advances the bar `name` by a number; any thread may call it."""
+    """Return a function that advances the bar `name` by a number; any thread may call the function."""
     done, lock = 0, threading.Lock()
 
     def advance(number: int) -> None:
@@ -65,7 +65,7 @@ def counted(show: Callable[..., None], name: str, total: int) -> Callable[[int],
 
 @contextmanager
 def _printed_lines(bars: Progress, unit: str, of_bytes: bool) -> Iterator[None]:
-    """Print lines at intervals from a separate thread, so that they also appear during a long step."""
+    """Print lines at intervals from a separate thread, so that lines also appear during a long step."""
     stopped = threading.Event()
 
     def print_repeatedly() -> None:

@@ -29,7 +29,7 @@ def new_array(shape: tuple[int, ...], dtype: DTypeLike, what: str) -> np.ndarray
     """Return an uninitialised array, if enough memory is free.
 
     Raises:
-        OptionError: if memory is short; with the array's name and size.
+        OptionError: if too little memory is free; the message has the array's name and size.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size < _PLENTY or size <= free_memory():
@@ -47,17 +47,17 @@ def gigabytes(size: int) -> str:
 
 
 def free_memory() -> int:
-    """Return the bytes that this process can still allocate, by the machine's and the control group's limits."""
+    """Return the bytes that this process can still allocate within the limits of the machine and the control group."""
     free = []
     with suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 free.append(int(line.split()[1]) * 1024)
-    with suppress(OSError, ValueError):  # the control group is missing, or its limit is "max"
+    with suppress(OSError, ValueError):  # no control group, or no limit ("max")
         free.append(int((_CGROUP / "memory.max").read_text()) - int((_CGROUP / "memory.current").read_text()))
     if free:
         return max(0, min(free))
-    try:  # not Linux: half of the machine's memory
+    try:  # other systems than Linux: half of the machine's memory
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     except (AttributeError, ValueError, OSError):
         return 4 * 2**30
@@ -71,7 +71,7 @@ def usable_cores() -> int:
         return os.cpu_count() or 1
 
 
-def in_slices(work: Callable[[int, int], None], n: int, threads: int, least: int = 1) -> None:
+def run_in_slices(work: Callable[[int, int], None], n: int, threads: int, least: int = 1) -> None:
     """Call `work(start, stop)` on slices that cover 0..n, on up to `threads` threads including the caller's.
 
     If slices raise, one of the errors is raised after all slices have ended.
@@ -118,7 +118,8 @@ def cache_folder() -> Path:
 def data_folder() -> Path:
     """Return the folder of fetched releases; ~/.local/share/icrl4aht by default on Linux.
 
-    Reads the environment at each call. Unlike in the cache folder, nothing is removed automatically."""
+    Reads the environment at each call. Unlike in the cache folder, no file is removed automatically.
+    """
     own = os.environ.get(DATA_VARIABLE)
     return Path(own).expanduser() if own else platformdirs.user_data_path("icrl4aht", appauthor=False)
 
@@ -127,7 +128,7 @@ def cache_limit() -> int:
     """Return the maximum size of the cache folder in bytes.
 
     Raises:
-        OptionError: if the environment variable is not a number of bytes.
+        OptionError: if $ICRL4AHT_CACHE_BYTES is not a number of bytes.
     """
     given = os.environ.get("ICRL4AHT_CACHE_BYTES")
     if not given:

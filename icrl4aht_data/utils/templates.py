@@ -13,7 +13,7 @@ _PACKAGE = Path(__file__).parent.parent
 
 
 def card_file(name: str) -> Path:
-    """Return the path of a template, table, licence or citation.
+    """Return the path of a file of the folder `cards`, or of LICENSE or CITATION.cff.
 
     An installed package contains the folder `cards`. In a checkout, `cards` is next to the package, and LICENSE and
     CITATION.cff are in the root.
@@ -31,10 +31,10 @@ def card_file(name: str) -> Path:
 
 
 def fill_template(template: str, **values: str) -> str:
-    """Return the text of a template in the folder `cards`, with every $name replaced.
+    """Return the text of a template in the folder `cards`, with every $name replaced by a value.
 
     Raises:
-        KeyError: if a value is missing.
+        KeyError: if the value for a name is missing.
     """
     return Template(card_file(template).read_text(encoding="utf-8")).substitute(values)
 

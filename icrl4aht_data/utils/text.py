@@ -15,11 +15,11 @@ def counted_histories(number: int) -> str:
     return counted_noun(number, "history", "histories")
 
 
-_LISTED = 10  # most names of a list in a text
+_LISTED = 10  # maximum number of names of a list in a text
 
 
 def listed_names(names: Sequence[str]) -> str:
-    """Return names as text, of many the first ones, such as "a, b and 198 others"."""
+    """Return a list of names as text; a long list is shortened, such as "a, b and 198 others"."""
     if len(names) <= _LISTED:
         return ", ".join(names)
     return f"{', '.join(names[: _LISTED - 1])} and {len(names) - _LISTED + 1} others"

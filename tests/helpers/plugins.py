@@ -46,5 +46,5 @@ def installed(*folders: Path) -> Iterator[None]:
         stack.enter_context(mock.patch.object(sys, "path", [*map(str, folders), *sys.path]))
         for plugins in (LAYOUT_PLUGINS, TEAMMATE_PLUGINS, METHOD_PLUGINS):
             stack.enter_context(mock.patch.dict(vars(plugins), _loaded={}))
-            vars(plugins).pop("_found", None)
+            vars(plugins).pop("_entry_points", None)
         yield

@@ -126,13 +126,13 @@ def test_a_remote_release_equals_its_local_copy(kind, lite, monkeypatch):
 def test_offline(kind, lite, variable, monkeypatch):
     with served(kind, lite[0]) as (url, _):
         monkeypatch.setenv(variable, "1")
-        with pytest.raises(OfflineError, match="offline, and no version of it is downloaded"):
+        with pytest.raises(OfflineError, match="offline, and this release is not downloaded"):
             load_icrl4aht(url)
         monkeypatch.delenv(variable)
         fetch_planned(plan_download(url, layout="demo_wide"))
         monkeypatch.setenv(variable, "1")
         assert_equal(batch(url), batch(lite[0]))
-        with pytest.raises(OfflineError, match=r"not downloaded.*: .*data/teammate/coord_simple/train-0"):
+        with pytest.raises(OfflineError, match=r"offline, but these files are missing.*: .*data/teammate/coord_simple/train-0"):
             batch(url, "coord_simple", cache="ram")
 
 
@@ -214,7 +214,7 @@ def test_folders_with_other_content_are_refused(lite, full, tmp_path):
         assert [path.name for path in target.iterdir()] == [".bashrc"]
         shutil.rmtree(target)
         shutil.copytree(full[0], target)
-        with pytest.raises(OptionError, match="holds another release or version"):
+        with pytest.raises(OptionError, match="contains another release or version"):
             plan_download(server.url, to=target)
     assert contents(target) == contents(full[0])
 
@@ -414,10 +414,10 @@ def test_damaged_manifests(kind, lite, tmp_path):
 @pytest.mark.parametrize(
     ("url", "error", "message"),
     [
-        ("{server}/nowhere", RootNotFoundError, r"no release there, expected MANIFEST\.sha256"),
-        ("{hub}", RootNotFoundError, r"no release there, expected MANIFEST\.sha256"),
-        ("hf://datasets/org/absent", RootNotFoundError, "no release there"),
-        ("hf://datasets/org/empty@v9", RootNotFoundError, "no release there"),
+        ("{server}/nowhere", RootNotFoundError, r"no release at this address, expected MANIFEST\.sha256"),
+        ("{hub}", RootNotFoundError, r"no release at this address, expected MANIFEST\.sha256"),
+        ("hf://datasets/org/absent", RootNotFoundError, "no release at this address"),
+        ("hf://datasets/org/empty@v9", RootNotFoundError, "no release at this address"),
         ("hf://org/name", OptionError, "expected hf://datasets/<org>/<repo>"),
         ("gopher://old/times", OptionError, "not an address that fsspec opens"),
         ("http:///x", RemoteError, "(?i)InvalidUrl"),

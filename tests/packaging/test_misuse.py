@@ -44,14 +44,14 @@ lst | unknown command 'lst'; valid: list, show,
 list --layout demo_wied | unknown layout 'demo_wied'; valid: coord_simple,
 verify --teammate-family h4 | unknown family 'h4'; valid: rl, H1, H2, H3, H4. Did you mean 'H4'?
 show 158 | 158: no such folder; give a history's id as --history 158
-show --history 9999 | this selection has no history [9999], ids are within 0..
+show --history 9999 | this selection has no history [9999], its ids are within 0..
 browse --out page.txt | page.txt: expected a name that ends in .html
 browse --out none/page.html | no folder none: make it first, or give another path
 show --plot curves.jpg | curves.jpg: expected a name that ends in .png or .svg or .pdf
 download | give the ADDRESS of a release, or set ICRL4AHT_REMOTE
 download empty | empty: expected an address such as hf://datasets/<org>/<repo>
 download s3://a/b --to file | 'file' is a file
-convert --out out | give the form to convert to: --to full, lite, observations, published,
+convert --out out | give the format to convert to: --to full, lite, observations, published,
 convert {MINI} --out out --to parquet --kept-steps 50 | --kept-steps is for published files
 release build a b --out c | unexpected extra argument
 generate --out g --address there:1 | --address needs --executor ray

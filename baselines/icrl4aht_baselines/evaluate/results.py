@@ -12,7 +12,7 @@ from typing import Any
 from icrl4aht_baselines.training.run_folder import check_same_settings
 from icrl4aht_data.benchmark.tasks import Task
 from icrl4aht_data.errors import OptionError
-from icrl4aht_data.utils.files import atomic_write, check_own_folder, json_hash
+from icrl4aht_data.utils.files import atomic_write, check_folder_content, json_hash
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def find_results(
             folder is no folder of results and has other files.
     """
     if not (out / RESULTS).is_dir():
-        check_own_folder(out, (), "results of `evaluate`")
+        check_folder_content(out, (), "results of `evaluate`")
     paths = [result_path(out, task.task_id) for task in tasks]
     found = {result.task_id: result for result in map(read_result, filter(Path.exists, paths))}
     for result in found.values():

@@ -14,7 +14,7 @@ from icrl4aht_generation.learners.resume import METRICS, TIMING, Checkpoints, di
 
 from icrl4aht_baselines.training.loggers import LOGGER_NAMES
 from icrl4aht_data.errors import IndexFormatError, OptionError
-from icrl4aht_data.utils.files import atomic_write, check_own_folder, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import atomic_write, check_folder_content, parse_json, read_text, write_json
 
 RUN_FORMAT = 4
 """Version of the layout of run folders: 2 since checkpoints are safetensors files, 3 since config.json has
@@ -84,7 +84,7 @@ def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
         found = read_config(folder)
         check_same_settings(found, config, f"{folder}: holds a run")
         return found
-    check_own_folder(folder, _FILES, "a run")
+    check_folder_content(folder, _FILES, "a run")
     folder.mkdir(parents=True, exist_ok=True)
     if jax.process_index() == 0:
         with atomic_write(folder / CONFIG) as partial:

@@ -39,7 +39,7 @@ from icrl4aht_data.utils.files import (
     NO_ROOM,
     atomic_write,
     file_hash,
-    hashes_hold,
+    have_hashes,
     json_hash,
     parse_json,
     read_text,
@@ -165,7 +165,7 @@ def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
         metadata = parse_json(read_text(folder / METADATA))
         same = {name: metadata[name] for name in settings} == settings
         listed = sorted(metadata["files"]) == hashed_files(work, profile)
-        return same and listed and hashes_hold(folder, metadata["files"])
+        return same and listed and have_hashes(folder, metadata["files"])
     except (IndexFormatError, OSError, KeyError, TypeError):
         return False
 

@@ -26,7 +26,7 @@ import numpy as np
 from icrl4aht_data.benchmark.facts import ALGORITHMS
 from icrl4aht_data.errors import IndexFormatError, OptionError, check_choice
 from icrl4aht_data.overcooked.layouts import Layout
-from icrl4aht_data.utils.files import atomic_write, file_hash, hashes_hold, json_hash, parse_json, read_text, write_json
+from icrl4aht_data.utils.files import atomic_write, file_hash, have_hashes, json_hash, parse_json, read_text, write_json
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.checkpoint import (
@@ -194,7 +194,7 @@ class PopulationJob:
         record = read_record(self.folder)
         try:
             same = record["settings_hash"] == json_hash(self.population.settings)
-            return same and hashes_hold(self.folder, record["files"])
+            return same and have_hashes(self.folder, record["files"])
         except (OSError, KeyError, TypeError):
             return False
 

@@ -14,7 +14,7 @@ from icrl4aht_data.format.provenance import ReferenceEgos
 from icrl4aht_data.format.schema import KINDS, Kind
 from icrl4aht_data.overcooked.layouts import LAYOUTS, get_layout
 from icrl4aht_data.plotting import check_can_draw
-from icrl4aht_data.utils.files import check_own_folder, process_lock
+from icrl4aht_data.utils.files import check_folder_content, process_lock
 from icrl4aht_data.utils.progress import counted, progress_bars
 from icrl4aht_data.writing.card import card_facts, print_learning, teammate_name
 from icrl4aht_generation.collection.job import CollectionJob
@@ -72,7 +72,7 @@ def build_releases(
     options = options or QueueOptions()
     out, suite = out.resolve(), (suite or out / SUITE).resolve()  # workers have other working directories
     names = {"artefacts", SUITE, FAILED, f".{FAILED}.lock", _PACKING_LOCK, *KINDS, *(f".{kind}.old" for kind in KINDS)}
-    check_own_folder(out, names | ({suite.name} if suite.parent == out else set()), "a rebuild")
+    check_folder_content(out, names | ({suite.name} if suite.parent == out else set()), "a rebuild")
     if tasks is None:
         units, headroom, left_out = train_teammates(profile, suite, seed, console, options)
     else:

@@ -364,7 +364,7 @@ class TestHeldOut:
 
     def test_releases_without_labels(self, tmp_path):
         random_release(tmp_path / "r", layouts=("demo_wide",), labels=False)
-        with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: take labels that all have"):
+        with pytest.raises(LabelsMissingError, match=r"have no expert actions.*: use labels that all have"):
             job(tmp_path / "r", "dpt")
 
 

@@ -103,7 +103,7 @@ def test_false_values_without_tasks_are_found(converted_release, tmp_path):
     for number, (change, message) in enumerate(
         (
             (lambda c: [line.update(seed=3) for line in c], "seed: expected -1 without tasks, found 3"),
-            (lambda c: c[0].update(task_id=c[-1]["task_id"]), "of one task: unlike"),
+            (lambda c: c[0].update(task_id=c[-1]["task_id"]), "of one task differ in"),
         )
     ):
         found = problems(spoiled(converted_release, tmp_path / str(number), HISTORIES, change), "quick")

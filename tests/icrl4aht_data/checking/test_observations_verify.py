@@ -67,4 +67,4 @@ def test_convert_lists_missing_options(published_folder, tmp_path):
     assert verify_release(tmp_path / "part").ok
     with pytest.raises(Icrl4ahtError, match="needs state records"):
         run_cli("convert", out, "--out", tmp_path / "full", "--to", "full")
-    assert "give the form to convert to" in run_cli("convert", out, "--out", tmp_path / "x", code=2)
+    assert "give the format to convert to" in run_cli("convert", out, "--out", tmp_path / "x", code=2)

@@ -98,7 +98,7 @@ def test_a_tag_does_not_move(hub, published, tmp_path):
     first = upload_release(published, ADDRESS)
     random_release(tmp_path / "source", streams=2, seed=1)
     other = build_release(tmp_path / "source", tmp_path / "other")
-    with pytest.raises(UploadError, match=r"us/histories: tag v0\.0\.1 has other content: .*another data version"):
+    with pytest.raises(UploadError, match=r"us/histories: tag v0\.0\.1 exists with other content: .*another"):
         upload_release(other, ADDRESS)
     assert hub.repo(REPO).tags == {"v0.0.1": first.commit}
 
@@ -108,7 +108,7 @@ def test_the_next_version_replaces_the_last(hub, published, tmp_path):
     new = next_version(published, tmp_path / "new")
     looked = upload_release(new, ADDRESS, dry_run=True)
     assert looked.deletes == ["figures/layouts.png"]
-    assert any("would delete  figures/layouts.png" in line for line in looked.in_words())
+    assert any("would delete  figures/layouts.png" in line for line in looked.report_lines())
     before = sent(hub)
     second = upload_release(new, ADDRESS)
     assert sent(hub) == before, "large files that were there are not sent again"
@@ -129,7 +129,7 @@ def test_repositories_with_foreign_files_are_refused(hub, published, tmp_path):
 
 def test_a_public_repository_is_refused_for_a_private_upload(hub, published, tmp_path):
     upload_release(published, ADDRESS)
-    with pytest.raises(UploadError, match="us/histories: is public; make it private"):
+    with pytest.raises(UploadError, match="us/histories: is a public repository; make it private"):
         upload_release(next_version(published, tmp_path / "new"), ADDRESS, private=True)
 
 
@@ -216,7 +216,7 @@ def test_a_changed_repository_gets_no_tag(hub, published, tmp_path):
             hub.add_repo(REPO, tmp_path / "theirs")
 
     hub.faults.add(rule)
-    with pytest.raises(UploadError, match=r"is not the release: more\.txt: not in the .*CITATION\.cff: missing"):
+    with pytest.raises(UploadError, match=r"differs from the release: more\.txt: not in the .*CITATION\.cff: missing"):
         upload_release(published, ADDRESS)
     assert not hub.repo(REPO).tags
     hub.faults.clear()

@@ -108,9 +108,9 @@ def test_filter_by_expert_return(measured):
     dataset = load_icrl4aht(measured, source="ppo", min_expert_return=9.5)
     assert dataset.ids.tolist() == [0, 1]
     assert load_icrl4aht(measured).select([2, 1]).filter(min_expert_return=-1).ids.tolist() == [2, 1]
-    with pytest.raises(EmptySelectionError, match=r"expert_return >= 10; the highest is 9\.5"):
+    with pytest.raises(EmptySelectionError, match=r"expert_return >= 10; highest: 9\.5"):
         load_icrl4aht(measured, source="ppo", min_expert_return=10)
-    with pytest.raises(NotStoredError, match=r"2 of 8 histories earn; leave them out by ds\.select"):
+    with pytest.raises(NotStoredError, match=r"2 of 8 histories; leave these histories out by ds\.select"):
         load_icrl4aht(measured, min_expert_return=0)
     known = load_icrl4aht(measured)
     known = known.select(known.ids[~np.isnan(known.column("expert_return"))])

@@ -199,7 +199,7 @@ class TestTasks:
 class TestWithoutStates:
     def test_missing_states_are_an_error(self, converted_release):
         with pytest.raises(
-            OptionError, match=r'obs = "state": .* has observations only, no state records; take float32'
+            OptionError, match=r'obs = "state": .* has observations only, no state records; use float32'
         ):
             load_icrl4aht(converted_release, obs="state")
         dataset = load_icrl4aht(converted_release)
@@ -208,7 +208,7 @@ class TestWithoutStates:
                 getattr(dataset[0], name)
             with pytest.raises(NotStoredError, match="full or lite release"):
                 dataset[0].read(name)
-        with pytest.raises(NotStoredError, match="take hf_windows"):
+        with pytest.raises(NotStoredError, match="use hf_windows"):
             hf_episodes(dataset)
 
     def test_missing_teammate_actions(self, converted_release):

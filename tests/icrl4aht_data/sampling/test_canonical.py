@@ -128,8 +128,8 @@ def test_selections(root):
     assert "canonical" not in repr(own)
     assert own.filter(layout="demo_wide").obs_shape == (5, 5, 45)
     message = (
-        r"spans layouts coord_simple, demo_wide, whose own observations are of unequal shape \(\(5, 5, 40\), "
-        r'\(5, 5, 45\)\): take channels="canonical", .* or add layout=\'coord_simple\''
+        r"has layouts coord_simple, demo_wide, and their observations have different shapes \(\(5, 5, 40\), "
+        r'\(5, 5, 45\)\): choose channels="canonical", .* or one layout: layout=\'coord_simple\''
     )
     for make in (lambda: own.obs_shape, lambda: own.ad(batch_size=2, length=5), lambda: kinds(own)):
         with pytest.raises(OptionError, match=message):

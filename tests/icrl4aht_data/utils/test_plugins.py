@@ -137,9 +137,9 @@ def test_unusable_teammates_and_methods(rooms):
 @pytest.mark.parametrize(
     ("registered", "message"),
     [
-        ({"one": "demo_wide"}, "package one 0.1, .*: demo_wide: icrl4aht-data has this name itself: rename it"),
-        ({"one": "demo_cook_wide"}, "demo_cook_wide: icrl4aht-data has this name itself"),
-        ({"one": "room", "two": "room"}, "room: package (one|two) 0.1 registers this name, too"),
+        ({"one": "demo_wide"}, "package one 0.1, .*: demo_wide: icrl4aht-data itself uses this name: rename"),
+        ({"one": "demo_cook_wide"}, "demo_cook_wide: icrl4aht-data itself uses this name"),
+        ({"one": "room", "two": "room"}, "room: package (one|two) 0.1 also registers this name"),
         ({"one": "a room"}, "a room: expected a name of letters"),
     ],
 )

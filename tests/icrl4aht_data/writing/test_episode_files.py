@@ -98,7 +98,7 @@ class TestObservations:
                 row | {"state": np.zeros((20, 3))},
                 {},
             ),
-            (NotStoredError, "without a column 'state'.* take hf_windows", {"layout": "demo_wide"}, {}),
+            (NotStoredError, "without a column 'state'.* use hf_windows", {"layout": "demo_wide"}, {}),
         ]
         for kind, message, rows, options in wrong:
             with pytest.raises(kind, match=message):
