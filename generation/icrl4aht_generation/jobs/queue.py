@@ -165,7 +165,7 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                     waiting.append(job)
                 else:
                     yield _failed(job, attempts[job.name], error)
-            board.show_stated(job for job, _ in running.values())
+            board.show_recorded(job for job, _ in running.values())
     finally:
         for _, pool in (*(pool for _, pool in running.values()), *idle):
             pool.shutdown(wait=False, cancel_futures=True)

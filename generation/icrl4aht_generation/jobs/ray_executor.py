@@ -46,7 +46,7 @@ def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueO
                 ready, _ = ray.wait(list(pending), num_returns=1, timeout=_POLL_SECONDS)
                 for reference in ready:
                     yield _outcome(ray, reference, pending.pop(reference), options)
-                board.show_stated(pending.values())  # workers report through their folders
+                board.show_recorded(pending.values())  # workers report through their folders
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)

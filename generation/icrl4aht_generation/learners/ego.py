@@ -37,7 +37,7 @@ class LearnerState(NamedTuple):
     Attributes:
         params: the ego's parameters, a pytree of float32.
         optimizer: state of the optimizer.
-        carry: environments and memories before the next roll-out.
+        carry: environments and memories before the next rollout.
         teammate: the teammate's parameters. In the state, not in the compiled update, so that all teammates of one
             family share one compilation.
         key: typed key, scalar, constant; every update folds its number into it.
@@ -91,16 +91,16 @@ class Learner:
         return LearnerState(params, optimizer, carry, self.teammate.params, running_key, jnp.int32(0))
 
     def update(self, state: LearnerState) -> tuple[LearnerState, Rollout, dict[str, Array]]:
-        """Play one roll-out and learn from it; a pure function of the state.
+        """Play one rollout and learn from it; a pure function of the state.
 
         Returns:
-            The next state, the roll-out, and scalar metrics.
+            The next state, the rollout, and scalar metrics.
         """
         play_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.update))
         players = self.players(state.params, state.teammate)
         carry, rollout = roll_out(self.env, players, state.carry, self.config.rollout, play_key)
         ego = players[EGO]
-        # Only for the value of the observation after the roll-out: the action is drawn again in the next one.
+        # Only for the value of the observation after the rollout: the action is drawn again in the next one.
         after, _ = ego.act(carry.memories[EGO], carry.env, play_key)
         shaping = shaping_weight(self.config, state.update)
         memory, forgiveness = state.carry.memories[EGO], self.config.forgiveness

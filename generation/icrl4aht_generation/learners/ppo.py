@@ -1,8 +1,8 @@
 """Recurrent PPO for egos and populations (paper, App. B.1 and C.2).
 
-T denotes the steps of a roll-out, M the agent slots of one policy: pairs of an environment and one of its two agents
+T denotes the steps of a rollout, M the agent slots of one policy: pairs of an environment and one of its two agents
 that the policy controls. A sequence is the T steps of one slot. Minibatches consist of complete sequences, because the
-recurrent state is recomputed from the one before the first step. The network's inputs are made once per roll-out. The
+recurrent state is recomputed from the one before the first step. The network's inputs are made once per rollout. The
 algorithms for egos and populations differ only in the partner and in the weight of each sequence's advantage.
 """
 
@@ -85,11 +85,11 @@ def sequences(
 
     Args:
         view: makes the network's input of state records.
-        rollout: the roll-out.
-        player: number of the player in the roll-out.
+        rollout: the rollout.
+        player: number of the player in the rollout.
         agent_slots: int (M,), the player's slots; slot a * N + n is agent a of environment n.
-        hidden: float32 (M, H), the player's recurrent state before the roll-out.
-        last_value: float32 (M,), the critic's estimates for the observations after the roll-out.
+        hidden: float32 (M, H), the player's recurrent state before the rollout.
+        last_value: float32 (M,), the critic's estimates for the observations after the rollout.
         shaping: float32 scalar or (M,), weight of shaped rewards.
         forgiveness: shaped reward of a wrong delivery, see `PPOConfig`.
     """
@@ -140,7 +140,7 @@ class PPO:
     def learn(
         self, params: Any, optimizer: optax.OptState, played: Sequences, key: Key[Array, ""]
     ) -> tuple[Any, optax.OptState, dict[str, Array]]:
-        """Update a policy with `config.epochs` passes over the sequences of one roll-out.
+        """Update a policy with `config.epochs` passes over the sequences of one rollout.
 
         Minibatches are of equal size; the remaining sequences are skipped, different ones in every epoch.
 
@@ -242,7 +242,7 @@ def generalised_advantage(
 
 
 def episode_metrics(rollout: Rollout) -> dict[str, Array]:
-    """Return scalar metrics of a roll-out by name; `return` is the mean over ended episodes, 0 if there are none."""
+    """Return scalar metrics of a rollout by name; `return` is the mean over ended episodes, 0 if there are none."""
     ended = jnp.sum(rollout.done)
     return {
         "episodes": ended,

@@ -1,4 +1,4 @@
-"""The one roll-out that learners learn from: N environments, whose 2 N agents are shared out among players.
+"""The one rollout that learners learn from: N environments, whose 2 N agents are shared out among players.
 
 N denotes the number of environments, M the number of agent slots of one player, T the number of steps. An *agent slot*
 is one agent of one environment: slot a * N + e is agent a (0 the ego, 1 the teammate) of environment e. A player acts
@@ -40,7 +40,7 @@ class Player(NamedTuple):
     """A policy, or several of one shape, in a fixed set of agent slots.
 
     Attributes:
-        agent_slots: int (M,), NumPy, so that the pairing is known when the roll-out is compiled.
+        agent_slots: int (M,), NumPy, so that the pairing is known when the rollout is compiled.
         init: environment states -> memories at the start of an episode, leaves (M, ...).
         act: memories, environment states and a key -> choices and the memories after the step.
     """
@@ -51,7 +51,7 @@ class Player(NamedTuple):
 
 
 class RolloutCarry(NamedTuple):
-    """State between two roll-outs.
+    """State between two rollouts.
 
     Attributes:
         env: states of the N environments.
@@ -111,7 +111,7 @@ def roll_out(
     Args:
         env: the environment.
         players: players whose agent slots are 0..2N-1, each once.
-        carry: from `init_rollout` or the roll-out before.
+        carry: from `init_rollout` or the rollout before.
         steps: T.
         key: for the players' draws; those of the environment come from the environments' own keys.
         restart: changes the states of environments whose next episode starts, those with `done`.

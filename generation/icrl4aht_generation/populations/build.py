@@ -188,7 +188,7 @@ def actions_on_common_states(
 ) -> np.ndarray:
     """Return actions of every policy, as the teammate, on the same states.
 
-    The states are those of roll-outs with a uniformly random ego and each policy in turn as the teammate, two episodes
+    The states are those of rollouts with a uniformly random ego and each policy in turn as the teammate, two episodes
     each. Every policy acts on every state; its memory follows the episode that it observes.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Return of learned policies with each other, over complete training episodes, by one compiled roll-out."""
+"""Return of learned policies with each other, over complete training episodes, by one compiled rollout."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
-from icrl4aht_generation.experts.padded import own_layout, padded_layout
+from icrl4aht_generation.experts.padded import unpadded_layout, padded_layout
 from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Policy, stacked
 
@@ -46,7 +46,7 @@ def reference_returns(layout: Layout, teammates: Sequence[Policy], episodes: int
     families = list(stacked_families(teammates))
     # Observations and the state records that a policy of one layout sees are not padded.
     every = all(family.sees == "situation" for _, family in families)
-    tables, expert, _ = (padded_layout if every else own_layout)(layout)
+    tables, expert, _ = (padded_layout if every else unpadded_layout)(layout)
     play = _program(
         tuple((tuple(numbers), family._replace(params=())) for numbers, family in families), len(teammates), episodes
     )

@@ -136,9 +136,9 @@ class PopulationState(NamedTuple):
     Attributes:
         params: parameters of all policies, leaves (P, ...).
         optimizer: optimizer states of the learning policies, leaves (L, ...).
-        carry: environments and memories before the next roll-out.
+        carry: environments and memories before the next rollout.
         memory: the algorithm's memory.
-        visited: uint8 (N, S), for each environment one of the states of its last roll-out.
+        visited: uint8 (N, S), for each environment one of the states of its last rollout.
         key: typed key, scalar, constant; every update folds its number into it.
         update: int32 scalar, number of updates so far.
     """
@@ -231,7 +231,7 @@ class Population:
         )
 
     def update(self, state: PopulationState) -> tuple[PopulationState, dict[str, Array]]:
-        """Play one roll-out, then every policy learns from its slots and the algorithm adapts its memory.
+        """Play one rollout, then every policy learns from its slots and the algorithm adapts its memory.
 
         A pure function of the state.
 
@@ -283,7 +283,7 @@ class Population:
         return restart if (source >= 0).any() else lambda state, done: state
 
     def _learn(self, state: PopulationState, players: list[Player], carry: RolloutCarry, rollout: Rollout, key: Array):
-        """Return all policies' parameters and optimizer states after learning from the roll-out, and mean losses."""
+        """Return all policies' parameters and optimizer states after learning from the rollout, and mean losses."""
         weight = self._slot_weights(state.memory)
         shaping = shaping_weight(self.config, state.update)
         params, optimizer, losses = state.params, state.optimizer, []

@@ -129,7 +129,7 @@ def _functions(heuristic: Heuristic, slot: int, noise: Noise, mixed: bool):
         return heuristic.begin(jax.random.key(slot) if noise == "fixed" else key)
 
     def act(params, memory: Any, view: Situation, key: Key[Array, ""]):
-        # The roll-out's key is not used: the published teammates carry a chain of keys in their memory.
+        # The rollout's key is not used: the published teammates carry a chain of keys in their memory.
         action, memory = heuristic.act(params, memory, Scene(view.tables, view.record, slot))
         return action.astype(jnp.int32), memory
 
