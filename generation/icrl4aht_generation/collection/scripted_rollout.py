@@ -27,7 +27,7 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
-from icrl4aht_generation.experts.padded import unpadded_layout, padded_layout
+from icrl4aht_generation.experts.padded import padded_layout, unpadded_layout
 from icrl4aht_generation.experts.search import SITUATION_SEARCHER, padded_dishes, with_taken_action
 from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out, select_rows
 from icrl4aht_generation.policy import Policy, sometimes_random

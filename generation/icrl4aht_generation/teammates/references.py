@@ -19,7 +19,7 @@ from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
-from icrl4aht_generation.experts.padded import unpadded_layout, padded_layout
+from icrl4aht_generation.experts.padded import padded_layout, unpadded_layout
 from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Policy, stacked
 
