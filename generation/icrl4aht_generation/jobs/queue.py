@@ -98,7 +98,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
 
 def _run_all(jobs: Sequence[Job], board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
     """Run every job, then wait for jobs that another process was running."""
-    execute = _run_in_this_process
+    execute = _run_serially
     if options.executor == "ray":
         execute = run_on_ray
     elif (options.workers or 1) > 1:
@@ -115,9 +115,7 @@ def _run_all(jobs: Sequence[Job], board: JobBoard, options: QueueOptions) -> Gen
         jobs = busy
 
 
-def _run_in_this_process(
-    jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions
-) -> Generator[JobOutcome]:
+def _run_serially(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
     """Run the jobs one after another in this process."""
     for job in jobs:
 

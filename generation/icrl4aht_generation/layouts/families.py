@@ -64,8 +64,8 @@ def generate_layouts(family: str, seed: int, count: int, *, split: str | None = 
         if layout is None:
             kept = "" if split is None else f" of split {split}"
             raise OptionError(
-                f"family {family}, seed {seed}: found only {len(found)} layouts{kept}, expected {count}; ask for fewer, or "
-                f"give another seed or family"
+                f"family {family}, seed {seed}: found only {len(found)} layouts{kept}, expected {count}; ask for "
+                f"fewer, or give another seed or family"
             )
         if split is None or split_of(layout) == split:
             found.append(layout)

@@ -75,7 +75,7 @@ def canonical_map(layout: Layout) -> tuple[str, ...]:
 
 
 def canonical_floor(floor: np.ndarray) -> tuple[str, ...]:
-    """Return the alphabetically first mirror image or rotation of a floor, bool (H, W), that is not taller than wide."""
+    """Return the alphabetically first mirror image or rotation, not taller than wide, of a floor, bool (H, W)."""
     images, width = _wide_images(*floor.shape)
     return _first_rows(np.where(floor.ravel()[images], ord(" "), ord("W")).astype(np.uint8), width)
 

@@ -27,9 +27,7 @@ def with_four_recipes(layout: Layout) -> Layout:
     """
     missing = {i for recipe in FOUR_RECIPES for i in recipe} - set(layout.ingredients)
     if missing:
-        raise OptionError(
-            f"{layout.name}: the layout has no pile of ingredient {min(missing)}, which the four recipes need"
-        )
+        raise OptionError(f"{layout.name}: no pile of ingredient {min(missing)}, which the four recipes need")
     return replace(layout, name=f"{layout.name} four recipes", recipes=FOUR_RECIPES)
 
 
@@ -49,9 +47,7 @@ def rearranged_layouts(layout: Layout, count: int) -> list[Layout]:
     """
     found = list(islice(_arrangements(layout, 0), count))
     if len(found) < count:
-        raise OptionError(
-            f"{layout.name}: found only {len(found)} other arrangements of the fixtures, expected {count}"
-        )
+        raise OptionError(f"{layout.name}: found only {len(found)} rearranged versions, expected {count}")
     return found
 
 
