@@ -249,7 +249,7 @@ def test_no_validation_teammate_trains(changed, monkeypatch):
     monkeypatch.setattr(profile_module, "spread_teammates", lambda layout, split, count: [entry] * count)
     counts = "per_layout = 0\nvalidation = { coord_simple = 1 }"
     spread_profile(changed, 'presets = ["default"]', counts)
-    with pytest.raises(OptionError, match=r"1 of the validation tasks have a teammate that also trains, such as team"):
+    with pytest.raises(OptionError, match="1 of the validation tasks have a teammate of a training task, such as"):
         spread_profile(changed, PRESETS, counts)
 
 

@@ -178,7 +178,7 @@ class OracleView(NamedTuple):
     def cost_at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
         """Return the steps to each cell of the given pots plus the later steps `then`; NEVER for other cells."""
         there = jnp.where(which & self.facts.pots, self.pot_times + then, NEVER)
-        return jnp.where(self.scene.static(POT), self.scene.at(POT, there), NEVER)
+        return jnp.where(self.scene.cells_of_kind(POT), self.scene.at(POT, there), NEVER)
 
     @property
     def parking_cost(self) -> Int[Array, " cells"]:

@@ -10,7 +10,7 @@ from icrl4aht_generation.policy import Noise, Situation
 from icrl4aht_generation.teammates import spread as module
 from icrl4aht_generation.teammates.distances import (
     INSTANCE_NAMES,
-    act_along,
+    actions_on_records,
     common_records,
     distances_to_tests,
     instance_policies,
@@ -153,8 +153,8 @@ def test_two_of_the_list_are_measured_again():
     family = "assembly_line"
     chosen = [mate for mate in spread.chosen if mate.family == family and RANDOM_ACTIONS not in mate.theta][:2]
     records = common_records(layout, 4)
-    tested = act_along(layout, instance_policies(layout), records)
-    actions = act_along(layout, [build_teammate(None, mate.entry) for mate in chosen], records)
+    tested = actions_on_records(layout, instance_policies(layout), records)
+    actions = actions_on_records(layout, [build_teammate(None, mate.entry) for mate in chosen], records)
     assert (actions[0] != actions[1]).mean() >= DIVERSE_DISTANCE
     for mate, distances in zip(chosen, distances_to_tests(tested, actions), strict=True):
         assert distances[INSTANCE_NAMES.index(mate.nearest)] == pytest.approx(mate.distance, abs=1e-4)
