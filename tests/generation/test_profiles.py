@@ -276,7 +276,7 @@ def test_given_tasks_have_the_sources_that_they_had(changed):
         (third, "ppo", 1),
     ]
     of_ppo = load_profile(changed("keep = 8", "keep = 7"))
-    with pytest.raises(OptionError, match=rf"task {second}: its source is noise, those of profile mine are ppo: "):
+    with pytest.raises(OptionError, match=rf"task {second}: the source is noise, but profile mine has ppo: "):
         of_ppo.units_of(tasks, {second: "noise"})
 
 

@@ -110,10 +110,8 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
     scripted_seconds = [count / ENVIRONMENT_STEPS_PER_SECOND + SCRIPTED_SECONDS for count in transitions]
     seconds = [played + COMPILE_SECONDS for played in playing] + scripted_seconds
     teammate_seconds = sum(run.steps * step_seconds(run.config) + COMPILE_SECONDS for run in runs)
-    fixed = sum(histories[source] * more for source, more in BYTES_PER_HISTORY.items())
-    sizes = {
-        kind: round(overhead + sum(kept[source] * BYTES_PER_STEP[kind, source] for source in kept)) for kind in KINDS
-    }
+    extra = sum(histories[source] * more for source, more in BYTES_PER_HISTORY.items())
+    sizes = {kind: round(extra + sum(kept[each] * BYTES_PER_STEP[kind, each] for each in kept)) for kind in KINDS}
     device = jax.devices()[0]
     return {
         "profile": profile.name,

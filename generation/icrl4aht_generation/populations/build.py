@@ -39,7 +39,7 @@ from icrl4aht_generation.populations.train import (
     suite_checkpoints,
 )
 from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.teammates.distances import actions_on_records, hamming_distances
+from icrl4aht_generation.teammates.distances import act_on_records, hamming_distances
 from icrl4aht_generation.teammates.instances import published_teammates
 from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_families
@@ -197,7 +197,7 @@ def actions_on_common_states(
     env, key = Environment(layout, steps), jax.random.key(seed)
     played = [_visited_records(env, *family, key) for family in stacked_families(policies)]
     records = jnp.concatenate(played, axis=1)  # (T, episodes, S)
-    return actions_on_records(layout, policies, records, seed).reshape(len(policies), -1)
+    return act_on_records(layout, policies, records, seed).reshape(len(policies), -1)
 
 
 def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]]) -> np.ndarray:

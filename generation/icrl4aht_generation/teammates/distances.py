@@ -100,7 +100,7 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
         UnknownNameError: if the benchmark does not have the layout.
     """
     records, tested = common_states(layout)
-    actions = actions_on_records(layout, policies, records)
+    actions = act_on_records(layout, policies, records)
     distances = distances_to_tests(tested, actions)
     nearest = distances.argmin(axis=1)
     return [
@@ -120,7 +120,7 @@ def common_states(layout: Layout) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
         UnknownNameError: if the benchmark does not have the layout.
     """
     records = common_records(layout)
-    return records, actions_on_records(layout, instance_policies(layout), records)
+    return records, act_on_records(layout, instance_policies(layout), records)
 
 
 def instance_policies(layout: Layout) -> list[Policy]:
@@ -176,7 +176,7 @@ def _compiled_test_play(families: tuple[Policy, ...], episodes: int) -> Callable
     return play
 
 
-def actions_on_records(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
+def act_on_records(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
     """Return the actions of policies as the teammate on recorded episodes, with memories of the observed episodes.
 
     Args:
@@ -313,7 +313,7 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
         for family, seed, theta_id in numbers
     ]
     records, tested = common_states(layout)
-    actions = actions_on_records(layout, policies, records)
+    actions = act_on_records(layout, policies, records)
     distances, returns = distances_to_tests(tested, actions), reference_returns(layout, policies)
     families = np.array([family for family, _, _ in numbers])
     behaviours = np.zeros(len(numbers), int)
@@ -361,7 +361,7 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]]) -> Layo
     # Candidates and test instances act together, so each family needs only one compilation.
     tested, records = instance_entries(layout), common_records(layout, _SPREAD_EPISODES)
     policies = [build_teammate(None, entry) for entry in with_equal_parameters([*tested, *candidates])]
-    actions, policies = actions_on_records(layout, policies, records), policies[len(tested) :]
+    actions, policies = act_on_records(layout, policies, records), policies[len(tested) :]
     tests, actions = distances_to_tests(actions[: len(tested)], actions[len(tested) :]), actions[len(tested) :]
     returns = reference_returns(layout, policies)  # of all candidates, so layouts share one compilation
     unlike = tests.min(axis=1) >= DIVERSE_DISTANCE

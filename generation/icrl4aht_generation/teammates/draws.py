@@ -243,7 +243,7 @@ def _ordered_draws(layout: str, family: str, base_seed: int) -> list[Draw]:
         farthest = max((draw.nearest_counted for draw in read_draws(layout, family, base_seed)), default=None)
         near = f", to {farthest[1]}" if farthest else ""
         raise OptionError(
-            f"{layout} has no usable {_OF_SEED[base_seed]} teammates of {family}: "
+            f"{layout}: no usable {_OF_SEED[base_seed]} teammates of {family}: "
             f"{unusable_reason(layout, family, base_seed)}; expected a distance of {_least_distance(base_seed)} or "
             f"more{near}, and returns that differ by {LEAST_HEADROOM:g} or more; name other families "
             f"({_hosted_text(layout, base_seed)})"

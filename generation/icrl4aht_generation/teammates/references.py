@@ -47,7 +47,7 @@ def reference_returns(layout: Layout, teammates: Sequence[Policy], episodes: int
     # Policies that see observations or state records of one layout need the layout without padding.
     every = all(family.sees == "situation" for _, family in families)
     tables, expert, _ = (padded_layout if every else unpadded_layout)(layout)
-    play = _compiled(
+    play = _compile(
         tuple((tuple(numbers), family._replace(params=())) for numbers, family in families), len(teammates), episodes
     )
     earned = np.asarray(play(tables, expert, [family.params for _, family in families]), np.float64)
@@ -66,9 +66,7 @@ def reference_egos(returns: np.ndarray, self_play: float | None = None) -> Refer
 
 
 @lru_cache(maxsize=16)
-def _compiled(
-    families: tuple[tuple[tuple[int, ...], Policy], ...], teammates: int, episodes: int
-) -> Callable[..., Any]:
+def _compile(families: tuple[tuple[tuple[int, ...], Policy], ...], teammates: int, episodes: int) -> Callable[..., Any]:
     """Return a compiled function that plays all pairs and returns the episodes' returns.
 
     Its arguments are the layout's tables, and the parameters of the oracle and of each family.

@@ -63,8 +63,8 @@ def test_stored_sizes_are_those_of_the_bundled_release():
     shards = sum(path.stat().st_size for path in (dataset.root / "data").rglob("*.h5"))
     made = [entry for entry in dataset.entries if entry.source != "agent"]  # which are a thirtieth of the transitions
     expected = sum(
-        entry.T * plan.BYTES_PER_STEP["lite", str(entry.source)] + plan.BYTES_PER_HISTORY.get(str(entry.source), 0)
-        for entry in made
+        one.T * plan.BYTES_PER_STEP["lite", str(one.source)] + plan.BYTES_PER_HISTORY.get(str(one.source), 0)
+        for one in made
     )
     assert shards == pytest.approx(expected, rel=0.1)
 

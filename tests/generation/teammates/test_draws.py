@@ -86,7 +86,7 @@ def test_no_chosen_teammate_acts_like_a_test_instance_of_its_family(layout):
         with pytest.raises(OptionError, match="distinct draws"):
             drawn_teammates(layout, families, len(teammates) + 1, seed)
         for family in {*HEURISTIC_FAMILIES} - {*families}:
-            with pytest.raises(OptionError, match=rf"{layout} cannot host (drawn|diverse) \w+ teammates of {family}: "):
+            with pytest.raises(OptionError, match=rf"{layout}: no usable (drawn|diverse) \w+ teammates of {family}: "):
                 drawn_teammates(layout, [family], 1, seed)
 
 

@@ -1,4 +1,4 @@
-"""Heuristic family H3 `assembly_line`: brings ingredients, or plates and delivers, and makes mistakes (paper, App. B.2)."""
+"""Heuristic family H3 `assembly_line`: brings ingredients, or plates and delivers, with mistakes (paper, App. B.2)."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def next_key(key: Key[Array, ""]) -> Key[Array, ""]:
 
 
 def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
-    """Return the next key of a teammate's chain and four uniform random numbers u1..u4 of the step, float32 in [0, 1)."""
+    """Return the next key of a teammate's chain, and four uniform random numbers u1..u4, float32 in [0, 1)."""
     # As in the published code, the first of five keys continues the chain; golden actions depend on this.
     keys = jax.random.split(key, 5)
     return keys[0], jax.vmap(jax.random.uniform)(keys[1:])

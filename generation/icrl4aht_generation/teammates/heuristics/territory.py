@@ -1,4 +1,4 @@
-"""Heuristic family H2 `territory`: prefers targets in its part of the layout; some modes do not cooperate (App. B.2)."""
+"""Heuristic family H2 `territory`: prefers targets in its part of the layout; some modes do not cooperate."""
 
 from __future__ import annotations
 

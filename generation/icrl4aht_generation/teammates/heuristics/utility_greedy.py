@@ -68,9 +68,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
     values, allowed = _values(scene, params, waits, jnp.any(needed))
     distance = jax.vmap(scene.nearest_distance)(targets)
     feasible = allowed & (distance < UNREACHABLE)
-    bonus = (
-        2.0 * params["inertia"] * (jnp.arange(8) == last_intent)
-    )  # prevents switching between two intents in every step
+    bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # prevents wavering between two intents
     scores = jnp.where(feasible, values - params["dist_weight"] * distance + bonus, -jnp.inf)
     best = jnp.argmax(scores)
     target = scene.closest(targets[best])
