@@ -263,9 +263,9 @@ class ArrayWriter:
             for name, (shape, dtype) in shapes.items():
                 new_mapped_array(partial / f"{name}.npy", shape, np.dtype(dtype))
         self.log = RunLog(partial, keep=lambda line: line["update"] < kept)
-        self.arrays = self._mapped()
+        self.arrays = self._map_arrays()
 
-    def _mapped(self) -> dict[str, Any]:
+    def _map_arrays(self) -> dict[str, Any]:
         return {name: np.lib.format.open_memmap(self._partial / f"{name}.npy", "r+") for name in self._names}
 
     @contextmanager
@@ -297,7 +297,7 @@ class ArrayWriter:
         with self.recording():
             for array in self.arrays.values():
                 array.flush()
-            self.arrays = self._mapped()
+            self.arrays = self._map_arrays()
             self.log.sync()
 
     def close(self) -> None:

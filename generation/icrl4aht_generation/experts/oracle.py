@@ -84,7 +84,7 @@ def _act(params: Any, memory: OracleMemory, view: Situation, key: Key[Array, ""]
     facts = LayoutFacts(*(jnp.asarray(leaf)[view.layout] for leaf in params[0]))
     scene = Scene(view.tables, view.record, EGO)
     memory = _update_memory(scene, memory)
-    action = jnp.where(facts.matters, _decide(_view_state(facts, scene, memory)), STAY).astype(jnp.int32)
+    action = jnp.where(facts.matters, _choose_action(_view_state(facts, scene, memory)), STAY).astype(jnp.int32)
     return action, memory._replace(action=action)
 
 
@@ -281,7 +281,7 @@ def _steps(stored: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
     return jnp.where(stored < NOWHERE, stored.astype(jnp.int32), FAR)
 
 
-def _way(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Array, ""]) -> Int[Array, ""]:
+def _first_move(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Array, ""]) -> Int[Array, ""]:
     """Return the first action of the shortest way to face a cell around an obstacle; INTERACT if already faced."""
     scene, ahead = view.scene, jnp.asarray(view.scene.tables.ahead)
     ends = jnp.asarray(scene.tables.moves)[scene.me, :STAY].astype(jnp.int32)
@@ -306,13 +306,13 @@ class Subgoal(NamedTuple):
     reason: str
 
 
-def _decide(view: OracleView) -> Int[Array, ""]:
+def _choose_action(view: OracleView) -> Int[Array, ""]:
     """Return the action towards the first subgoal that applies and has a cell that can be reached."""
     facts = view.facts
-    rows = _with_dish(view) + _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
+    rows = _dish_subgoals(view) + _plate_subgoals(view) + _ingredient_subgoals(view) + _empty_hand_subgoals(view)
     possible = jnp.stack([row.when & (jnp.min(row.cost) < NEVER) for row in rows])
     target = jnp.argmin(jnp.stack([row.cost for row in rows])[jnp.argmax(possible)])
-    action = _way(view, view.obstacle, target)
+    action = _first_move(view, view.obstacle, target)
     at_pot = (jnp.asarray(view.scene.tables.pots) == target) & facts.pots
     # Interacting too early would spoil the pot or have no effect.
     waits = jnp.any(at_pot & view.waiting_pots) & (action == INTERACT)
@@ -321,7 +321,7 @@ def _decide(view: OracleView) -> Int[Array, ""]:
     return jnp.where(facts.shares_room, _act_in_shared_room(view, jnp.any(possible), target, action), alone)
 
 
-def _with_dish(view: OracleView) -> list[Subgoal]:
+def _dish_subgoals(view: OracleView) -> list[Subgoal]:
     scene, facts = view.scene, view.facts
     # A dish on a counter is worth a trip only if the ego can carry it to a goal.
     wanted = (view.items == view.dish) & facts.mine & jnp.any(scene.goals & facts.mine)
@@ -336,7 +336,7 @@ def _with_dish(view: OracleView) -> list[Subgoal]:
     ]
 
 
-def _with_plate(view: OracleView) -> list[Subgoal]:
+def _plate_subgoals(view: OracleView) -> list[Subgoal]:
     holds, building = view.scene.holds_plate, jnp.min(view.plan_costs) < NEVER
     right = view.right & ~view.left_to_teammate
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
@@ -353,7 +353,7 @@ def _with_plate(view: OracleView) -> list[Subgoal]:
     ]
 
 
-def _with_ingredient(view: OracleView) -> list[Subgoal]:
+def _ingredient_subgoals(view: OracleView) -> list[Subgoal]:
     holds, kind = view.scene.holds_ingredient, view.scene.counts(view.scene.hand) > 0
     takes = jnp.any((view.missing > 0) & kind, axis=-1)
     # An ingredient for a later recipe goes into a pot only if another pot is left for the current recipe.
@@ -372,7 +372,7 @@ def _with_ingredient(view: OracleView) -> list[Subgoal]:
     ]
 
 
-def _with_nothing(view: OracleView) -> list[Subgoal]:
+def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
     facts, scene, plans = view.facts, view.scene, view.plan_costs
     empty = scene.holds_nothing
     to_pot, first = view.steps_to_pots, jnp.argmax(facts.pots)
@@ -424,7 +424,7 @@ def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Ar
     reachable = found & (view.time[target] < FAR)
     # A teammate that blocks the way may leave in this step; if it stays, it may be waiting for the ego.
     follows = found & ~reachable & ~pushed & (still < 3)
-    through = _way(view, 0, target)
+    through = _first_move(view, 0, target)
 
     # What the teammate carries shows where it may be going; see `LayoutFacts.hindrance`.
     carries = jnp.where(scene.partner_hand & COOKED > 0, 0, jnp.where(scene.partner_hand > 0, 1, 2))

@@ -64,7 +64,7 @@ def _arrangements(layout: Layout, seed: int) -> Iterator[Layout]:
     """Yield distinct rearranged versions of a layout, until `MOST_REPEATS` draws in a row give no new version."""
     recipes = with_four_recipes(layout).recipes
     rng = np.random.default_rng([seed, *map(ord, layout.name)])
-    known = {mirrored for name in LAYOUT_NAMES for mirrored in _mirrored(get_layout(name).rows)}
+    known = {mirrored for name in LAYOUT_NAMES for mirrored in _mirror_images(get_layout(name).rows)}
     grid = grid_of(layout)
     reach = [neighbours(room) for room in agent_rooms(layout)]
     fixtures = np.flatnonzero((grid != " ") & (grid != "A") & np.any(reach, axis=0)).tolist()
@@ -77,13 +77,13 @@ def _arrangements(layout: Layout, seed: int) -> Iterator[Layout]:
         rows = rows_of(new)
         repeats += 1
         if rows not in known:
-            known |= set(_mirrored(rows))
+            known |= set(_mirror_images(rows))
             one = replace(layout, name=f"{layout.name} rearranged {found}", rows=rows)
             yield replace(one, recipes=recipes) if found % 2 else one
             found, repeats = found + 1, 0
 
 
-def _mirrored(rows: tuple[str, ...]) -> list[tuple[str, ...]]:
+def _mirror_images(rows: tuple[str, ...]) -> list[tuple[str, ...]]:
     """Return a map and its mirror images."""
     flipped = [rows, rows[::-1]]
     return flipped + [tuple(row[::-1] for row in one) for one in flipped]

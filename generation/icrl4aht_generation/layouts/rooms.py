@@ -54,11 +54,11 @@ def _shared_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         surrounded = np.argwhere(binary_erosion(floor, np.ones((3, 3), bool)))
         if len(surrounded):
             floor[tuple(rng.choice(surrounded))] = False
-    floor = _cropped(floor)
+    floor = _crop(floor)
     return floor, floor
 
 
-def _cropped(floor: np.ndarray) -> np.ndarray:
+def _crop(floor: np.ndarray) -> np.ndarray:
     """Return a floor cropped to its cells and a border of walls."""
     rows, columns = np.flatnonzero(floor.any(axis=1)), np.flatnonzero(floor.any(axis=0))
     return np.pad(floor[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)

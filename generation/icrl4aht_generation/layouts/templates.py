@@ -24,23 +24,23 @@ def published_rooms(tested: bool) -> dict[tuple[str, ...], list[np.ndarray]]:
     Returns:
         Symmetric images of the agents' rooms, each bool (2, H, W), by the `canonical_floor` of the rooms.
     """
-    trained = {_floor(get_layout(name)) for name in TESTED_ON if name not in TESTED_ON.values()}
+    trained = {_layout_floor(get_layout(name)) for name in TESTED_ON if name not in TESTED_ON.values()}
     found: dict[tuple[str, ...], list[np.ndarray]] = {}
     for layout in map(get_layout, LAYOUT_NAMES):
-        floor = _floor(layout)
+        floor = _layout_floor(layout)
         if (floor not in trained) == tested:
             pairs = zip(*map(symmetric_images, agent_rooms(layout)), strict=True)
             found.setdefault(floor, [np.stack(pair) for pair in pairs])
     return found
 
 
-def _floor(layout: Layout) -> tuple[str, ...]:
+def _layout_floor(layout: Layout) -> tuple[str, ...]:
     return canonical_floor(layout.walkable.reshape(layout.height, layout.width))
 
 
 def has_tested_rooms(layout: Layout) -> bool:
     """Return whether a layout has rooms that are reserved for tests, see `published_rooms`."""
-    return _floor(layout) in published_rooms(tested=True)
+    return _layout_floor(layout) in published_rooms(tested=True)
 
 
 def draw_templates(seed: int) -> Iterator[LayoutDraw]:

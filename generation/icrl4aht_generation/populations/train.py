@@ -285,7 +285,7 @@ class _PopulationTraining:
                 state = state._replace(params=self._with_nearest_member(state.params, stage, number))
             state, metrics = update(state)
             seconds = time.perf_counter() - started
-            line = self._line(stage, number, metrics)
+            line = self._metrics_line(stage, number, metrics)
             speed = round((number + 1 - first) * population.steps_per_update / seconds, 1)
             log.write(line, timing={"stage": stage, "update": number, "steps_per_second": speed})
             done = stage * updates + number + 1
@@ -297,7 +297,7 @@ class _PopulationTraining:
                 log.sync()
                 self.saved.save(state, done)
 
-    def _line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
+    def _metrics_line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
         """Return a line of the metrics log, without mean returns if no episode ended."""
         values = {name: float(value) for name, value in metrics.items()}
         if not values["episodes"]:

@@ -109,10 +109,10 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
         raise unknown("profile", name, profile_names())
-    with _named_errors(path):
-        profile = _profile(path.stem, msgspec.convert(_content(path), _ProfileFile))
+    with _errors_with_path(path):
+        profile = _build_profile(path.stem, msgspec.convert(_read_content(path), _ProfileFile))
     prepare(profile)
-    with _named_errors(path):
+    with _errors_with_path(path):
         units = profile.units()  # raises for unknown presets and for too many sampled teammates
         if not units and not profile.algorithms:
             raise OptionError(
@@ -122,24 +122,24 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     return profile
 
 
-def _content(path: Path) -> dict[str, Any]:
+def _read_content(path: Path) -> dict[str, Any]:
     """Return the content of a profile's file; a file with a `base` overrides values of a shipped profile."""
     content = msgspec.toml.decode(path.read_bytes())
     base = content.pop("base", None)
     if base is None:
         return content
     check_choice("base", base, profile_names())
-    return _merged(_content(FOLDER / f"{base}.toml"), content)
+    return _merge_tables(_read_content(FOLDER / f"{base}.toml"), content)
 
 
-def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+def _merge_tables(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     """Merge nested tables; values of `own` replace values of `base`."""
-    both = {key: _merged(base[key], own[key]) for key in base.keys() & own.keys() if isinstance(own[key], dict)}
+    both = {key: _merge_tables(base[key], own[key]) for key in base.keys() & own.keys() if isinstance(own[key], dict)}
     return {**base, **own, **both}
 
 
 @contextmanager
-def _named_errors(path: Path) -> Iterator[None]:
+def _errors_with_path(path: Path) -> Iterator[None]:
     """Context manager that adds the file's path to errors about its content."""
     try:
         yield
@@ -147,21 +147,21 @@ def _named_errors(path: Path) -> Iterator[None]:
         raise OptionError(f"{path}: {error}") from error
 
 
-def _profile(name: str, content: _ProfileFile) -> Profile:
+def _build_profile(name: str, content: _ProfileFile) -> Profile:
     release, tasks = content.release, content.tasks
     check_version(release.data_version)
-    layouts, sources = _layouts("tasks.layouts", tasks.layouts), _distinct("tasks.sources", tasks.sources)
+    layouts, sources = _layout_names("tasks.layouts", tasks.layouts), _check_distinct("tasks.sources", tasks.sources)
     generated: dict[str, int] = {}
     for one in tasks.generated:
         found = add_layouts(generate_layouts(one.family, one.seed, one.count, split=one.split))
-        names = _distinct("tasks.generated", [*generated, *(layout.name for layout in found)])
+        names = _check_distinct("tasks.generated", [*generated, *(layout.name for layout in found)])
         generated |= dict.fromkeys(names[len(generated) :], one.teammates)
     layouts += tuple(generated)
-    _known("source", "tasks.sources", sources, REBUILT_SOURCES)
+    _check_known("source", "tasks.sources", sources, REBUILT_SOURCES)
     if not layouts and sources != ("search",):
         raise OptionError("tasks.layouts: no layouts; name layouts in tasks.layouts or add tasks.generated")
     preference = PREFERENCE_LAYOUTS["train"] if tasks.preference == ("all",) else tasks.preference
-    _known("layout of the track preference", "tasks.preference", preference, PREFERENCE_LAYOUTS["train"])
+    _check_known("layout of the track preference", "tasks.preference", preference, PREFERENCE_LAYOUTS["train"])
     if bool(preference) != ("search" in sources):
         raise OptionError(
             f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: expected layouts of the "
@@ -169,12 +169,12 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         )
     if "ppo" not in sources:
         release.keep = 0
-    ego, ego_layouts = _section("ego", content.ego, PPOConfig(), layouts)
-    noise, noise_layouts = _section("noise", content.noise, NoiseConfig(), layouts)
-    search, search_layouts = _section("search", content.search, SEARCH, preference)
+    ego, ego_layouts = _read_section("ego", content.ego, PPOConfig(), layouts)
+    noise, noise_layouts = _read_section("noise", content.noise, NoiseConfig(), layouts)
+    search, search_layouts = _read_section("search", content.search, SEARCH, preference)
     algorithms = _by_layout("tasks.algorithms", tasks.algorithms, layouts)
     for key, names in algorithms.items():
-        _known("algorithm", "tasks.algorithms", _distinct(f"tasks.algorithms.{key}", names), ALGORITHMS)
+        _check_known("algorithm", "tasks.algorithms", _check_distinct(f"tasks.algorithms.{key}", names), ALGORITHMS)
     return Profile(
         name=name,
         ego=ego,
@@ -184,20 +184,20 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         search=search,
         scripted_layouts={"noise": noise_layouts, "search": search_layouts},
         generated=generated,
-        preference=_distinct("tasks.preference", preference),
+        preference=_check_distinct("tasks.preference", preference),
         layouts=layouts,
         sources=sources,
         learners=tasks.learners,
-        presets=_distinct("tasks.presets", tasks.presets),
-        sampled=_sampled(tasks.sampled, layouts, sources) if tasks.sampled else None,
-        spread=SpreadConfig(**_counts("tasks.spread", tasks.spread, layouts, sources)) if tasks.spread else None,
+        presets=_check_distinct("tasks.presets", tasks.presets),
+        sampled=_sampled_config(tasks.sampled, layouts, sources) if tasks.sampled else None,
+        spread=SpreadConfig(**_numbers("tasks.spread", tasks.spread, layouts, sources)) if tasks.spread else None,
         algorithms={each: tuple(algorithms[each]) for each in layouts if algorithms.get(each)},
         xla_threads=content.xla_threads,
         **msgspec.structs.asdict(release),
     )
 
 
-def _section(
+def _read_section(
     name: str, values: dict[str, Any], default: Config, layouts: tuple[str, ...]
 ) -> tuple[Config, dict[str, Config]]:
     """Return the settings of a section, and the settings by layout for layouts in the section's table `layouts`."""
@@ -206,18 +206,18 @@ def _section(
     return common, {each: replace_options(common, of, f"{name}.layouts.{each}.") for each, of in own.items()}
 
 
-def _sampled(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
-    counts = _counts("tasks.sampled", values, layouts, sources)
+def _sampled_config(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
+    counts = _numbers("tasks.sampled", values, layouts, sources)
     chosen: dict[str, Any] = _by_layout("tasks.sampled.families", values.families, layouts)
-    families = {name: _distinct("tasks.sampled.families", chosen.get(name, ())) for name in layouts}
+    families = {name: _check_distinct("tasks.sampled.families", chosen.get(name, ())) for name in layouts}
     for name in layouts:
-        _known("family", "tasks.sampled.families", families[name], HEURISTIC_KINDS)
+        _check_known("family", "tasks.sampled.families", families[name], HEURISTIC_KINDS)
         if (counts["per_layout"][name] or counts["validation"][name]) and not families[name]:
             raise OptionError(f"tasks.sampled.families: expected families for {name}, which has sampled teammates")
     return SampledConfig(**counts, families=families)
 
 
-def _counts(
+def _numbers(
     section: str, values: _Spread, layouts: tuple[str, ...], sources: tuple[str, ...]
 ) -> dict[str, dict[str, int]]:
     """Return the numbers of sampled teammates by field of `SpreadConfig` and by layout."""
@@ -275,24 +275,24 @@ def _by_layout(key: str, value: Mapping[str, Value] | Value, layouts: tuple[str,
     """Return a value for each layout, from one value for all layouts or from a table of some layouts."""
     if not isinstance(value, Mapping):
         return dict.fromkeys(layouts, value)
-    found = dict(zip(_layouts(key, list(value)), value.values(), strict=True))
+    found = dict(zip(_layout_names(key, list(value)), value.values(), strict=True))
     for name in found:
         if name not in layouts:
             raise OptionError(f"{key}.{name}: expected one of the profile's layouts, {', '.join(layouts)}")
     return found
 
 
-def _distinct(key: str, names: Sequence[str]) -> tuple[str, ...]:
+def _check_distinct(key: str, names: Sequence[str]) -> tuple[str, ...]:
     if len(set(names)) < len(names):
         raise OptionError(f"{key} = {names!r}: expected different names")
     return tuple(names)
 
 
-def _known(what: str, key: str, names: Sequence[str], valid: Sequence[str] | Mapping[str, Any]) -> None:
+def _check_known(what: str, key: str, names: Sequence[str], valid: Sequence[str] | Mapping[str, Any]) -> None:
     for name in names:
         if name not in valid:
             raise OptionError(f"{key}: {unknown(what, name, valid)}")
 
 
-def _layouts(key: str, names: Sequence[str]) -> tuple[str, ...]:
-    return _distinct(key, [get_layout(name).name for name in names])
+def _layout_names(key: str, names: Sequence[str]) -> tuple[str, ...]:
+    return _check_distinct(key, [get_layout(name).name for name in names])

@@ -63,7 +63,7 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceE
     for layout, own in grouped(tasks, lambda task: task.layout).items():
         folders = [checkpoint_folder(suite, task.teammate) for task in own]
         mates = [build_learned(layout, folder) for folder in folders]
-        partners = [build_learned(layout, _partner(folder), "sampled") for folder in folders]
+        partners = [build_learned(layout, _training_partner(folder), "sampled") for folder in folders]
         for task, ego, mate, returns in zip(own, partners, mates, reference_returns(layout, mates), strict=True):
             play = _compiled_self_play(layout, ego._replace(params=()), mate._replace(params=()))
             self_play = float(np.asarray(play(ego.params, mate.params)).mean())
@@ -71,7 +71,7 @@ def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceE
     return found
 
 
-def _partner(folder: Path) -> Path:
+def _training_partner(folder: Path) -> Path:
     """Return the folder of the training partner of a checkpoint m<k>/c<n>: its best response, or the policy itself."""
     response = folder.parent.parent / RESPONSES / folder.parent.name
     return response if response.is_dir() else folder

@@ -326,13 +326,13 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
             base_seed,
             theta_id,
             behaviour=int(behaviours[k]),
-            **_measured(family, distances[k], returns[k]),
+            **_measured_fields(family, distances[k], returns[k]),
         )
         for k, (family, base_seed, theta_id) in enumerate(numbers)
     ]
 
 
-def _measured(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[str, Any]:
+def _measured_fields(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[str, Any]:
     """Return the fields that both tables of teammates have: the nearest test instances, and the egos' returns.
 
     Args:
@@ -376,7 +376,7 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]]) -> Layo
             theta_id=candidates[place]["theta_id"],
             theta=candidates[place]["theta"],
             separation=round(separation, _DIGITS),
-            **_measured(candidates[place]["family"], tests[place], returns[place]),
+            **_measured_fields(candidates[place]["family"], tests[place], returns[place]),
         )
         for number, (place, separation) in enumerate(zip(usable[order], separations, strict=True))
     ]

@@ -168,7 +168,7 @@ def drawn_teammates(
     if count > available:
         raise OptionError(
             f"{name}: {count} {_OF_SEED[base_seed]} teammates requested of {', '.join(families) or 'no family'}, with "
-            f"only {available} distinct draws; request fewer or name more families ({_hosted_text(name, base_seed)})"
+            f"only {available} distinct draws; request fewer or name more families ({_usable_text(name, base_seed)})"
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
     ranges = ranges_of(base_seed)
@@ -214,7 +214,7 @@ def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
     if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
         return None
     draws = [draw for draw in read_draws(layout, str(family), seed) if draw.theta_id == theta_id]
-    same = draws and equal_parameters(_sampled(str(family), draws[0].theta_id, seed)["theta"], teammate["theta"])
+    same = draws and equal_parameters(_sampled_entry(str(family), draws[0].theta_id, seed)["theta"], teammate["theta"])
     return draws[0] if same else None
 
 
@@ -224,7 +224,7 @@ def equal_parameters(theta: Mapping[str, float], other: Mapping[str, float]) -> 
 
 
 @cache
-def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
+def _sampled_entry(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
     return sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)
 
 
@@ -246,7 +246,7 @@ def _ordered_draws(layout: str, family: str, base_seed: int) -> list[Draw]:
             f"{layout}: no usable {_OF_SEED[base_seed]} teammates of {family}: "
             f"{unusable_reason(layout, family, base_seed)}; expected a distance of {_least_distance(base_seed)} or "
             f"more{near}, and returns that differ by {LEAST_HEADROOM:g} or more; name other families "
-            f"({_hosted_text(layout, base_seed)})"
+            f"({_usable_text(layout, base_seed)})"
         )
     first = {(draw.like_another_family, draw.behaviour): draw for draw in reversed(draws)}
 
@@ -285,7 +285,7 @@ def unusable_reason(layout: str, family: str, base_seed: int = 0) -> str:
     )
 
 
-def _hosted_text(layout: str, base_seed: int) -> str:
+def _usable_text(layout: str, base_seed: int) -> str:
     counts = {family: len(_usable(layout, family, base_seed)) for family in usable_families(layout, base_seed)}
     return "available: " + (", ".join(f"{count} of {family}" for family, count in counts.items()) or "none")
 

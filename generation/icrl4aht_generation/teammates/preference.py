@@ -55,12 +55,12 @@ def preference_tasks(split: str) -> list[Task]:
     tasks = []
     for part in PREFERENCE_LAYOUTS if split == "test" else ("train",):
         for number, name in enumerate(PREFERENCE_LAYOUTS[part]):
-            for dish, mate in _pairs(get_layout(name), split, number, part):
+            for dish, mate in _dishes_and_teammates(get_layout(name), split, number, part):
                 tasks.append(make_task(PREFERENCE, split, name, mate, 0, [dish]))
     return tasks
 
 
-def _pairs(layout: Layout, split: str, number: int, part: str) -> Iterator[tuple[Dish, dict[str, Any]]]:
+def _dishes_and_teammates(layout: Layout, split: str, number: int, part: str) -> Iterator[tuple[Dish, dict[str, Any]]]:
     """Yield dish and teammate of each task on a layout; `number` shifts the pairs, so they differ between layouts."""
     dishes = all_dishes(layout) if split == "test" else training_dishes(layout)
     mates = _teammates(layout, split)

@@ -23,29 +23,29 @@ RUNNER, PLATER, FLEX = range(3)
 AT_POTS, CENTRAL, NEAR_PARTNER = range(3)
 
 _MOVES_BY_DRAW = (RIGHT, DOWN, LEFT, UP)
-_OFF_BEATS = (np.arange(10) / 10).astype(np.float32)
+_HESITATION_FACTORS = (np.arange(10) / 10).astype(np.float32)
 
 
 def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int[Array, ""], Key[Array, ""]]:
     """Return the action of an H3 teammate, and the next random key, which is its only memory."""
     following, u = draw(memory)
-    idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
-    makes_room = _makes_room(scene)
+    idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _hesitation_factor(scene))
+    makes_room = _should_step_aside(scene)
     # Deliveries and emergency moves are never mistaken, as in the published teammates.
-    final, action = _decide(scene, params, abandons=u[2] < params["task_abandon_prob"])
+    final, action = _choose_action(scene, params, abandons=u[2] < params["task_abandon_prob"])
     slips = ~(idles | makes_room | final)
-    action, following = _slip(scene, params, action, slips, u[1], following)
+    action, following = _with_mistakes(scene, params, action, slips, u[1], following)
     action = jnp.where(makes_room, _step_aside(scene), action)
     return jnp.where(idles, STAY, action), following
 
 
-def _off_beat(scene: Scene) -> Array:
+def _hesitation_factor(scene: Scene) -> Array:
     """Return a factor of the chance to hesitate, float32 in 0..0.9, which is a fixed pattern over the cells."""
     x, y = jnp.asarray(scene.tables.column)[scene.me], jnp.asarray(scene.tables.row)[scene.me]
-    return jnp.asarray(_OFF_BEATS)[(7 * x + 13 * y) % 10]
+    return jnp.asarray(_HESITATION_FACTORS)[(7 * x + 13 * y) % 10]
 
 
-def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether the action is exempt from mistakes, and the action of the first rule that applies."""
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
@@ -107,7 +107,7 @@ def _first_nonempty(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -
     return jnp.where(jnp.any(mask), mask, other)
 
 
-def _makes_room(scene: Scene) -> Bool[Array, ""]:
+def _should_step_aside(scene: Scene) -> Bool[Array, ""]:
     """Return whether agent 1 has empty hands and is adjacent to a partner who carries an item."""
     if scene.slot == 0:
         return jnp.asarray(False)
@@ -127,7 +127,7 @@ def _step_aside(scene: Scene) -> Int[Array, ""]:
     return scene.best_way(scene.free & (score > 0), score)
 
 
-def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, key: Key[Array, ""]):
+def _with_mistakes(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, key: Key[Array, ""]):
     """Return the action, perhaps replaced by a wrong move or a step to the home cell, and the next random key."""
     errs = slips & (u < params["wrong_action_prob"])
     key, own = extra_split(key, errs)

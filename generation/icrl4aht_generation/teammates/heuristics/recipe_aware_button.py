@@ -53,7 +53,7 @@ def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple
     following, u = draw(memory.key)
     unsure = (recipe == 0) | (memory.clock - seen > params["refresh_interval"])
     idles = u[0] < params["idle_prob"]
-    action, considered, pressed, erred = _decide(scene, params, recipe, unsure, u)
+    action, considered, pressed, erred = _choose_action(scene, params, recipe, unsure, u)
     # As in the published code, the key does not change if the button is considered but not pressed.
     key = jnp.where(considered & ~pressed & ~idles, memory.key, following)
     key, _ = extra_split(key, erred & ~idles)
@@ -61,7 +61,7 @@ def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple
     return action, ButtonMemory(key, memory.clock + 1, recipe, seen)
 
 
-def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], u: Float[Array, " 4"]):
+def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], u: Float[Array, " 4"]):
     """Return the action of a step without idling, and three facts that determine the next random key.
 
     The facts are whether the teammate considered pressing the button, whether it chose to press the button, and whether
@@ -116,11 +116,11 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
     gives_way, aside = _yield_pot(scene, chosen.target)
     action = jnp.where(second & chosen.found & (chosen.number == pot_rule) & gives_way, aside, action)
     action = jnp.where(chosen.found, action, scene.wander())
-    blocks, step = _block(scene)
+    blocks, step = _blocking_step(scene)
     blocks &= cooks & (u[2] < params["path_blocking"]) & ~settled
     action = jnp.where(blocks, step, action)
     clears = cramped & plate & is_dish(scene.partner_hand) & ~jnp.any(scene.reach(scene.cooked))
-    action = jnp.where(clears, _clear_the_way(scene), action)
+    action = jnp.where(clears, _step_out_of_way(scene), action)
     pressed = chosen.found & (chosen.number == press_rule)
     return action, considered, pressed, errs & ~settled & ~blocks
 
@@ -133,7 +133,7 @@ def _plate_is_urgent(scene: Scene, params) -> Bool[Array, ""]:
     return urgency >= 1 - params["plate_timing"]
 
 
-def _decoded(scene: Scene) -> Bool[Array, " 3"]:
+def _recognized_types(scene: Scene) -> Bool[Array, " 3"]:
     """Return the ingredient types that H1 recognizes in an item; as in the published code, not id 3."""
     return jnp.asarray(scene.tables.ingredients) < 3
 
@@ -141,7 +141,7 @@ def _decoded(scene: Scene) -> Bool[Array, " 3"]:
 def _missing(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P 3"]:
     """Return the number of missing ingredients of the recipe in each pot; 0 for pots that take no ingredient."""
     missing = jnp.maximum(scene.counts(recipe) - scene.counts(scene.state.pot_items), 0)
-    return missing * scene.takes_more[:, None] * _decoded(scene)
+    return missing * scene.fillable_pots[:, None] * _recognized_types(scene)
 
 
 def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
@@ -149,7 +149,7 @@ def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
     # Pots with wrong ingredients also take ingredients: without a better pot, H1 fills these pots.
     held = scene.counts(scene.hand)
     wanting = scene.at(POT, _missing(scene, recipe) @ held > 0)
-    wanted_everywhere = jnp.any((held > 0) & ~_decoded(scene))
+    wanted_everywhere = jnp.any((held > 0) & ~_recognized_types(scene))
     return jnp.where(jnp.any(wanting) & ~wanted_everywhere, wanting, scene.fillable_pot_cells)
 
 
@@ -165,7 +165,7 @@ def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], second: Ar
     return jnp.where(recipe > 0, known, guessed)
 
 
-def _block(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+def _blocking_step(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Return whether the agent can reach a cell next to a pot or goal, and the step to the nearest such cell."""
     critical = (scene.cells_near(POT) | scene.cells_near(GOAL)) & jnp.asarray(scene.tables.walkable)
     distance = jnp.where(critical, scene.distances(scene.me), UNREACHABLE)
@@ -213,7 +213,7 @@ def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
     return ~carries & single
 
 
-def _clear_the_way(scene: Scene) -> Int[Array, ""]:
+def _step_out_of_way(scene: Scene) -> Int[Array, ""]:
     """Return a step that leaves the shortest paths of the partner, who carries a dish, to the goals."""
     exits, walkable = jnp.asarray(scene.tables.goal_access), jnp.asarray(scene.tables.walkable)
     if not len(exits):

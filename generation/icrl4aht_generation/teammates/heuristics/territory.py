@@ -37,9 +37,9 @@ def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Ar
     """Return the action of an H2 teammate, and the next memory."""
     following, u = draw(memory.key)
     mode = params["behavior_mode"]
-    action = _work(scene, params, u[0], memory.stuck >= _STUCK)
+    action = _rule_action(scene, params, u[0], memory.stuck >= _STUCK)
     # As in the published code, all modes use the same random number u1.
-    blocked = jnp.where(u[0] < 0.7, STAY, _to_the_middle(scene))
+    blocked = jnp.where(u[0] < 0.7, STAY, _step_to_middle(scene))
     action = jnp.where(mode == BLOCKER, blocked, action)
     action = jnp.where((mode == LAZY) & (u[0] > params["action_probability"]), STAY, action)
     # Intended waiting also counts as stuck, so agents that wait for each other separate.
@@ -47,7 +47,7 @@ def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Ar
     return action, TerritoryMemory(following, scene.me, stuck)
 
 
-def _to_the_middle(scene: Scene) -> Int[Array, ""]:
+def _step_to_middle(scene: Scene) -> Int[Array, ""]:
     """Return the step towards the middle: first to the middle column, then along this column; stay at a wall."""
     x, y = jnp.asarray(scene.tables.column)[scene.me], jnp.asarray(scene.tables.row)[scene.me]
     middle_x, middle_y = jnp.asarray(scene.tables.size) // 2
@@ -59,7 +59,7 @@ def _to_the_middle(scene: Scene) -> Int[Array, ""]:
     return jnp.where(blocked, STAY, action)
 
 
-def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> Int[Array, ""]:
+def _rule_action(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> Int[Array, ""]:
     """Return the action of all modes except BLOCKER, by rules in order of priority."""
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
     hoards, counters = params["behavior_mode"] == HOARDER, params["behavior_mode"] == COUNTER
@@ -70,7 +70,7 @@ def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> 
         Rule(empty & counters & soup, scene.needed_piles),
     ]
     # Only targets that every soup needs have a fallback outside the territory.
-    goals, nonfull, put_down, cooked, heating, plates, staged, needed = _filter(
+    goals, nonfull, put_down, cooked, heating, plates, staged, needed = _territory_targets(
         scene,
         params,
         [
@@ -123,7 +123,7 @@ def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
     return jnp.where(waits, STAY, step)
 
 
-def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array, "masks cells"]:
+def _territory_targets(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array, "masks cells"]:
     """Return the reachable cells of each mask in the agent's territory, or else in the shared territory.
 
     If both are empty, masks with a fallback return all reachable cells, and other masks none.

@@ -33,8 +33,8 @@ class GreedyMemory(NamedTuple):
 
 def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[Array, ""], GreedyMemory]:
     """Return the action of an H4 teammate, and the next memory."""
-    intent, action = _decide(scene, params, memory.intent)
-    action, wait = _yield(scene, memory, action)
+    intent, action = _choose_action(scene, params, memory.intent)
+    action, wait = _yield_to_partner(scene, memory, action)
     # As in the published code, the key changes in every step, but the intent does not change during a wait.
     waiting = memory.wait > 0
     after = GreedyMemory(
@@ -45,7 +45,7 @@ def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[
     return jnp.where(waiting, STAY, action), after
 
 
-def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
+def _choose_action(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Return the best intent (-1 if no intent is feasible) and the action of this intent."""
     cooked, cooking, fillable = map(scene.reach, (scene.cooked, scene.cooking, scene.fillable_pot_cells))
     # An agent with a plate goes to a soup that still cooks if no soup is finished.
@@ -65,7 +65,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
             scene.buttons,
         ]
     )
-    values, allowed = _values(scene, params, waits, jnp.any(needed))
+    values, allowed = _intent_values(scene, params, waits, jnp.any(needed))
     distance = jax.vmap(scene.nearest_distance)(targets)
     feasible = allowed & (distance < UNREACHABLE)
     bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # prevents wavering between two intents
@@ -78,7 +78,7 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
     return jnp.where(some, best, -1), jnp.where(some, action, scene.wander())
 
 
-def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array, " 8"], Array]:
+def _intent_values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array, " 8"], Array]:
     """Return weight x value of each intent, float32 (8,), and whether the intent is allowed, bool (8,)."""
     cooking, cooked, nonfull = (jnp.sum(mask) for mask in (scene.cooking, scene.cooked, scene.fillable_pot_cells))
     can_add = jnp.any(scene.reach(scene.fillable_pot_cells))
@@ -113,7 +113,7 @@ def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array,
     return jnp.stack([jnp.asarray(v, jnp.float32) for v in values]), jnp.stack(allowed)
 
 
-def _yield(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
+def _yield_to_partner(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
     """Return the action, which is sometimes `stay` next to the partner, and the number of steps to wait."""
     distance = scene.manhattan(scene.destination(action), scene.partner)
     # As in the published code, the random number is the key's first word, not a number drawn with the key.
