@@ -1,4 +1,4 @@
-"""Commands of `icrl4aht-data` that rebuild releases, train teammates and maintain tasks."""
+"""Commands of `icrl4aht-data` that generate releases, train teammates and maintain tasks."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from icrl4aht_generation.layouts.families import LAYOUT_FAMILIES, LAYOUT_SPLITS,
 from icrl4aht_generation.learners.config import EncoderKind
 
 if TYPE_CHECKING:
-    from icrl4aht_generation.profiles import Profile  # loads JAX
+    from icrl4aht_generation.profiles import Profile  # not at run time, because the module imports JAX
 
 console = Console(soft_wrap=True)
 
@@ -47,13 +47,13 @@ _profile_option = click.option(
     "profile_name",
     default="smoke",
     metavar="PROFILE",
-    help="smoke, noise, search, bundle, teach, billion, small, mini, cpu or paper, or a TOML file.",
+    help="Profile: smoke, noise, search, bundle, teach, billion, small, mini, cpu, paper, or a TOML file.",
 )
 
 _threads_option = click.option(
     "--xla-threads",
     type=COUNT,
-    help="Threads of one XLA operation on a CPU; other numbers give other bits.",
+    help="Number of CPU threads of an XLA operation; the last bits of results depend on it.",
     show_default="the profile's, else all cores",
 )
 
@@ -84,11 +84,11 @@ _threads_option = click.option(
     "task_file",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Collect the tasks of this file, such as a release's meta/tasks.jsonl, each of the source that the release "
-    "names, and train no teammates: --suite is a suite that has them, or the release's folder teammates.",
+    help="Generate the tasks of this file, such as a release's meta/tasks.jsonl, with the release's sources. Trains no "
+    "teammates: --suite is a suite that contains them, or the release's folder teammates.",
     show_default="the profile's tasks",
 )
-@click.option("--bundle", is_flag=True, help="Also replace the release that the package bundles by the lite one.")
+@click.option("--bundle", is_flag=True, help="Also replace the bundled release of the package by the lite release.")
 @click.option(
     "--encoder",
     type=click.Choice(get_args(EncoderKind)),
@@ -108,12 +108,12 @@ def generate(
     xla_threads: int | None,
     queue: dict[str, Any],
 ) -> None:
-    """Rebuild a release, or resume a rebuild.
+    """Generate a release, or resume an interrupted run.
 
-    Trains the learned teammates of a profile, then collects its tasks into OUT/artefacts: egos that learn (source ppo),
-    scripts (sources noise and search), or several of these. Packs the release OUT/lite or OUT/full. Unfinished work
-    resumes from its last save. The executor trains the teammates and collects the tasks. Tasks that fail are listed in
-    OUT/failed.jsonl; the others are finished, nothing is packed, and the exit code is 1.
+    Trains the learned teammates of a profile, then generates histories of its tasks in OUT/artefacts, by egos that
+    learn (source ppo) and by scripts (sources noise and search). Packs the release into OUT/lite or OUT/full.
+    Unfinished work resumes from its last save. OUT/failed.jsonl lists the tasks that fail: the other tasks are
+    finished, but nothing is packed and the exit code is 1.
     """
     from icrl4aht_generation.releases.build import build_releases
     from icrl4aht_generation.releases.package import bundle_release, recorded_sources
@@ -135,7 +135,7 @@ def generate(
 
 
 def _profile_with_threads(name: str, threads: int | None) -> Profile:
-    """Return a profile by name, with XLA limited to its threads or to the given number."""
+    """Load a profile by name, and limit XLA to the given number of threads, or else to the profile's."""
     from icrl4aht_generation.learners.resume import limit_xla_threads
     from icrl4aht_generation.profiles import load_profile
 
@@ -169,19 +169,19 @@ def _profile_with_threads(name: str, threads: int | None) -> Profile:
 @click.option(
     "--check",
     is_flag=True,
-    help="Play each: exit with 1 if the oracle, or a pair of them, delivers no soup in 400 steps.",
+    help="Exit with 1 if on any layout neither the oracle nor a pair of oracles delivers a soup in 400 steps.",
 )
-@click.option("--out", type=NewFile(".png"), metavar="FILE", help="Draw pictures of them here.")
+@click.option("--out", type=NewFile(".png"), metavar="FILE", help="Write a picture of the layouts to this file.")
 @overwrite_option
 @json_option
 def layouts(
     family: str, count: int, seed: int, split: str | None, check: bool, out: Path | None, overwrite: bool, as_json: bool
 ) -> None:
-    """List generated layouts, and draw them.
+    """List generated layouts, and draw pictures of them.
 
-    A layout is a function of its family, seed and number: templates-0-17. The families: rearranged, with the fixtures
-    of asymm_both and cramped_up in other cells; templates, with new fixtures in the rooms of the published layouts,
-    mirrored and rotated; rooms, with new rooms.
+    A layout such as templates-0-17 depends only on its family, seed and number. The family rearranged moves the
+    fixtures of asymm_both and cramped_up to other cells; templates puts new fixtures into the rooms of the published
+    layouts, mirrored and rotated; rooms generates new rooms.
     """
     if out:
         check_output(out, overwrite)
@@ -218,9 +218,10 @@ def layouts(
 @click.option("--devices", type=COUNT, default=8, help="Also estimate the hours on this many devices.")
 @json_option
 def plan(profile_name: str, devices: int, as_json: bool) -> None:
-    """Estimate the cost of a rebuild.
+    """Estimate the cost of generating a release.
 
-    Prints tasks, environment steps, disk space, and hours at the speed that is measured here. Writes nothing.
+    Prints the number of tasks and environment steps, the disk space, and the hours at a speed that is measured on this
+    machine. Writes nothing.
     """
     from icrl4aht_generation.planning.plan import cost_rows, estimate_cost
 
@@ -233,10 +234,10 @@ def plan(profile_name: str, devices: int, as_json: bool) -> None:
 @click.argument("b", type=Folder())
 @json_option
 def check(a: Path, b: Path, as_json: bool) -> None:
-    """Compare two rebuilds bit for bit.
+    """Compare two generated releases bit for bit.
 
-    A and B are releases, artefacts, or folders that `generate` wrote. Prints the differences, and exits with 1 if
-    there are any. Writes nothing.
+    A and B are releases, artefacts, or output folders of `generate`. Prints the differences, and exits with 1 if any
+    file differs. Writes nothing.
     """
     from icrl4aht_generation.releases.check import compare_rebuilds
 
@@ -258,11 +259,11 @@ def check(a: Path, b: Path, as_json: bool) -> None:
 )
 @overwrite_option
 def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
-    """Write the manifests of drawn tasks in the package.
+    """Write the package's manifests with sampled teammates.
 
-    Makes TRACK_validation.jsonl, TRACK_diverse_train.jsonl and TRACK_diverse_validation.jsonl from the drawn teammates
-    that `draws` measured, and those of the track preference. Files that have these tasks are kept. TRACK_test.jsonl are
-    the published tasks, whose ids hash their parameters.
+    Writes TRACK_validation.jsonl, TRACK_diverse_train.jsonl and TRACK_diverse_validation.jsonl with the teammates that
+    `draws` sampled and measured, and the manifests of the track preference. An existing file with other tasks is only
+    replaced with --overwrite. TRACK_test.jsonl contains the published tasks, and this command does not write it.
     """
     from icrl4aht_generation.teammates.draws import diverse_tasks, validation_tasks
     from icrl4aht_generation.teammates.preference import preference_tasks
@@ -280,7 +281,7 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
             different = read_tasks(path) != tasks
             if different and (check or not overwrite):
                 remedy = "run `icrl4aht-data research manifests --overwrite`" if check else "replace it by --overwrite"
-                raise TaskFormatError(f"{path}: differs from the draws; {remedy}")
+                raise TaskFormatError(f"{path}: the file has other tasks than this version writes; {remedy}")
         if not check:
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(path) as partial:
@@ -299,15 +300,15 @@ def manifests(check: bool, out: Path | None, overwrite: bool) -> None:
     help="Write the table here.",
     show_default="the package's file",
 )
-@click.option("--spread", is_flag=True, help="Choose the teammates that differ most instead, and print their numbers.")
-@click.option("--overwrite", is_flag=True, help="Measure again what the table has.")
+@click.option("--spread", is_flag=True, help="Choose the teammates that differ most instead, and print their measures.")
+@click.option("--overwrite", is_flag=True, help="Measure layouts again that the table already contains.")
 def draws(layouts: tuple[str, ...], out: Path | None, spread: bool, overwrite: bool) -> None:
-    """Measure the heuristic teammates that tasks may draw.
+    """Sample heuristic teammates for tasks, and measure them.
 
-    Draws parameters from the training ranges, and from wider ones (diverse): for each layout and family 32 for training
-    and 8 for validation. Writes for each draw which test instance acts most like it, and what the egos stay, random and
-    oracle earn with it. With --spread, chooses widely different teammates for the profiles' tasks.spread. Layouts that
-    the table has are kept, so that a stopped command resumes.
+    Samples parameters from the training ranges and from wider ranges (diverse): for each layout and family 32 teammates
+    for training and 8 for validation. Writes for each teammate which test teammate behaves most similarly, and the
+    returns of the egos stay, random and oracle with it. With --spread, chooses widely different teammates for
+    tasks.spread of the profiles. A stopped command resumes: layouts that the table already contains are skipped.
     """
     import pandas as pd
 
@@ -351,7 +352,7 @@ _algorithms_option = click.option(
 @_layouts_option("the profile's")
 @_algorithms_option
 @click.option("--suite", type=Folder(), metavar="FOLDER", default="build/suite", help="Write the populations here.")
-@click.option("--seed", type=SEED, default=0, help="Seed of their training.")
+@click.option("--seed", type=SEED, default=0, help="Seed of the training.")
 @topic("Machines", _threads_option, queue_options)
 def teammates(
     profile_name: str,
@@ -364,9 +365,9 @@ def teammates(
 ) -> None:
     """Train populations of teammates.
 
-    Writes five checkpoints of every member into SUITE/LAYOUT/ALGORITHM, filters them by their returns, and writes
-    tasks with the remaining ones, SUITE/manifests. Finished populations are kept. Without --layout, trains the
-    populations of the profile, or all algorithms on its layouts if it names none.
+    Writes five checkpoints of every member into SUITE/LAYOUT/ALGORITHM, selects checkpoints by their returns, and
+    writes tasks with the selected checkpoints to SUITE/manifests. Finished populations are not trained again. Without
+    --layout, trains the populations of the profile, or all algorithms on the profile's layouts if it names none.
     """
     from icrl4aht_generation.populations.build import build_suite
 
@@ -378,7 +379,7 @@ def teammates(
         available = profile.algorithms or dict.fromkeys(profile.layouts, ALGORITHMS)
         wanted = {layout: [name for name in names if name in algorithms] for layout, names in available.items()}
         if not any(wanted.values()):
-            raise OptionError(f"profile {profile.name} has no teammates by {', '.join(algorithms)}: name a --layout")
+            raise OptionError(f"profile {profile.name} has no teammates by {', '.join(algorithms)}: choose a --layout")
     build_suite(profile, suite, wanted, seed, console, options)
 
 
@@ -390,7 +391,7 @@ def teammates(
     type=Folder(),
     metavar="FOLDER",
     default="build/suite",
-    help="Folder that `teammates` wrote.",
+    help="Output folder of `teammates`.",
 )
 @click.option("--greedy", is_flag=True, help="Let the teammate act greedily, as in the dataset.")
 def diversity(layouts: tuple[str, ...], algorithms: tuple[str, ...], suite: Path, greedy: bool) -> None:

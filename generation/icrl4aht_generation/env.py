@@ -1,7 +1,7 @@
-"""The JAX environment: keys, reset draws and auto-reset around the rules of `icrl4aht_data.overcooked`.
+"""The JAX environment: random keys, resets and automatic restarts around the rules of `icrl4aht_data.overcooked`.
 
-Batch first: one `EnvState` holds N environments. Everything random is a function of an environment's own key, the
-number of its episode and the step in it, so an episode does not depend on the other environments.
+One `EnvState` is a batch of N environments. Every random draw depends only on an environment's key, the number of the
+episode and the step, so an episode does not depend on the other environments.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class EnvStep(NamedTuple):
     """Result of one step of N environments.
 
     Attributes:
-        state: the states after the step; where `done`, the start of the next episode.
+        state: the states after the step; an environment that is `done` has already started its next episode.
         reward: float32 (N,), the team's reward.
         shaped: float32 (N, 2), each agent's shaped reward, not part of `reward`.
         done: bool (N,), whether the step ended an episode.
@@ -67,18 +67,18 @@ class Environment:
 
     Observations: uint8 (N, 2, 5, 5, C) from `observe(state)`; `icrl4aht_data.overcooked.observe` lists the channels.
     Actions: int (N, 2), of ego and teammate, 0..5 (up, down, left, right, stay, interact).
-    Rewards: float32 (N,), the team's; shaped rewards per agent are separate. Episodes end after `max_steps` steps; the
-    next one starts automatically.
+    Rewards: float32 (N,), the team's rewards; shaped rewards of each agent are separate. Episodes end after `max_steps`
+    steps; the next episode starts automatically.
 
-    With several layouts, every environment has a number of its own, which says which of them it plays. Their state
-    records are padded to common columns, see `stack_tables`. Canonical channels of observations mean the same on all of
-    them; own channels do only if the layouts have equal channel names.
+    With several layouts, `EnvState.layout` is the number of the layout that each environment plays. All state records
+    are padded to common columns, see `stack_tables`. Canonical observation channels mean the same on all layouts; a
+    layout's own channels mean the same only if all layouts have equal channel names.
 
     Args:
-        layout: the map and its recipes, or several; or their tables, if a compiled program takes them as an argument.
+        layout: one layout or several; or their tables, if a compiled function takes the tables as an argument.
         max_steps: steps of an episode: 400 in training, 100 in evaluation.
-        recipes: uint8 (R,), items of the recipes to draw from; by default those of the layout. For one layout only.
-        redraws: whether every episode is played on a layout that is drawn from all of them at its start.
+        recipes: uint8 (R,), items of the recipes to draw from; by default the layout's recipes. Only for one layout.
+        redraws: whether every episode starts on a layout that is drawn at random from all layouts.
     """
 
     layout: Layout | Sequence[Layout] | Tables
@@ -88,7 +88,7 @@ class Environment:
 
     @cached_property
     def tables(self) -> Tables:
-        """Tables of the one layout, or stacked ones of several."""
+        """Tables of the only layout, or stacked tables of several layouts."""
         if isinstance(self.layout, Tables):
             return self.layout
         if not isinstance(self.layout, Layout):
@@ -99,27 +99,27 @@ class Environment:
 
     @property
     def only_layout(self) -> Layout:
-        """The layout, for what is made for one.
+        """The layout of an environment with exactly one layout.
 
         Raises:
             TypeError: if the environment has several layouts, or only tables.
         """
         if not isinstance(self.layout, Layout):
-            raise TypeError("expected an environment of one layout")
+            raise TypeError("expected an environment of one layout, found several layouts or only tables")
         return self.layout
 
     @property
     def recipe_items(self) -> np.ndarray:
-        """uint8 (R,): items of the recipes that the environment draws from."""
+        """Items of the recipes that the environment draws from, uint8 (R,)."""
         return self.tables.recipes
 
     def init(self, keys: Key[Array, " N"], layout: Int[Array, " N"] | None = None) -> EnvState:
         """Return the start of the first episode of each environment.
 
         Args:
-            keys: typed JAX keys (N,), or raw ones, uint32 (N, 2).
-            layout: numbers of the layouts that the environments play; by default all in turn. Not for one layout, nor
-                for an environment that redraws them.
+            keys: typed JAX keys (N,), or raw keys, uint32 (N, 2).
+            layout: number of each environment's layout; by default all layouts in turn. Ignored with only one layout,
+                and if layouts are redrawn.
         """
         if not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
             keys = jax.random.wrap_key_data(keys)
@@ -133,7 +133,7 @@ class Environment:
         return EnvState(keys, zero, zero, self.first_record(keys, zero, layout), layout)
 
     def step(self, state: EnvState, actions: Int[Array, "N 2"]) -> EnvStep:
-        """Return the result of one step of every environment; finished ones start their next episode."""
+        """Play one step in every environment; environments with a finished episode start their next episode."""
         clock = state.clock + 1
         outcome: rules.StepResult = self.on_tables(
             rules.step, state.layout, state.record, actions, self.next_recipe(state)
@@ -148,27 +148,26 @@ class Environment:
             first = self.first_record(state.key, episode, layout)
             return jnp.where(done[:, None], first, outcome.state), layout
 
-        # Environments that were initialized together finish together, so one condition for the batch avoids the cost of
-        # the reset in all other steps.
+        # In most steps no episode ends: one condition for the whole batch avoids the cost of the reset.
         record, layout = jax.lax.cond(jnp.any(done), restarted, lambda: (outcome.state, state.layout))
         after = EnvState(state.key, episode, jnp.where(done, 0, clock), record, layout)
         return EnvStep(after, outcome.reward, outcome.shaped, done, outcome.state)
 
     def on_tables(self, function: Callable[..., Any], layout: Int[Array, " N"] | None, *arguments: Array) -> Any:
-        """Call a function of tables and arrays with the environments' tables.
+        """Call a function with the layout tables of every environment and further arrays.
 
         Args:
-            function: takes tables of one layout, then arrays with or without a leading axis (N,).
-            layout: numbers of the layouts, `EnvState.layout`.
-            arguments: arrays (N, ...).
+            function: function of the tables of one layout, and of arrays with or without a leading axis (N,).
+            layout: number of each environment's layout, `EnvState.layout`.
+            arguments: further arguments of the function, arrays (N, ...).
         """
         if layout is None:
             return function(self.tables, *arguments)
         return jax.vmap(lambda number, *own: function(self.tables_of(number), *own))(layout, *arguments)
 
     def tables_of(self, layout: Int[Array, ""] | None) -> Tables:
-        """Return the tables of the layout with a number; None for the only one."""
-        # The compiler fuses this gather with those that follow, so that no environment holds a copy of its tables.
+        """Return the tables of a layout by its number, or of the only layout for None."""
+        # The compiler fuses this gather with later ones, so the environments hold no copies of the tables.
         return self.tables if layout is None else jax.tree.map(lambda leaf: jnp.asarray(leaf)[layout], self.tables)
 
     def act(
@@ -182,16 +181,16 @@ class Environment:
         *,
         own: bool,
     ) -> tuple[Int[Array, " N"], Any]:
-        """Return the actions of a policy as one agent of every environment, and its memories after the step.
+        """Return the actions of a policy as one agent of every environment, and the policy's memories after the step.
 
         Args:
-            policy: the policy.
-            params: its parameters; with `own`, stacked on a leading axis, one for each environment.
-            memories: its memories, leaves (N, ...).
+            policy: policy that chooses the actions.
+            params: parameters of the policy; with `own`, stacked on a leading axis of length N.
+            memories: memories of the policy, with leaves (N, ...).
             state: the environments' states.
-            agent: 0 or 1.
-            keys: one for each environment.
-            own: whether every environment has parameters of its own.
+            agent: 0 for the ego, 1 for the teammate.
+            keys: one JAX key for each environment.
+            own: whether every environment has separate parameters.
         """
         axis = 0 if own else None
         if policy.sees == "situation":
@@ -224,10 +223,10 @@ class Environment:
         return self.on_tables(_drawn_recipe, state.layout, keys)
 
     def episode_key(self, state: EnvState) -> Key[Array, " N"]:
-        """Return the key of each running episode: a function of the environment's key and the episode's number.
+        """Return the key of each running episode, which depends only on the environment's key and the episode's number.
 
-        Policies may fold in 1..20. Those are the recipe draws of an episode's first steps, which are never used, since
-        no soup is done before step 20.
+        Policies may fold the numbers 1..20 into this key. The environment folds in a step's number to draw the recipe
+        after a delivery, and no soup is done before step 20.
         """
         return _fold(state.key, state.episode)
 
@@ -236,47 +235,47 @@ class Environment:
     ) -> UInt8[Array, "N S"]:
         """Return state records at the start of episodes.
 
-        Recipe and facings are uniform; first the ego, then the teammate is put on a uniformly drawn free cell of its
-        own room.
+        Recipe and facings are uniformly random. First the ego, then the teammate starts on a random free cell of its
+        room.
         """
         draw = jax.vmap(lambda key: jax.random.split(key, 5))(_fold(_fold(keys, episode), jnp.zeros_like(episode)))
         return self.on_tables(_first_record, layout, draw)
 
     def _drawn_layout(self, keys: Key[Array, " N"], episode: Int[Array, " N"]) -> Int[Array, " N"]:
-        """Return the number of a layout for each environment, drawn for an episode."""
-        return _below(
+        """Return a random layout number for the given episode of each environment."""
+        return _random_below(
             _fold(_fold(keys, episode), jnp.full_like(episode, _LAYOUT_DRAW)), np.uint32(len(self.tables.kinds))
         )
 
 
 _LAYOUT_DRAW = 2**31 - 1
-"""Number that an episode's key is folded with to draw a layout: more than any step's."""
+"""Number folded into an episode's key to draw a layout; larger than the number of any step."""
 
 
 def _first_record(tables: Tables, draw: Key[Array, "*N 5"]) -> UInt8[Array, "*N S"]:
     (ego_room, mate_room), (ego_cells, mate_cells) = jnp.asarray(tables.rooms), jnp.asarray(tables.room_sizes)
-    # In a common room the teammate draws among the cells that the ego has left; numbers behind the ego's move up.
+    # In a shared room the teammate has one cell less to start on, and skips the ego's cell.
     one_room = jnp.all(ego_room == mate_room) & (ego_cells == mate_cells)
-    ego_number = _below(draw[..., 0], ego_cells)
-    mate_number = _below(draw[..., 1], mate_cells - one_room)
+    ego_number = _random_below(draw[..., 0], ego_cells)
+    mate_number = _random_below(draw[..., 1], mate_cells - one_room)
     mate_number += one_room & (mate_number >= ego_number)
     positions = jnp.stack([ego_room[ego_number], mate_room[mate_number]], axis=-1)
-    facings = jnp.stack([_below(draw[..., k], np.uint32(4)) for k in (2, 3)], axis=-1).astype(jnp.uint8)
+    facings = jnp.stack([_random_below(draw[..., k], np.uint32(4)) for k in (2, 3)], axis=-1).astype(jnp.uint8)
     return start_record(tables, positions, facings, _drawn_recipe(tables, draw[..., 4]))
 
 
 def _drawn_recipe(tables: Tables, keys: Key[Array, "*N"]) -> UInt8[Array, "*N"]:
-    return jnp.asarray(tables.recipes)[_below(keys, jnp.asarray(tables.recipe_count))]
+    return jnp.asarray(tables.recipes)[_random_below(keys, jnp.asarray(tables.recipe_count))]
 
 
 def _fold(keys: Key[Array, " N"], data: Int[Array, " N"]) -> Key[Array, " N"]:
     return jax.vmap(jax.random.fold_in)(keys, data)
 
 
-def _below(keys: Key[Array, "*N"], n: UInt32[Array, ""] | np.uint32) -> Int[Array, "*N"]:
-    """Return an integer in 0..n-1 per key: the high half of 32 random bits times n (bias below n / 2**32)."""
+def _random_below(keys: Key[Array, "*N"], n: UInt32[Array, ""] | np.uint32) -> Int[Array, "*N"]:
+    """Return a random integer in 0..n-1 for each key, computed as 32 random bits * n >> 32 (bias below n / 2**32)."""
     draw = partial(jax.random.bits, shape=(), dtype=jnp.uint32)
     bits = (jax.vmap(draw) if keys.ndim else draw)(keys)
-    # In two halves, because JAX has no integers of 64 bits by default.
+    # The product is computed in two halves, because JAX has no 64-bit integers by default.
     high = (bits >> 16) * n + ((bits & 0xFFFF) * n >> 16)
     return (high >> 16).astype(jnp.int32)

@@ -1,8 +1,8 @@
-"""Features of a state for scripted agents: masks over cells, shortest paths, and moves made of them.
+"""Features of a state for scripted agents: masks over cells, shortest paths, and moves along these paths.
 
-`cells` denotes the cells of the layout, row by row. Scripted agents see the complete state. The partner never blocks a
-path; ties resolve in the order right, down, left, up (first steps) and above, below, left, right (access cells),
-scanning targets row by row. Source: paper, App. B.2.
+`cells` denotes the cells of the layout, row by row. Scripted agents see the complete state. Paths ignore the partner.
+Ties are resolved in the order right, down, left, up (first steps) and above, below, left, right (access cells), and row
+by row for targets. Source: paper, App. B.2.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ def is_dish(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
 
 
 def is_ingredient(item: UInt8[Array, "*B"]) -> Bool[Array, "*B"]:
-    """Return whether an item has ingredients and no plate."""
+    """Return whether an item consists of ingredients without a plate."""
     return (item >> 2 > 0) & ((item & PLATE) == 0)
 
 
-def _far(distance: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
+def _path_length(distance: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
     return jnp.where(distance < NOWHERE, distance.astype(jnp.int32), UNREACHABLE)
 
 
 class Rule(NamedTuple):
-    """Rule of a teammate: if a condition holds and a target can be reached, go to the nearest one.
+    """Rule of a teammate: if a condition holds and a target can be reached, go to the nearest target.
 
     Attributes:
-        when: bool scalar, the condition.
+        when: bool scalar, condition of the rule.
         targets: bool (cells,), cells to go to.
-        waits: Python bool, whether to face the target and wait, instead of interacting with it.
+        waits: Python bool, whether to face the target and wait instead of interacting.
     """
 
     when: Bool[Array, ""]
@@ -67,13 +67,13 @@ class Rule(NamedTuple):
     waits: bool = False
 
 
-class Chosen(NamedTuple):
-    """The first rule that applies. If none does, only `found` is defined.
+class ChosenRule(NamedTuple):
+    """The first rule in a list that applies. If no rule applies, only `found` is defined.
 
     Attributes:
         found: bool scalar, whether a rule applies.
         number: int32 scalar, the rule's position in the list.
-        target: int32 scalar, the nearest of its targets.
+        target: int32 scalar, cell of the nearest target of the rule.
         waits: bool scalar, the rule's `waits`.
     """
 
@@ -85,12 +85,12 @@ class Chosen(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One state as a heuristic reads it. All masks are bool (cells,); everything is traced and computed on first use.
+    """Features of a state from one agent's view, traced and computed at first use; all masks are bool (cells,).
 
     Attributes:
         tables: tables of the layout.
         record: uint8 (S,), the state record.
-        slot: 0 or 1, the agent that reads it, "own" below; the other one is the partner.
+        slot: 0 or 1, the agent with this view; the other agent is its partner.
     """
 
     tables: Tables
@@ -99,29 +99,29 @@ class Scene:
 
     @cached_property
     def state(self) -> State:
-        """The record's fields."""
+        """Fields of the state record."""
         return unpack(self.tables, self.record)
 
     @cached_property
     def cell(self) -> Int[Array, " cells"]:
-        """The numbers of all cells."""
+        """Numbers of all cells."""
         return jnp.arange(self.tables.kinds.shape[0])
 
     @cached_property
     def me(self) -> Int[Array, ""]:
-        """The own cell."""
+        """Number of the agent's cell."""
         return self.state.positions[self.slot].astype(jnp.int32)
 
     @cached_property
     def partner(self) -> Int[Array, ""]:
-        """The partner's cell."""
+        """Number of the partner's cell."""
         return self.state.positions[1 - self.slot].astype(jnp.int32)
 
-    # Items in the agents' hands
+    # Properties for the items in both agents' hands
 
     @cached_property
     def hand(self) -> UInt8[Array, ""]:
-        """The item byte in the own hand."""
+        """Item byte in the agent's hand."""
         return self.state.hands[self.slot]
 
     @cached_property
@@ -142,40 +142,40 @@ class Scene:
 
     @cached_property
     def partner_hand(self) -> UInt8[Array, ""]:
-        """The item byte in the partner's hand."""
+        """Item byte in the partner's hand."""
         return self.state.hands[1 - self.slot]
 
-    # Masks over cells
+    # Properties and methods for masks over cells
 
-    def static(self, kind: int) -> Bool[Array, " cells"]:
+    def cells_of_kind(self, kind: int) -> Bool[Array, " cells"]:
         """Return the mask of cells of a kind."""
         return jnp.asarray(self.tables.kinds) == kind
 
-    def near(self, kind: int) -> Bool[Array, " cells"]:
-        """Return the mask of cells with one of a kind above, below, left or right of them."""
+    def cells_near(self, kind: int) -> Bool[Array, " cells"]:
+        """Return the mask of cells next to a cell of a kind: above, below, left or right."""
         return (jnp.asarray(self.tables.near) >> kind & 1) > 0
 
     def at(self, kind: int, values: Array) -> Array:
-        """Return a value for each cell: that of the pot, button or counter there, or 0."""
-        # A gather by number, since a scatter by traced values is slow under vmap.
+        """Return a value for each cell: the value of the pot, button or counter on the cell, or 0."""
+        # This uses a gather, because a scatter by traced values is slow under vmap.
         number = jnp.asarray(self.tables.number)
         if not values.shape[0]:
             return jnp.zeros(number.shape, values.dtype)
         found = values[jnp.minimum(number, values.shape[0] - 1)]
-        return jnp.where(self.static(kind) & (number < NOWHERE), found, jnp.zeros((), values.dtype))
+        return jnp.where(self.cells_of_kind(kind) & (number < NOWHERE), found, jnp.zeros((), values.dtype))
 
     @cached_property
-    def takes_more(self) -> Bool[Array, " P"]:
-        """Pots that take another ingredient, in the order of the layout's pots."""
-        # A pot with three ingredients cooks by itself, so a full one is cooking or cooked.
+    def fillable_pots(self) -> Bool[Array, " P"]:
+        """Whether each pot takes another ingredient, in the order of the layout's pots."""
+        # A pot with three ingredients cooks by itself, so full pots are cooking or cooked.
         items = self.state.pot_items
         exists = jnp.asarray(self.tables.pots) < NOWHERE
         return exists & (self.state.pot_timers == 0) & ((items & COOKED) == 0) & (ingredient_count(items) < 3)
 
     @cached_property
-    def nonfull(self) -> Bool[Array, " cells"]:
-        """Mask of pots that take another ingredient."""
-        return self.at(POT, self.takes_more)
+    def fillable_pot_cells(self) -> Bool[Array, " cells"]:
+        """Mask of the cells of pots that take another ingredient."""
+        return self.at(POT, self.fillable_pots)
 
     @cached_property
     def cooking(self) -> Bool[Array, " cells"]:
@@ -187,24 +187,24 @@ class Scene:
 
     @cached_property
     def pots(self) -> Bool[Array, " cells"]:
-        return self.static(POT)
+        return self.cells_of_kind(POT)
 
     @cached_property
     def pots_in_use(self) -> Bool[Array, " cells"]:
-        """Pots with something in them, raw, cooking or cooked."""
+        """Mask of pots that contain ingredients, raw, cooking or cooked."""
         return self.at(POT, self.state.pot_items > 0)
 
     @cached_property
-    def staged(self) -> Bool[Array, " cells"]:
-        """Mask of counters with an ingredient."""
+    def counter_ingredients(self) -> Bool[Array, " cells"]:
+        """Mask of counters with an ingredient on top."""
         return self.at(WALL, is_ingredient(self.state.counters))
 
     @cached_property
     def empty_counters(self) -> Bool[Array, " cells"]:
-        """Walls without an item, also unreachable ones."""
-        # The published teammates also aim at walls that nobody reaches; `first` then skips the rule.
+        """Mask of walls and counters without an item, also unreachable walls."""
+        # The published teammates also target unreachable walls; `first` then skips the rule.
         taken = self.at(WALL, self.state.counters > 0)
-        return self.static(WALL) & ~taken
+        return self.cells_of_kind(WALL) & ~taken
 
     @cached_property
     def button_lit(self) -> Bool[Array, ""]:
@@ -212,20 +212,20 @@ class Scene:
 
     @cached_property
     def needed(self) -> Int[Array, " 3"]:
-        """Missing pieces of each piled ingredient, over all pots together."""
-        # Over all pots together, as published: two half-filled pots count as one.
+        """Number of missing pieces of each piled ingredient, over all pots together."""
+        # As in the published code, the contents of all pots are added: two half-filled pots count as one.
         return jnp.maximum(self.counts(self.state.recipe) - self.counts(self.state.pot_items).sum(axis=0), 0)
 
     def counts(self, item: UInt8[Array, "*B"]) -> Int[Array, "*B 3"]:
         """Return the number of pieces of each piled ingredient in an item, by ascending id; 0 for further types."""
-        # Two bits for each ingredient, above the bits of plate and cooked.
+        # An item byte has two bits for each ingredient, above the bits of plate and cooked.
         shift = 2 + 2 * jnp.arange(3, dtype=jnp.uint8)
         return (item[..., None] >> shift & 3).astype(jnp.int32)
 
     def piles_of(self, wanted: Bool[Array, " 3"]) -> Bool[Array, " cells"]:
-        """Return the piles of the wanted ingredient types."""
+        """Return the mask of piles of the wanted ingredient types."""
         piles = jnp.asarray(self.tables.piles)
-        return jnp.any((self.counts(piles) > 0) & wanted, axis=-1) & self.static(PILE)
+        return jnp.any((self.counts(piles) > 0) & wanted, axis=-1) & self.cells_of_kind(PILE)
 
     @cached_property
     def needed_piles(self) -> Bool[Array, " cells"]:
@@ -237,29 +237,29 @@ class Scene:
 
     @cached_property
     def goals(self) -> Bool[Array, " cells"]:
-        return self.static(GOAL)
+        return self.cells_of_kind(GOAL)
 
     @cached_property
     def plate_piles(self) -> Bool[Array, " cells"]:
-        return self.static(PLATES)
+        return self.cells_of_kind(PLATES)
 
     @cached_property
     def buttons(self) -> Bool[Array, " cells"]:
-        return self.static(BUTTON)
+        return self.cells_of_kind(BUTTON)
 
     @cached_property
     def indicators(self) -> Bool[Array, " cells"]:
-        return self.static(INDICATOR)
+        return self.cells_of_kind(INDICATOR)
 
-    # Distances and moves
+    # Methods for distances and moves
 
     def distances(self, cell: Int[Array, ""]) -> Int[Array, " cells"]:
-        """Return the distances from a floor cell to all others; UNREACHABLE if there is no path."""
-        return _far(jnp.asarray(self.tables.distance)[cell])
+        """Return the distances from a floor cell to all other cells; UNREACHABLE without a path."""
+        return _path_length(jnp.asarray(self.tables.distance)[cell])
 
     @cached_property
     def _target_distance(self) -> Int[Array, " cells"]:
-        return _far(jnp.asarray(self.tables.target_distance)[self.me])
+        return _path_length(jnp.asarray(self.tables.target_distance)[self.me])
 
     def manhattan(self, cell: Int[Array, "*B"], other: Int[Array, "*B"]) -> Int[Array, "*B"]:
         """Return the Manhattan distance of two cells, or of broadcast arrays of cells."""
@@ -276,11 +276,11 @@ class Scene:
 
     def access(self, target: Int[Array, ""]) -> Int[Array, " 4"]:
         """Return the floor cells above, below, left and right of a cell; -1 for other cells."""
-        beside = self.neighbours(target)
-        return jnp.where((beside >= 0) & jnp.asarray(self.tables.walkable)[beside], beside, -1)
+        cells = self.neighbours(target)
+        return jnp.where((cells >= 0) & jnp.asarray(self.tables.walkable)[cells], cells, -1)
 
     def only_access(self, target: Int[Array, ""]) -> Int[Array, ""]:
-        """Return the access cell of a target that has exactly one, else -1."""
+        """Return the only access cell of a target; -1 if the target has none or several."""
         access = self.access(target)
         return jnp.where(jnp.sum(access >= 0) == 1, jnp.max(access), -1)
 
@@ -289,33 +289,35 @@ class Scene:
         return jnp.asarray(self.tables.first_step)[self.me, cell].astype(jnp.int32)
 
     def reach(self, mask: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
-        """Return the cells of the mask that are adjacent to a cell that can be walked to."""
+        """Return the mask of cells in `mask` next to a floor cell that the agent can reach."""
         return mask & (self._target_distance < UNREACHABLE)
 
     def nearest_distance(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
-        """Return the distance to the nearest access cell of the mask; UNREACHABLE if there is none."""
+        """Return the distance to the nearest access cell of the mask's cells; UNREACHABLE without a path."""
         return jnp.min(jnp.where(mask, self._target_distance, UNREACHABLE))
 
     def closest(self, mask: Bool[Array, " cells"]) -> Int[Array, ""]:
-        """Return the nearest cell of the mask, ties in reading order. Undefined if none is reachable."""
+        """Return the nearest cell of the mask, with ties in reading order; undefined if no cell is reachable."""
         return jnp.argmin(jnp.where(mask, self._target_distance, UNREACHABLE))
 
-    def first(self, rules: Sequence[Rule]) -> Chosen:
-        """Return the first rule that applies, with the nearest of its targets."""
-        # All rules are evaluated and one is selected: under vmap a branch would run both sides anyway.
+    def first(self, rules: Sequence[Rule]) -> ChosenRule:
+        """Return the first rule that applies, with the rule's nearest target."""
+        # All rules are evaluated, because a branch would run both sides under vmap anyway.
         targets = jnp.stack([rule.targets for rule in rules])
         possible = jnp.stack([rule.when for rule in rules]) & jnp.any(self.reach(targets), axis=-1)
         number = jnp.argmax(possible)
         waits = jnp.asarray(np.array([rule.waits for rule in rules]))[number]
-        return Chosen(jnp.any(possible), number, self.closest(targets[number]), waits)
+        return ChosenRule(jnp.any(possible), number, self.closest(targets[number]), waits)
 
     def approach(
         self, target: Int[Array, ""], extra: Float[Array, " cells"] | None = None
     ) -> tuple[Int[Array, ""], Int[Array, ""] | Float[Array, ""]]:
-        """Return the step towards the target's nearest access cell, and that cell's cost: its distance, plus 100 if the
-        partner is on it, plus `extra` (cells,)."""
+        """Return the step towards the cheapest access cell of a target, and the cell's cost.
+
+        The cost is the distance, plus 100 if the partner is on the cell, plus `extra` (cells,).
+        """
         access = self.access(target)
-        # 100 is more than any path: an occupied access cell is chosen only if there is no other.
+        # 100 is more than any path, so an occupied access cell is only chosen if no other exists.
         distance = jnp.where(access >= 0, self.distances(self.me)[access], UNREACHABLE)
         cost = distance + 100 * (access == self.partner)
         if extra is not None:
@@ -329,17 +331,20 @@ class Scene:
         waits: Bool[Array, ""] | bool = False,
         step: Int[Array, ""] | None = None,
     ) -> Int[Array, ""]:
-        """Walk to the target; next to it, turn, then interact or wait. `step` replaces the step of `approach`."""
+        """Return the action that walks to a target, faces the target, and then interacts or waits.
+
+        The argument `step` replaces the step of `approach`.
+        """
         adjacent = self.manhattan(self.me, target) == 1
         direction = jnp.argmax(self.neighbours(self.me) == target)  # up, down, left, right
         faced = jnp.asarray(_ACTION_OF_FACING)[self.state.facings[self.slot].astype(jnp.int32)]
-        # A move into a wall only turns the agent, which is how it comes to face an adjacent target.
+        # A move towards an adjacent target only turns the agent, because targets block the move.
         action = jnp.where(faced == direction, jnp.where(waits, STAY, INTERACT), direction)
         return jnp.where(adjacent, action, self.approach(target)[0] if step is None else step)
 
     @cached_property
     def ways(self) -> Int[Array, " 4"]:
-        """Cells to which a move right, down, left or up leads; the agent's own cell if the move is blocked."""
+        """Cells to which a move right, down, left or up leads; the agent's cell if the move is blocked."""
         return jnp.asarray(self.tables.moves)[self.me, jnp.array(SEARCH_ORDER)].astype(jnp.int32)
 
     @cached_property
@@ -348,7 +353,7 @@ class Scene:
         return (self.ways != self.me) & (self.ways != self.partner)
 
     def sidestep(self, otherwise: Int[Array, ""] | int) -> Int[Array, ""]:
-        """Return the first free move in search order."""
+        """Return the first free move in the order right, down, left, up; `otherwise` if no move is free."""
         return self.best_way(self.free, jnp.zeros(4), otherwise)
 
     def best_way(
@@ -357,19 +362,19 @@ class Scene:
         score: Int[Array, " 4"] | Float[Array, " 4"],
         otherwise: Int[Array, ""] | int = STAY,
     ) -> Int[Array, ""]:
-        """Return the allowed way with the highest score, ties in search order."""
+        """Return the allowed move with the highest score, with ties in the order right, down, left, up."""
         best = jnp.argmax(jnp.where(allowed, score, -jnp.inf))
         return jnp.where(jnp.any(allowed), jnp.asarray(SEARCH_ORDER)[best], otherwise)
 
     def wander(self, stay_score: int = 50) -> Int[Array, ""]:
-        """Return a step onto a free neighbour, in search order; else stay, or (150) walk into the partner."""
+        """Return a step onto a free neighbour cell; else stay, or walk into the partner if `stay_score` is 150."""
         target = jnp.asarray(self.tables.moves)[self.me].astype(jnp.int32)
-        # Costs as published; `stay_score` between them decides whether it is better to stay than to push.
+        # Published costs: pushing the partner costs 100, so a `stay_score` above 100 prefers pushing to staying.
         scores = [jnp.where(target[a] == self.me, 1000, 100 * (target[a] == self.partner)) for a in SEARCH_ORDER]
         best = jnp.argmin(jnp.stack([*scores, jnp.asarray(stay_score)]))
         return jnp.asarray((*SEARCH_ORDER, STAY))[best]
 
     def destination(self, action: Int[Array, ""]) -> Int[Array, ""]:
-        """Return the cell that a move action points at, walls ignored; the own cell for other actions."""
+        """Return the cell to which a move action points, ignoring walls; the agent's cell for other actions."""
         ahead = self.neighbours(self.me)[jnp.minimum(action, 3)]
         return jnp.where(action < 4, ahead, self.me)

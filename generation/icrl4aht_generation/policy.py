@@ -21,12 +21,12 @@ compare with the paper's; or "seeded", a new key in every episode."""
 
 
 class Situation(NamedTuple):
-    """What a scripted agent sees of one environment.
+    """Complete view of one environment, which scripted agents see.
 
     Attributes:
-        tables: tables of its layout.
-        record: uint8 (S,), its state record.
-        layout: int32 (), number of the layout among those of the environments.
+        tables: tables of the environment's layout.
+        record: uint8 (S,), state record of the environment.
+        layout: int32 (), index of the layout among all layouts of the environments.
     """
 
     tables: Tables
@@ -35,7 +35,7 @@ class Situation(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """A policy for one agent of one environment, as pure functions without a batch axis; roll-outs vmap them.
+    """A policy for one agent of one environment, as pure functions without a batch axis; rollouts vmap them.
 
     Attributes:
         params: pytree of arrays that the functions take as an argument, so that policies which differ only in their
@@ -44,8 +44,8 @@ class Policy(NamedTuple):
         act: (params, memory, view, key) -> action, int32 () in 0..5, and the memory after the step.
         sees: content of `view`: "state" for the state record, uint8 (S,); "situation" for a `Situation`, by which one
             policy plays every layout; "observation" for uint8 (5, 5, C);
-            "ego_input", for egos in evaluation only, for the observation with the outcome of the previous step
-            (`icrl4aht_baselines.agents.EgoInput`), and "canonical_input" for the same with canonical channels.
+            "ego_input", only for egos in evaluation, for the observation with the outcome of the previous step
+            (`icrl4aht_baselines.agents.EgoInput`), and "canonical_input" for this input with canonical channels.
     """
 
     params: Any
@@ -55,12 +55,12 @@ class Policy(NamedTuple):
 
     @property
     def label_view(self) -> LabelView:
-        """What actions of this policy, as labels, are made from: the full state, or what an ego sees."""
+        """What labels by this policy are computed from: "state" for the full state, "ego" for what an ego sees."""
         return "state" if self.sees in ("state", "situation") else "ego"
 
 
 @lru_cache(maxsize=256)
-def _act_on(act: Callable[..., Any], layout: Layout) -> Callable[..., Any]:
+def _act_on_layout(act: Callable[..., Any], layout: Layout) -> Callable[..., Any]:
     def on_layout(params: Any, memory: Any, record: UInt8[Array, " S"], key: Key[Array, ""]) -> Any:
         return act(params, memory, Situation(layout.tables, record), key)
 
@@ -68,20 +68,20 @@ def _act_on(act: Callable[..., Any], layout: Layout) -> Callable[..., Any]:
 
 
 def on_layout(policy: Policy, layout: Layout) -> Policy:
-    """Return a policy that sees a `Situation` as one that sees the state records of one layout.
+    """Convert a policy that sees a `Situation` into a policy that sees state records of one layout.
 
-    Policies with the same functions have the same functions afterwards.
+    Policies with equal functions still have equal functions afterwards, so they share compilations.
     """
-    return policy._replace(act=_act_on(policy.act, layout), sees="state")
+    return policy._replace(act=_act_on_layout(policy.act, layout), sees="state")
 
 
 def sometimes_random(key: Key[Array, ""], chance: Any, action: Int[Array, ""]) -> Int[Array, ""]:
-    """Return an action, or with a chance one that is drawn uniformly from the six actions."""
+    """Return the given action, or with probability `chance` one of the six actions at random."""
     whether, which = jax.random.split(key)
     drawn = jax.random.randint(which, (), 0, len(ACTIONS))
     return jnp.where(jax.random.uniform(whether) < chance, drawn, action)
 
 
 def stacked(trees: Iterable[Any]) -> Any:
-    """Return one pytree whose leaves are those of all trees, stacked on a new first axis."""
+    """Return one pytree with the leaves of all trees stacked on a new first axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

@@ -6,12 +6,12 @@ _CLI = "icrl4aht_generation.commands"
 _TASKS = "Tasks and teammates"
 
 VERBS = (
-    Verb("generate", f"{_CLI}:generate", "Generate", "Rebuild a release, or resume a rebuild."),
+    Verb("generate", f"{_CLI}:generate", "Generate", "Generate a release, or resume an interrupted run."),
     Verb("teammates", f"{_CLI}:teammates", "Generate", "Train populations of teammates."),
-    Verb("layouts", f"{_CLI}:layouts", "Generate", "List generated layouts, and draw them."),
-    Verb("plan", f"{_CLI}:plan", "Generate", "Estimate the cost of a rebuild."),
-    Verb("check", f"{_CLI}:check", "Generate", "Compare two rebuilds bit for bit."),
-    Verb("research draws", f"{_CLI}:draws", _TASKS, "Measure the heuristic teammates that tasks may draw."),
-    Verb("research manifests", f"{_CLI}:manifests", _TASKS, "Write the manifests of drawn tasks in the package."),
+    Verb("layouts", f"{_CLI}:layouts", "Generate", "List generated layouts, and draw pictures of them."),
+    Verb("plan", f"{_CLI}:plan", "Generate", "Estimate the cost of generating a release."),
+    Verb("check", f"{_CLI}:check", "Generate", "Compare two generated releases bit for bit."),
+    Verb("research draws", f"{_CLI}:draws", _TASKS, "Sample heuristic teammates for tasks, and measure them."),
+    Verb("research manifests", f"{_CLI}:manifests", _TASKS, "Write the package's manifests with sampled teammates."),
     Verb("research diversity", f"{_CLI}:diversity", _TASKS, "Report how much the teammates of a suite differ."),
 )

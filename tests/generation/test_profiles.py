@@ -249,7 +249,7 @@ def test_no_validation_teammate_trains(changed, monkeypatch):
     monkeypatch.setattr(profile_module, "spread_teammates", lambda layout, split, count: [entry] * count)
     counts = "per_layout = 0\nvalidation = { coord_simple = 1 }"
     spread_profile(changed, 'presets = ["default"]', counts)
-    with pytest.raises(OptionError, match=r"1 of the validation tasks have a teammate that also trains, such as team"):
+    with pytest.raises(OptionError, match="1 of the validation tasks have a teammate of a training task, such as"):
         spread_profile(changed, PRESETS, counts)
 
 
@@ -276,7 +276,7 @@ def test_given_tasks_have_the_sources_that_they_had(changed):
         (third, "ppo", 1),
     ]
     of_ppo = load_profile(changed("keep = 8", "keep = 7"))
-    with pytest.raises(OptionError, match=rf"task {second}: its source is noise, those of profile mine are ppo: "):
+    with pytest.raises(OptionError, match=rf"task {second}: the source is noise, but profile mine has ppo: "):
         of_ppo.units_of(tasks, {second: "noise"})
 
 

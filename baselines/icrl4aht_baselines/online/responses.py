@@ -19,7 +19,7 @@ import numpy as np
 from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.learners.resume import METRICS, TIMING, differing_settings, last_line, run_lock
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.teammates.distances import act_along, common_states, group_behaviours
+from icrl4aht_generation.teammates.distances import act_on_records, common_states, group_behaviours
 from icrl4aht_generation.teammates.registry import build_teammate
 from icrl4aht_generation.teammates.spread import find_measured
 from msgspec import structs, to_builtins
@@ -89,7 +89,7 @@ def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
             found.append((own[0],))
             continue
         plain = replace(own[0], recipes=None).layout
-        actions = act_along(plain, [build_teammate(plain, task.teammate) for task in own], common_states(plain)[0])
+        actions = act_on_records(plain, [build_teammate(plain, task.teammate) for task in own], common_states(plain)[0])
         numbers = np.array(group_behaviours(actions))
         for number in dict.fromkeys(numbers.tolist()):
             found.append(tuple(own[k] for k in np.flatnonzero(numbers == number)))

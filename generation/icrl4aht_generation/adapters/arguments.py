@@ -15,14 +15,14 @@ from icrl4aht_data.overcooked.state import faults, record_size
 from icrl4aht_data.utils.options import check_int
 
 RENDER_MODES = ["rgb_array"]
-"""Render modes of the environments: pictures, which need Pillow."""
+"""Render modes of the environments: only RGB arrays, which Pillow draws."""
 
 
 def check_choices(channels: str, render_mode: str | None = None) -> None:
-    """Check the channels and the render mode of an environment.
+    """Validate the channels and the render mode of an environment.
 
     Raises:
-        UnknownNameError: for one that does not exist.
+        UnknownNameError: if the channels or the render mode do not exist.
     """
     for name, value, valid in (("channels", channels, CHANNELS), ("render_mode", render_mode, (None, *RENDER_MODES))):
         if value not in valid:
@@ -30,14 +30,14 @@ def check_choices(channels: str, render_mode: str | None = None) -> None:
 
 
 def check_action(name: str, action: SupportsIndex) -> int:
-    """Return an action as an int.
+    """Validate an action and return it as an int.
 
     Args:
         name: name of the argument, for the message.
-        action: 0..5.
+        action: number of the action, 0..5.
 
     Raises:
-        OptionError: for an action that does not exist.
+        OptionError: if the action does not exist.
     """
     number = check_int(name, action, 0)
     if number >= len(ACTIONS):
@@ -46,10 +46,10 @@ def check_action(name: str, action: SupportsIndex) -> int:
 
 
 def check_record(layout: Layout, state: Any) -> np.ndarray:
-    """Return a state record of a layout as uint8 (S,).
+    """Validate a state record of a layout and return it as uint8 (S,).
 
     Raises:
-        OptionError: for another shape, or values that the layout's states do not have.
+        OptionError: if the shape is wrong, or a value is impossible on this layout.
     """
     record = check_integers("state", state, np.uint8, 255, (record_size(layout),))
     if wrong := faults(layout, record[None]):
@@ -60,17 +60,17 @@ def check_record(layout: Layout, state: Any) -> np.ndarray:
 def check_integers(
     name: str, value: Any, dtype: DTypeLike, highest: int, shape: tuple[int, ...] | None = None
 ) -> np.ndarray:
-    """Return an array of integers in another dtype.
+    """Validate an array of integers and return it in another dtype.
 
     Args:
         name: name of the argument, for the message.
         value: integers in 0..highest.
         dtype: dtype of the result.
         highest: the largest valid integer.
-        shape: the valid shape; any with one axis by default.
+        shape: the valid shape; by default any shape with one axis.
 
     Raises:
-        OptionError: for anything else.
+        OptionError: if the value is no such array.
     """
     found = np.asarray(value)
     numeric = found.dtype.kind in "iu" and found.size > 0

@@ -20,42 +20,42 @@ from icrl4aht_generation.profiles import Work
 
 
 def recorded_draws(dataset: Dataset, history_id: int, episode: int = 0) -> dict[str, Any]:
-    """Return the options of `TaskEnv.reset` with which everything random is drawn as in a recorded episode.
+    """Return options of `TaskEnv.reset` that repeat all random draws of a recorded episode.
 
-    Unlike `Dataset.reset_options`, they do not script the teammate: its policy draws what it drew then, so that it
-    answers to other actions of the ego as it would have. The bits of a learned teammate's network may differ between
-    machines; heuristics play exactly as recorded.
+    Unlike the options of `Dataset.reset_options`, these do not replay the teammate's actions: its policy acts with the
+    recorded random draws, and reacts if the ego acts differently. A learned teammate's network may round differently
+    on another machine; heuristics play exactly as recorded.
 
     Args:
-        dataset: a release of this package's code.
+        dataset: a release that this version of the code generated.
         history_id: a history of the release.
         episode: number of the episode in the history, from 0.
 
     Returns:
-        `key` uint32 (2,) and `episode`, the number of the episode with this key.
+        `key`, uint32 (2,), data of a JAX key, and `episode`, the number of the episode with this key.
 
     Raises:
-        OptionError: for an episode that the history does not have.
-        NotStoredError: if the release does not say how the history was drawn, or the keys do not give its start.
+        OptionError: if the history does not have the episode.
+        NotStoredError: if the release does not record the history's keys, or if the keys give another first state.
     """
     recorded = dataset.reset_options(history_id, episode)["state"]
     entry = dataset.index.entry(history_id)
     task, number = dataset.history_task(history_id), episode
     ego = dataset.provenance.get(task.task_id, Provenance()).ego
-    if entry.source in SCRIPTED_SOURCES:  # a script plays each episode in an environment of its own
+    if entry.source in SCRIPTED_SOURCES:  # every episode of a script has a new environment
         key, number = scripted_episode_keys(task.seed, np.array([entry.env_idx]), np.array([episode]))[0], 0
     elif entry.source == "ppo" and ego is not None:
         key = stream_keys(learner_key(Work(task, learner=entry.learner)), ego["environments"])[entry.env_idx]
     else:
         raise NotStoredError(
-            f"{dataset.root}: history {history_id}, source {entry.source}: its keys are not known; take "
-            f"dataset.reset_options, which needs none"
+            f"{dataset.root}: history {history_id}, source {entry.source}: the release does not record its random "
+            f"keys; use dataset.reset_options, which needs no keys"
         )
     env = Environment(task.layout)
     drawn = np.asarray(env.first_record(key[None], jnp.array([number])))[0]
     if not np.array_equal(drawn, recorded):
         raise NotStoredError(
             f"{dataset.root}: history {history_id}: the keys of its seed {entry.seed} give another start of episode "
-            f"{episode}: other code made it; take dataset.reset_options, which needs no keys"
+            f"{episode}: other code generated it; use dataset.reset_options, which needs no keys"
         )
     return {"key": np.asarray(jax.random.key_data(key)), "episode": number}

@@ -1,4 +1,4 @@
-"""A task as a Gymnasium environment: the ego's side of the game, with the teammate inside."""
+"""A task as a Gymnasium environment, in which the ego is the agent and the teammate belongs to the environment."""
 
 from __future__ import annotations
 
@@ -48,29 +48,29 @@ RESET_OPTIONS = ("state", "key", "episode", "teammate_actions", "recipes")
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
-    """The ego's side of a task; the task's teammate plays inside.
+    """Environment of the ego in a task; the task's teammate acts inside the environment.
 
     Observation: uint8 (5, 5, C), what the ego sees, as `icrl4aht_data.overcooked.observe.observe` describes.
     Action: 0..5 (up, down, left, right, stay, interact).
-    Reward: the team's, without shaping.
-    End: never by itself. `gymnasium.make` adds a limit of 100 steps; give it another `max_episode_steps` to change it.
+    Reward: the team's reward, without shaping.
+    End: the environment never ends an episode. `gymnasium.make` adds a limit of 100 steps, or `max_episode_steps`.
     Info: `state`, the state record uint8 (S,); after a step also `teammate_action`, an int, and `shaped_rewards`,
-    float32 (2,), of ego and teammate. The ego of the benchmark does not see them.
+    float32 (2,), of ego and teammate. Egos in the benchmark do not see this info.
 
     Args:
         task: the fields of a task, as in a line of a manifest; see `icrl4aht_data.benchmark.tasks.Task`.
         suite: folder of learned teammates' checkpoints: a suite, or the folder `teammates` of a release.
         noise: source of a heuristic teammate's randomness, see `icrl4aht_generation.policy.Noise`.
-        channels: the layout's own channels, or the canonical ones, which all layouts share.
+        channels: "own" for the layout's observation channels, "canonical" for channels that all layouts share.
         render_mode: "rgb_array" for pictures, which need Pillow.
 
     Raises:
-        TaskFormatError: for a malformed task, or parameters that its teammate does not have.
-        OptionError: for a checkpoint that is missing.
-        UnknownNameError: for a noise, channels or a render mode that does not exist.
+        TaskFormatError: if the task is malformed, or sets parameters that its teammate does not have.
+        OptionError: if the checkpoint of a learned teammate is missing.
+        UnknownNameError: if the noise, the channels or the render mode do not exist.
     """
 
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 5}  # noqa: RUF012 - declared so by the base class
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 5}  # noqa: RUF012 - type of the base class
 
     def __init__(
         self,
@@ -93,12 +93,12 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         policy = build_teammate(
             self.layout, self.task.teammate, TEAMMATE, noise, None if suite is None else Path(suite)
         )
-        self._start, self._step = _compiled(self.layout, policy._replace(params=()), channels == "canonical")
+        self._start, self._step = _compiled_functions(self.layout, policy._replace(params=()), channels == "canonical")
         self._params = policy.params
         self.observation_space = spaces.Box(0, 255, observation_shape(self.layout, channels == "canonical"), np.uint8)
         self.action_space = spaces.Discrete(len(ACTIONS))
         self.render_mode = render_mode
-        self._moment: _Moment | None = None
+        self._current: _RunningEpisode | None = None
         self._script, self._recipes = np.empty(0, np.int32), np.empty(0, np.uint8)
 
     def __repr__(self) -> str:
@@ -110,25 +110,25 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
         """Start an episode.
 
         Args:
-            seed: seed of the draws of this episode and those that follow.
-            options: all optional. `state`: uint8 (S,), the state record to start from instead of a drawn one.
-                `key`: uint32 (2,), data of the JAX key that the episode is drawn from, and `episode`: its number with
-                this key, 0 by default; see `icrl4aht_generation.env.Environment`. `teammate_actions`: integers (n,),
-                actions that the teammate repeats in the first n steps, whatever the ego does. `recipes`: uint8 (n,),
-                item of the recipe after each of the first n steps, if it changes in this step. `Dataset.reset_options`
-                returns those of a recorded episode.
+            seed: seed of the random draws of this episode and all later episodes.
+            options: all optional. `state`: uint8 (S,), the state record to start from; by default a random state.
+                `key`: uint32 (2,), data of the JAX key for all random draws of the episode, and `episode`: number of
+                the episode with this key, 0 by default; see `icrl4aht_generation.env.Environment`.
+                `teammate_actions`: integers (n,), the teammate's actions in the first n steps, whatever the ego does.
+                `recipes`: uint8 (n,), item of the recipe after each of the first n steps, if the recipe changes in this
+                step. `Dataset.reset_options` returns the options of a recorded episode.
 
         Returns:
             The first observation, and `info`.
 
         Raises:
-            UnknownNameError, OptionError: for options that do not exist, or have impossible values.
+            UnknownNameError, OptionError: if an option does not exist, or has an impossible value.
         """
         super().reset(seed=seed)
         given = dict(options or {})
         for name in given:
             check_choice("option of reset", name, RESET_OPTIONS)
-        # Drawn in any case, so that an episode with options leaves those after it unchanged.
+        # Always draw a key: an episode with options must not change the keys of later episodes.
         drawn = self.np_random.integers(0, 2**32, 2, dtype=np.uint32)
         key = check_integers("key", given.get("key", drawn), np.uint32, 2**32 - 1, (2,))
         record = None if (state := given.get("state")) is None else check_record(self.layout, state)
@@ -140,24 +140,24 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
                 f"recipes: expected items of {self.layout.name}'s recipes, {self.layout.recipe_items.tolist()}, found "
                 f"{np.unique(self._recipes).tolist()}"
             )
-        self._moment, observation = self._start(self._params, key, np.int32(episode), record)
+        self._current, observation = self._start(self._params, key, np.int32(episode), record)
         return np.asarray(observation)[0], {"state": self.state}
 
     def step(self, action: SupportsIndex) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Play one step with the ego's action 0..5, and the teammate's.
+        """Play one step with the ego's action 0..5; the teammate's policy chooses the teammate's action.
 
         Returns:
-            Observation, reward, False, False and `info`; see the class.
+            Observation, reward, terminated (False), truncated (False) and `info`, as the class describes.
 
         Raises:
-            OptionError: before the first `reset`, and for an action that does not exist.
+            OptionError: if `reset` was not called before, or the action does not exist.
         """
-        moment, number = self._started, check_action("action", action)
+        moment, number = self._running, check_action("action", action)
         scripted = np.int32(self._script[0]) if len(self._script) else np.int32(-1)
         recipe = self._recipes[0] if len(self._recipes) else np.uint8(0)
         self._script, self._recipes = self._script[1:], self._recipes[1:]
         played = self._step(self._params, moment, np.int32(number), scripted, recipe)
-        self._moment = played.after
+        self._current = played.after
         info = {
             "state": self.state,
             "teammate_action": int(played.teammate_action),
@@ -171,41 +171,41 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.int64]):
 
     @property
     def state(self) -> np.ndarray:
-        """The state record uint8 (S,); see `icrl4aht_data.overcooked.state`."""
-        return np.array(self._started.env.record[0])
+        """State record of the running episode, uint8 (S,); see `icrl4aht_data.overcooked.state`."""
+        return np.array(self._running.env.record[0])
 
     @property
-    def _started(self) -> _Moment:
-        if self._moment is None:
+    def _running(self) -> _RunningEpisode:
+        if self._current is None:
             raise OptionError("the environment has not been started: call reset() first")
-        return self._moment
+        return self._current
 
 
 def published_environment(layout: str, teammate: str, **options: Any) -> TaskEnv:
-    """Return the environment of a published test task; Gymnasium's ids of these tasks lead here.
+    """Return the environment of a published test task; entry point of the ids registered with Gymnasium.
 
     Args:
         layout: name of the layout.
         teammate: family and number of the teammate, such as "H4/t0".
-        options: further options of `TaskEnv`.
+        options: further arguments of `TaskEnv`.
 
     Raises:
-        UnknownNameError: for a layout or teammate that does not exist.
+        UnknownNameError: if the layout or the teammate does not exist.
     """
     return TaskEnv(asdict(published_task(layout, teammate)), **options)
 
 
-class _Moment(NamedTuple):
-    """A running episode, N = 1: the environment's state and the teammate's memory."""
+class _RunningEpisode(NamedTuple):
+    """State of a running episode: the state of one environment and the teammate's memory."""
 
     env: EnvState
     memory: Any
 
 
-class _Played(NamedTuple):
+class _StepResult(NamedTuple):
     """Result of a step: float32 reward (1,) and shaped rewards (1, 2), observation uint8 (1, 5, 5, C)."""
 
-    after: _Moment
+    after: _RunningEpisode
     observation: UInt8[Array, "1 5 5 C"]
     reward: Float[Array, " 1"]
     shaped: Float[Array, "1 2"]
@@ -213,10 +213,10 @@ class _Played(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _compiled(
+def _compiled_functions(
     layout: Layout, policy: Policy, canonical: bool
-) -> tuple[Callable[..., tuple[_Moment, Array]], Callable[..., _Played]]:
-    """Return the compiled start of an episode, and its step, of one layout and one family of teammates."""
+) -> tuple[Callable[..., tuple[_RunningEpisode, Array]], Callable[..., _StepResult]]:
+    """Return two compiled functions for a layout and a teammate family: start an episode, and play a step."""
     env = Environment(layout)
     teammate = lambda params: policy_player(env, policy, params, TEAMMATE, 1)  # noqa: E731
 
@@ -225,17 +225,17 @@ def _compiled(
         state = state._replace(episode=state.episode + episode)
         drawn = env.first_record(state.key, state.episode)
         state = state._replace(record=drawn if record is None else jnp.asarray(record)[None])
-        return _Moment(state, teammate(params).init(state)), observe(layout, state.record, EGO, canonical)
+        return _RunningEpisode(state, teammate(params).init(state)), observe(layout, state.record, EGO, canonical)
 
-    def step(params, moment: _Moment, action, scripted, recipe) -> _Played:
+    def step(params, moment: _RunningEpisode, action, scripted, recipe) -> _StepResult:
         state = moment.env
-        # The key is not used: heuristics have keys of their own, and learned teammates act greedily.
+        # The key has no effect: heuristics use their own keys, and learned teammates act greedily.
         choice, memory = teammate(params).act(moment.memory, state, jax.random.key(0))
         other = jnp.where(scripted < 0, choice.action[0], scripted)
         following = jnp.where(recipe == 0, env.next_recipe(state), recipe)
         outcome = rules.step(layout, state.record, jnp.stack([action, other])[None], following)
-        after = _Moment(state._replace(clock=state.clock + 1, record=outcome.state), memory)
+        after = _RunningEpisode(state._replace(clock=state.clock + 1, record=outcome.state), memory)
         seen = observe(layout, outcome.state, EGO, canonical)
-        return _Played(after, seen, outcome.reward, outcome.shaped, other)
+        return _StepResult(after, seen, outcome.reward, outcome.shaped, other)
 
     return jax.jit(start), jax.jit(step)

@@ -1,4 +1,4 @@
-"""The environment of a layout with the interface of JaxMARL."""
+"""The environment of a layout with JaxMARL's interface."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class JaxMARLState:
     """State of one environment, without a batch axis.
 
     Attributes:
-        key: uint32 (2,), data of the key that the episode is drawn from.
+        key: uint32 (2,), data of the JAX key for all random draws of the episode.
         step: int32 (), steps taken in the episode.
         done: bool (), whether the episode has ended.
         record: uint8 (S,), the state record; see `icrl4aht_data.overcooked.state`.
-        recipe: int32 (), the current recipe as JaxMARL's OvercookedV2 encodes it, for its wrapper of logs.
+        recipe: int32 (), the current recipe in the encoding of JaxMARL's OvercookedV2, for its logging wrapper.
     """
 
     key: UInt32[Array, " 2"]
@@ -57,21 +57,21 @@ class JaxMARLEnv(MultiAgentEnv):
     Agents: "agent_0", the ego, and "agent_1", the teammate.
     Observation: uint8 (5, 5, C) of each agent, as `icrl4aht_data.overcooked.observe.observe_both` describes.
     Action: 0..5 of each agent (up, down, left, right, stay, interact), which is not JaxMARL's order.
-    Reward: float32, the team's, equal for both.
-    End: `done` of both agents after `max_steps` steps; `step` then starts the next episode, as in all of JaxMARL.
-    Info: `shaped_reward` of each agent, as JaxMARL's OvercookedV2 has it; not part of the reward.
+    Reward: float32, the team's reward, equal for both agents.
+    End: both agents are `done` after `max_steps` steps; `step` then starts the next episode, as usual in JaxMARL.
+    Info: `shaped_reward` of each agent, as in JaxMARL's OvercookedV2; not part of the reward.
 
     Args:
         layout: name of the layout.
         max_steps: steps of an episode: 400 in training, 100 in evaluation.
-        channels: the layout's own channels, or the canonical ones, which all layouts share.
+        channels: "own" for the layout's observation channels, "canonical" for channels that all layouts share.
 
     Attributes:
-        possible_recipes: int32 (R, 3), the ingredient ids of each recipe, which JaxMARL's wrapper of logs reads.
+        possible_recipes: int32 (R, 3), the ingredient ids of each recipe, which JaxMARL's logging wrapper reads.
 
     Raises:
-        UnknownNameError: for a layout or channels that do not exist.
-        OptionError: for a number of steps below 1.
+        UnknownNameError: if the layout or the channels do not exist.
+        OptionError: if the number of steps is below 1.
     """
 
     def __init__(self, layout: str, *, max_steps: int = EPISODE_STEPS, channels: Channels = "own") -> None:
@@ -93,7 +93,7 @@ class JaxMARLEnv(MultiAgentEnv):
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: Key[Array, ""] | UInt32[Array, " 2"]) -> tuple[dict[str, UInt8[Array, "5 5 C"]], JaxMARLState]:
-        """Return the first observations and the state of an episode, a function of the key."""
+        """Return the first observations and the first state of an episode, which depend only on the key."""
         data = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
         record = self._environment.init(data[None]).record[0]
         state = JaxMARLState(data, jnp.int32(0), jnp.bool_(False), record, self._recipe_code(record))
@@ -111,9 +111,9 @@ class JaxMARLEnv(MultiAgentEnv):
         """Return observations, state, rewards, dones and infos after a step, without a reset.
 
         Args:
-            key: not used: the key of the episode decides everything random.
+            key: not used; all random draws use the episode's key in `state`.
             state: the state before the step.
-            actions: an action of each agent.
+            actions: action of each agent by its name.
         """
         both = jnp.stack([jnp.asarray(actions[agent], jnp.int32) for agent in self.agents])
         running = EnvState(
@@ -142,20 +142,20 @@ class JaxMARLEnv(MultiAgentEnv):
     def get_avail_actions(  # type: ignore[override]
         self, state: JaxMARLState
     ) -> dict[str, Bool[Array, " 6"]]:
-        """Return for each agent that every action is available."""
+        """Return a mask of available actions for each agent: all actions are always available."""
         return dict.fromkeys(self.agents, jnp.ones(len(ACTIONS), bool))
 
     def observation_space(self, agent: str = "") -> spaces.Box:
-        """Return the space of observations, the same for both agents; JaxMARL's learners ask without an agent."""
+        """Return the observation space, equal for both agents; JaxMARL's learners call it without an agent."""
         return self.observation_spaces[self.agents[0]]
 
     def action_space(self, agent: str = "") -> spaces.Discrete:
-        """Return the space of actions, the same for both agents."""
+        """Return the action space, equal for both agents."""
         return self.action_spaces[self.agents[0]]
 
     @property
     def name(self) -> str:
-        """Name of the environment, with that of its layout."""
+        """Name of the environment, which includes the layout's name."""
         return f"icrl4aht_{self.layout.name}"
 
     @property
@@ -165,5 +165,5 @@ class JaxMARLEnv(MultiAgentEnv):
 
     @property
     def agent_classes(self) -> dict[str, list[str]]:
-        """The agents by class: both are chefs."""
+        """Names of the agents by class; both agents have the class `chef`."""
         return {"chef": list(self.agents)}

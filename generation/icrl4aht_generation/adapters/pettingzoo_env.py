@@ -39,25 +39,25 @@ AGENT_NAMES = ("ego", "teammate")
 class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
     """Both agents of a layout, for self-play and cross-play.
 
-    Agents: "ego" and "teammate". They observe and act alike, but where walls divide a layout, each starts in its part.
+    Agents: "ego" and "teammate", with equal spaces. If walls divide the layout, each agent starts on its own side.
     Observation: uint8 (5, 5, C) of each agent, as `icrl4aht_data.overcooked.observe.observe_both` describes.
     Action: 0..5 of each agent (up, down, left, right, stay, interact).
-    Reward: the team's, equal for both, without shaping.
+    Reward: the team's reward without shaping, equal for both agents.
     End: both agents are truncated after `max_steps` steps.
-    Info: of each agent `shaped_reward`, after a step; see `icrl4aht_data.overcooked.rules.shaped_rewards`.
+    Info: `shaped_reward` of each agent after a step; see `icrl4aht_data.overcooked.rules.shaped_rewards`.
 
     Args:
         layout: name of the layout.
-        max_steps: steps of an episode: 100 in the evaluation, 400 in training.
-        channels: the layout's own channels, or the canonical ones, which all layouts share.
+        max_steps: steps of an episode: 100 in evaluation, 400 in training.
+        channels: "own" for the layout's observation channels, "canonical" for channels that all layouts share.
         render_mode: "rgb_array" for pictures, which need Pillow.
 
     Raises:
-        UnknownNameError: for a layout, channels or a render mode that does not exist.
-        OptionError: for a number of steps below 1.
+        UnknownNameError: if the layout, the channels or the render mode do not exist.
+        OptionError: if the number of steps is below 1.
     """
 
-    metadata: dict[str, Any] = {"name": "icrl4aht_v0", "render_modes": RENDER_MODES, "render_fps": 5}  # noqa: RUF012 - declared so by the base class
+    metadata: dict[str, Any] = {"name": "icrl4aht_v0", "render_modes": RENDER_MODES, "render_fps": 5}  # noqa: RUF012 - type of the base class
 
     def __init__(
         self,
@@ -74,10 +74,10 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         self.possible_agents = list(AGENT_NAMES)
         self.agents: list[str] = []
         shape = observation_shape(self.layout, channels == "canonical")
-        # One object per agent and environment: PettingZoo wants equal spaces in every call, and seeds them.
+        # PettingZoo seeds these spaces, and requires the same objects in every call.
         self._observed = {agent: spaces.Box(0, 255, shape, np.uint8) for agent in AGENT_NAMES}
         self._played = {agent: spaces.Discrete(len(ACTIONS)) for agent in AGENT_NAMES}
-        self._start, self._step = _compiled(self.layout, channels == "canonical")
+        self._start, self._step = _compiled_functions(self.layout, channels == "canonical")
         self._random, _ = seeding.np_random()
         self._running: EnvState | None = None
 
@@ -85,11 +85,11 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         return f"{type(self).__name__}({self.layout.name}, episodes of {counted_noun(self.max_steps, 'step')})"
 
     def observation_space(self, agent: str) -> spaces.Box:
-        """Return the space of an agent's observations."""
+        """Return the observation space of an agent."""
         return self._observed[agent]
 
     def action_space(self, agent: str) -> spaces.Discrete:
-        """Return the space of an agent's actions."""
+        """Return the action space of an agent."""
         return self._played[agent]
 
     def reset(
@@ -98,15 +98,15 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         """Start an episode.
 
         Args:
-            seed: seed of the draws of this episode and those that follow.
-            options: `state`, uint8 (S,): the state record to start from instead of a drawn one. Others are ignored, as
-                PettingZoo's test of environments expects.
+            seed: seed of the random draws of this episode and all later episodes.
+            options: `state`, uint8 (S,): the state record to start from; by default a random state. Other options are
+                ignored, as PettingZoo's test of environments expects.
 
         Returns:
             The first observation of each agent, and empty infos.
 
         Raises:
-            OptionError: for an impossible state.
+            OptionError: if the state is impossible.
         """
         if seed is not None:
             self._random, _ = seeding.np_random(seed)
@@ -123,15 +123,15 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         """Play one step with an action 0..5 of each agent.
 
         Returns:
-            Observations, rewards, terminations, truncations and infos of both agents; see the class.
+            Observations, rewards, terminations, truncations and infos of both agents, as the class describes.
 
         Raises:
-            OptionError: if no episode is running, or for actions that are missing or do not exist.
+            OptionError: if no episode is running, or an action is missing or does not exist.
         """
         if self._running is None or not self.agents:
             raise OptionError("no episode is running: call reset() first")
         if set(actions) != set(AGENT_NAMES):
-            raise OptionError(f"actions: expected those of {' and '.join(AGENT_NAMES)}, found {sorted(actions)}")
+            raise OptionError(f"actions: expected actions of {' and '.join(AGENT_NAMES)}, found {sorted(actions)}")
         both = np.array([check_action(f"action of {agent}", actions[agent]) for agent in AGENT_NAMES], np.int32)
         after, observations, reward, shaped = self._step(self._running, both)
         self._running, ended = after, int(after.clock[0]) >= self.max_steps
@@ -154,7 +154,7 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
         """Return the state record uint8 (S,); see `icrl4aht_data.overcooked.state`.
 
         Raises:
-            OptionError: before the first `reset`.
+            OptionError: if `reset` was not called before.
         """
         if self._running is None:
             raise OptionError("no episode has been started: call reset() first")
@@ -166,8 +166,8 @@ class BothAgentsEnv(ParallelEnv[str, np.ndarray, np.int64]):
 
 
 @lru_cache(maxsize=16)
-def _compiled(layout: Layout, canonical: bool) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return the compiled start of an episode, and its step."""
+def _compiled_functions(layout: Layout, canonical: bool) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return two compiled functions for a layout: start an episode, and play a step."""
     env = Environment(layout)
 
     def start(key, record):

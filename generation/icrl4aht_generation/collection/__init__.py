@@ -1,1 +1,1 @@
-"""Collecting learning histories: one task, and all tasks of a profile."""
+"""Generation of learning histories: one task, or all tasks of a profile."""

@@ -1,4 +1,4 @@
-"""Selects streams of a task and labels them with expert actions (paper, App. F.1 and App. D.1)."""
+"""Select streams (the histories of single environments) and label them with expert actions (paper, App. F.1, D.1)."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from icrl4aht_generation.learners.network import ActorCritic
 
 
 def stream_returns(rewards: np.ndarray) -> np.ndarray:
-    """Return the sum of rewards over each episode's kept steps, float64 (N, E).
+    """Return the episode returns of N streams, float64 (N, E), over the stored steps of each episode.
 
     Args:
-        rewards: int8 (N, T).
+        rewards: rewards of N streams, int8 (N, T).
     """
     return rewards.reshape(len(rewards), -1, KEPT_STEPS).sum(axis=-1, dtype=np.float64)
 
 
 def best_streams(returns: np.ndarray, keep: int, least_improvement: float | None = None) -> np.ndarray:
-    """Return the numbers of the streams with the highest end + improvement, best first: int (n,), n <= keep.
+    """Return the streams with the highest final return plus improvement, best first: indices int (n,), n <= keep.
 
     Args:
         returns: (N, E), episode returns of a learner's streams.
-        keep: how many at most.
-        least_improvement: only streams whose end exceeds their start by this; None for all.
+        keep: maximum number of streams.
+        least_improvement: minimum improvement from a stream's initial to its final return; None for no minimum.
     """
     start, end = curve_ends(returns)
     order = np.argsort(-stream_score(returns), kind="stable")
@@ -51,16 +51,16 @@ def select_streams(
 ) -> list[np.ndarray]:
     """Select up to `keep` streams from all learners of a task together; see `best_streams`.
 
-    Streams are divided equally among learners with enough of them: in each round every learner adds its next best one,
-    starting with the learner whose stream is best.
+    Learners take turns: in each round every learner adds its next best stream, and the learner with the best stream of
+    the round comes first.
 
     Args:
         returns: for each learner (N, E), episode returns of its streams.
-        keep: how many in all at most.
-        least_improvement: only streams whose end exceeds their start by this; None for all.
+        keep: maximum number of streams of all learners together.
+        least_improvement: minimum improvement from a stream's initial to its final return; None for no minimum.
 
     Returns:
-        for each learner int (n,), best first; the sum of all n is at most `keep`.
+        Indices of each learner's selected streams, int (n,), best first; the sum of all n is at most `keep`.
     """
     candidates = [best_streams(of_learner, keep, least_improvement) for of_learner in returns]
     turns = [
@@ -73,11 +73,11 @@ def select_streams(
 
 
 def filter_report(before: np.ndarray, after: np.ndarray, least_improvement: float | None = None) -> StreamFilter:
-    """Return mean returns at the start and at the end of learning, before the filter and after it.
+    """Return the mean initial and final return of all streams and of the selected streams.
 
     Args:
         before: (N, E), episode returns of all streams.
-        after: (n, E), those of the selected streams.
+        after: (n, E), episode returns of the selected streams.
         least_improvement: minimum improvement of the selected streams.
     """
     sides = []
@@ -93,10 +93,10 @@ def relabel(layout: Layout, network: ActorCritic, params: Any, states: np.ndarra
     The recurrent state is zero at the start of each episode, as in training.
 
     Args:
-        layout: the layout.
+        layout: layout of the stream.
         network: the ego's network.
         params: parameters of the checkpoint that labels.
-        states: uint8 (T, S).
+        states: state records of the stream, uint8 (T, S).
     """
     return _by_step(_compiled_greedy(layout, network.widths)(params, _by_episode(states)))
 
@@ -108,15 +108,15 @@ def oracle_labels(layout: Layout, states: np.ndarray, actions: np.ndarray) -> np
     took, and chooses its own action at each state.
 
     Args:
-        layout: the layout.
-        states: uint8 (T, S).
-        actions: int8 (T,), the ego's.
+        layout: layout of the stream.
+        states: state records of the stream, uint8 (T, S).
+        actions: the ego's actions, int8 (T,).
     """
     return _by_step(_compiled_oracle(layout)(_by_episode(states), _by_episode(actions)))
 
 
 def _by_episode(stream: np.ndarray) -> jax.Array:
-    """Reshape (T, ...) to (100, E, ...): step in the episode first."""
+    """Reshape a stream (T, ...) to (100, E, ...), with the step of the episode as first axis."""
     return jnp.asarray(stream.reshape(-1, KEPT_STEPS, *stream.shape[1:]).swapaxes(0, 1))
 
 
@@ -127,7 +127,7 @@ def _by_step(labels: jax.Array) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array], jax.Array]:
-    """Return a compiled map from parameters and records (100, E, S) to greedy actions, int8 (100, E)."""
+    """Return a compiled function of parameters and state records (100, E, S) that returns greedy actions (100, E)."""
     network = ActorCritic(widths)
 
     @jax.jit
@@ -142,26 +142,26 @@ def _compiled_greedy(layout: Layout, widths: Widths) -> Callable[[Any, jax.Array
 
 @lru_cache(maxsize=8)
 def _compiled_oracle(layout: Layout) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Return a compiled map from records (100, E, S) and ego actions (100, E) to oracle actions, int8 (100, E)."""
+    """Return a compiled function of state records (100, E, S) and ego actions (100, E) that returns oracle actions."""
     return jax.jit(lambda records, taken: follow_oracle(layout, records, taken).astype(jnp.int8))
 
 
 def follow_oracle(
     layout: Layout | Sequence[Layout], records: jax.Array, taken: jax.Array, numbers: jax.Array | None = None
 ) -> jax.Array:
-    """Return what the scripted oracle would do in each state of episodes in which another ego acted.
+    """Return the actions that the scripted oracle would take in each state of episodes that another ego played.
 
     Args:
-        layout: the layout, or several.
+        layout: one layout or several.
         records: uint8 (T, E, S), state records of E episodes.
-        taken: int (T, E), the ego's actions.
-        numbers: int (E,), number of each episode's layout; None for one layout.
+        taken: int (T, E), the actions that the ego took.
+        numbers: int (E,), index of each episode's layout; None for one layout.
 
     Returns:
-        int32 (T, E).
+        The oracle's actions, int32 (T, E).
     """
     env, script = Environment(layout), oracle(layout)
-    keys = jax.random.split(jax.random.key(0), records.shape[1])  # without effect: the oracle draws nothing
+    keys = jax.random.split(jax.random.key(0), records.shape[1])  # no effect: the oracle is deterministic
     zero = jnp.zeros(len(keys), jnp.int32)
 
     def step(memory: Any, now: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:

@@ -1,12 +1,12 @@
-"""One task of the sources `noise` and `search` -> the files of its artefact, without a learner.
+"""Generate the artefact of a task with a scripted source, `noise` or `search`, without a learner.
 
-A task takes seconds, so a killed one is made again from its start, with the same bits.
+A task takes seconds, so a killed task restarts from the beginning; the result is identical.
 
-The artefact has the arrays of `task_folder`, and
+Besides the arrays that `task_folder` describes, the artefact contains:
 
   metrics.jsonl       one line for each history: its mean returns at the start and at the end
   script_actions.npy  int8 (N, T), the script's action at every step, which the ego took unless it acted at random
-  noise.npy           float32 (N, E), every episode's chance of a random action
+  noise.npy           float32 (N, E), the chance of a random action in every episode
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from icrl4aht_generation.collection.curate import stream_returns
 from icrl4aht_generation.collection.scripted_rollout import (
     noise_schedules,
     play_scripted_histories,
-    scripted_pieces,
+    scripted_batches,
 )
 from icrl4aht_generation.collection.task import TEAMMATE_NOISE
 from icrl4aht_generation.collection.task_folder import (
@@ -41,11 +41,11 @@ from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 from icrl4aht_generation.teammates.registry import build_teammate
 
-_LINE_BYTES = 100  # line of a history in metrics, and of a piece in timing
+_LINE_BYTES = 100  # upper bound of the bytes of a line in metrics or timing
 
 
 def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return shapes and dtypes of an artefact's arrays: fields of `ScriptedEpisodes` by history, and chances."""
+    """Return the shape and dtype of every array in a scripted artefact, by name."""
     actions, chances = SCRIPT_ARRAYS
     return array_shapes(layout, config.histories, config.episodes) | {
         actions: ((config.histories, config.episodes * KEPT_STEPS), "int8"),
@@ -54,31 +54,31 @@ def _array_shapes(layout: Layout, config: NoiseConfig) -> dict[str, tuple[tuple[
 
 
 def scripted_bytes(layout: Layout, config: NoiseConfig) -> int:
-    """Return the size of an artefact."""
+    """Return the size of a scripted artefact in bytes."""
     return arrays_bytes(_array_shapes(layout, config)) + (config.histories + config.episodes) * _LINE_BYTES
 
 
 def play_histories(
     work: Work, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
 ) -> None:
-    """Play the histories of a task into a partial artefact, see `collection.job.CollectionJob`."""
+    """Play the histories of a task with a script, and write them to a partial artefact."""
     task, config = work.task, profile.scripted_on(work.task.layout.name, work.source)
     layout = None if task.teammate["kind"] == "heuristic" else task.layout
     teammate = build_teammate(layout, task.teammate, TEAMMATE, TEAMMATE_NOISE, suite)
-    schedules, pieces = noise_schedules(config, task.seed), scripted_pieces(work.source, config)
+    schedules, batches = noise_schedules(config, task.seed), scripted_batches(work.source, config)
     needed = scripted_bytes(task.layout, config)
     shutil.rmtree(partial, ignore_errors=True)  # left by a killed run
     partial.mkdir(parents=True)
     with reserve_disk(partial, needed):
         with closing(ArrayWriter(partial, _array_shapes(task.layout, config))) as writer:
             writer.arrays["noise"][:] = schedules
-            played = play_scripted_histories(task.layout, teammate, task.seed, work.source, pieces, schedules)
-            for number, (piece, episodes) in enumerate(played):
+            played = play_scripted_histories(task.layout, teammate, task.seed, work.source, batches, schedules)
+            for number, (batch, episodes) in enumerate(played):
                 jax.block_until_ready(episodes)
                 with writer.recording():
                     for name, values in episodes._asdict().items():
-                        writer.arrays[name].reshape(*schedules.shape, *values.shape[1:])[piece] = values
-                timing = writer.timing(len(piece[0]) * KEPT_STEPS)
+                        writer.arrays[name].reshape(*schedules.shape, *values.shape[1:])[batch] = values
+                timing = writer.timing(len(batch[0]) * KEPT_STEPS)
                 writer.log.write(timing={"update": number} | timing)
                 on_update(number + 1, timing["steps_per_second"])
             ends = zip(*curve_ends(stream_returns(writer.arrays["rewards"])), strict=True)

@@ -1,11 +1,11 @@
-"""Roll-outs of the sources `noise` and `search`, in which a script acts, sometimes at random.
+"""Rollouts of the sources `noise` and `search`, in which a script plays the ego and some actions are random.
 
 Source `noise`: the scripted oracle plays, and the chance of a random action falls over a history. Noise distillation
 (Zisman et al. 2024, "Emergence of In-Context Reinforcement Learning from Noise Distillation") makes learning histories
-without learning. An episode is a pure function of the task's seed, its history's number, its own number and its chance.
+without learning. An episode depends only on the task's seed, the numbers of history and episode, and its chance.
 
-Source `search`: the scripted searcher plays, which finds out the wanted dish and remembers it. An episode also depends
-on those before it in its history. Whatever else is in a batch changes nothing for either source.
+Source `search`: a script finds out which dish the teammate wants, and remembers it. An episode also depends on the
+earlier episodes of its history. For both sources, the other episodes of a batch make no difference.
 
 Shapes: `N` histories, `E` episodes of each, `M` episodes of one batch, `S` bytes of a state record.
 """
@@ -27,46 +27,46 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_generation.env import Environment, EnvState
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
-from icrl4aht_generation.experts.padded import own_layout, padded_layout
-from icrl4aht_generation.experts.search import SITUATION_SEARCHER, padded_dishes, with_taken
+from icrl4aht_generation.experts.padded import padded_layout, unpadded_layout
+from icrl4aht_generation.experts.search import SITUATION_SEARCHER, padded_dishes, with_taken_action
 from icrl4aht_generation.learners.rollout import Player, init_rollout, policy_player, roll_out, select_rows
 from icrl4aht_generation.policy import Policy, sometimes_random
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
 EPISODES_AT_ONCE = 256
-"""Episodes of one batch of the source `noise`. A constant, since a matrix product of another size may round the logits
-of a learned teammate differently."""
+"""Number of episodes in a batch of the source `noise`; with another size, a learned teammate's logits may round
+differently."""
 
 _NOISE = 2
-"""Number that an episode's key is folded with for the draws of the noise; see `Environment.episode_key`."""
+"""Number folded into an episode's key to draw random actions; see `Environment.episode_key`."""
 
 
 def noise_schedules(config: NoiseConfig, seed: int) -> np.ndarray:
     """Return the chance of a random action in every episode, float32 (N, E); see `NoiseConfig`.
 
     Args:
-        config: ranges that each history's schedule is drawn from.
+        config: ranges from which the schedule of each history is drawn.
         seed: the task's seed.
     """
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(_keys(seed)[0], jnp.arange(config.histories))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(_task_keys(seed)[0], jnp.arange(config.histories))
     drawn = np.asarray(jax.vmap(lambda key: jax.random.uniform(key, (5,)))(keys), np.float64)[..., None]
     ranges = (config.start, config.end, config.begin, config.finish, config.power)
     start, end, begin, finish, power = (low + (high - low) * drawn[:, k] for k, (low, high) in enumerate(ranges))
     share = np.linspace(0, 1, config.episodes)
     length = finish - begin
     fallen = np.where(length > 0, (share - begin) / np.where(length > 0, length, 1), share >= finish).clip(0, 1)
-    # Rounded, so that the last bits of a platform's `power` do not matter.
+    # Rounding hides that the last bits of a power differ between platforms.
     return np.round(end + (start - end) * (1 - fallen) ** power, 6).astype(np.float32)
 
 
 class ScriptedEpisodes(NamedTuple):
-    """M episodes of 100 steps.
+    """M recorded episodes of 100 steps in which a script played the ego.
 
     Attributes:
         state: uint8 (M, 100, S), state records before each step.
-        actions: int8 (M, 100), the ego's actions, clean or random.
-        teammate_actions: int8 (M, 100).
-        rewards: int8 (M, 100), the team's, unshaped.
+        actions: int8 (M, 100), the ego's actions: the script's or random ones.
+        teammate_actions: int8 (M, 100), the teammate's actions.
+        rewards: int8 (M, 100), the team's rewards without shaping.
         episode_end_state: uint8 (M, S), state records after the last step.
         script_actions: int8 (M, 100), the script's actions.
     """
@@ -80,7 +80,7 @@ class ScriptedEpisodes(NamedTuple):
 
 
 class NoisyChoice(NamedTuple):
-    """Actions of the noisy ego in one step of M environments.
+    """Actions of a script with random actions in one step of M environments.
 
     Attributes:
         action: int32 (M,), the action taken.
@@ -91,52 +91,52 @@ class NoisyChoice(NamedTuple):
     clean: Int[Array, " M"]
 
 
-Piece = tuple[np.ndarray, np.ndarray]
-"""Episodes that are played at once: numbers of their histories and of the episodes in these, int (M,) each."""
+EpisodeBatch = tuple[np.ndarray, np.ndarray]
+"""Episodes that are played at once: history numbers and episode numbers, int (M,) each."""
 
 
-def scripted_pieces(source: str, config: NoiseConfig) -> list[Piece]:
-    """Return the pieces of a task, in the order in which they are played."""
-    if source == "search":  # one episode of all histories, because the script remembers those before
+def scripted_batches(source: str, config: NoiseConfig) -> list[EpisodeBatch]:
+    """Return the batches of episodes of a task, in the order of play."""
+    if source == "search":  # one episode of all histories at once, because the script remembers earlier episodes
         histories = np.arange(config.histories)
         return [(histories, np.full_like(histories, episode)) for episode in range(config.episodes)]
     episodes = config.histories * config.episodes
     found = []
     for first in range(0, episodes, EPISODES_AT_ONCE):
-        # The last piece repeats the last episode: equal sizes share one compilation.
+        # The last batch is filled up with copies of the last episode: equal sizes share one compilation.
         numbers = np.minimum(first + np.arange(EPISODES_AT_ONCE), episodes - 1)
         found.append(np.divmod(numbers, config.episodes))
     return found
 
 
 def play_scripted_histories(
-    layout: Layout, teammate: Policy, seed: int, source: str, pieces: Sequence[Piece], schedules: np.ndarray
-) -> Iterator[tuple[Piece, ScriptedEpisodes]]:
-    """Play the pieces of a task; compiled once for all heuristics of one family on all layouts of a size.
+    layout: Layout, teammate: Policy, seed: int, source: str, batches: Sequence[EpisodeBatch], schedules: np.ndarray
+) -> Iterator[tuple[EpisodeBatch, ScriptedEpisodes]]:
+    """Play batches of a task's episodes, with one compilation per teammate family and size class of layouts.
 
-    A piece is played while its predecessor is used.
+    The device plays the next batch while the caller uses the yielded batch.
 
     Args:
-        layout: the layout, with the dish of the task.
-        teammate: the teammate: a heuristic that sees a `Situation`, or a learned one of this layout.
+        layout: layout of the task, with the task's recipes.
+        teammate: a heuristic that sees a `Situation`, or a learned teammate of this layout.
         seed: the task's seed.
         source: "noise" or "search".
-        pieces: see `scripted_pieces`.
+        batches: batches of episodes, see `scripted_batches`.
         schedules: float32 (N, E), the chance of a random action in every episode.
 
     Yields:
-        The piece, and its episodes.
+        Each batch with its recorded episodes.
     """
-    padded = padded_layout(layout, by_size=True) if teammate.sees == "situation" else own_layout(layout)
+    padded = padded_layout(layout, by_size=True) if teammate.sees == "situation" else unpadded_layout(layout)
     tables, expert, own = padded
     searches = source == "search"
     params = {"oracle": expert, "dishes": padded_dishes([layout])} if searches else expert
-    play, last = _program(teammate._replace(params=()), searches), None
-    memory = _blank_memories(params, len(pieces[0][0])) if searches else None
-    for history, episode in pieces:
+    play, last = _compiled_play(teammate._replace(params=()), searches), None
+    memory = _blank_memories(params, len(batches[0][0])) if searches else None
+    for history, episode in batches:
         where = history.astype(np.int32), episode.astype(np.int32)
         chance = schedules[history, episode]
-        played, memory = play(tables, params, teammate.params, _keys(seed)[1], *where, chance, memory)
+        played, memory = play(tables, params, teammate.params, _task_keys(seed)[1], *where, chance, memory)
         state, end = played.state[..., own], played.episode_end_state[..., own]
         if last is not None:
             yield last
@@ -146,18 +146,18 @@ def play_scripted_histories(
 
 
 def scripted_episode_keys(seed: int, history: np.ndarray, episode: np.ndarray) -> Key[Array, " M"]:
-    """Return the keys of the environments in which some episodes of a task are played, each its first episode.
+    """Return the environment keys of some episodes of a task; every episode is the first of its environment.
 
     Args:
         seed: the task's seed.
         history: int (M,), number of each episode's history.
-        episode: int (M,), its number in the history.
+        episode: int (M,), number of each episode in its history.
     """
-    return _episode_keys(_keys(seed)[1], history.astype(np.int32), episode.astype(np.int32))
+    return _episode_keys(_task_keys(seed)[1], history.astype(np.int32), episode.astype(np.int32))
 
 
-def _keys(seed: int) -> Key[Array, " 2"]:
-    """Return two keys of a task: of its schedules, and of its episodes."""
+def _task_keys(seed: int) -> Key[Array, " 2"]:
+    """Return two keys of a task: one for the noise schedules, one for the episodes."""
     return jax.random.split(jax.random.key(seed))
 
 
@@ -167,11 +167,10 @@ def _episode_keys(key: Key[Array, ""], history: Any, episode: Any) -> Key[Array,
 
 
 @lru_cache(maxsize=64)
-def _program(teammate: Policy, searches: bool) -> Callable[..., tuple[ScriptedEpisodes, Any]]:
-    """Return a compiled function of tables, parameters of script and teammate, a key, episodes, and memories.
+def _compiled_play(teammate: Policy, searches: bool) -> Callable[..., tuple[ScriptedEpisodes, Any]]:
+    """Return a compiled function that plays a batch of episodes and returns the searcher's memories after them.
 
-    The memories are the searcher's before the episodes, ignored in the first of a history; the function also returns
-    those after them.
+    The function ignores the given memories in the first episode of a history.
     """
     script = SITUATION_SEARCHER if searches else SITUATION_ORACLE
 
@@ -184,7 +183,7 @@ def _program(teammate: Policy, searches: bool) -> Callable[..., tuple[ScriptedEp
         if searches:
             own = select_rows(episode == 0, start.memories[EGO], memory)
             start = start._replace(memories=(own, start.memories[TEAMMATE]))
-        # The roll-out's own key is not used: heuristics have keys of their own, and learned teammates act greedily.
+        # The rollout's key has no effect: heuristics use their own keys, and learned teammates act greedily.
         carry, rollout = roll_out(env, players, start, KEPT_STEPS, key)
         choice: Any = rollout.choices[EGO]
 
@@ -196,7 +195,7 @@ def _program(teammate: Policy, searches: bool) -> Callable[..., tuple[ScriptedEp
             actions=by_episode(choice.action),
             teammate_actions=by_episode(rollout.actions[..., TEAMMATE]),
             rewards=by_episode(rollout.reward),
-            episode_end_state=carry.env.record,  # training episodes have more steps, so none has been reset
+            episode_end_state=carry.env.record,  # not reset yet: training episodes have more steps
             script_actions=by_episode(choice.clean),
         )
         return episodes, carry.memories[EGO] if searches else None
@@ -205,16 +204,16 @@ def _program(teammate: Policy, searches: bool) -> Callable[..., tuple[ScriptedEp
 
 
 def _blank_memories(params: Any, count: int) -> Any:
-    """Return zeros in the shape of `count` memories of the searcher."""
+    """Return `count` memories of the searcher, filled with zeros."""
     shape = jax.eval_shape(SITUATION_SEARCHER.init, params, jax.random.key(0))
     return jax.tree.map(lambda leaf: np.zeros((count, *leaf.shape), leaf.dtype), shape)
 
 
 def _noisy_script(env: Environment, script: Policy, params: Any, chance: Float[Array, " M"]) -> Player:
-    """Return a script as agent 0 of M environments, each with its own chance of a random action.
+    """Return a player of agent 0 in M environments that follows a script, or acts at random with a given chance.
 
-    It remembers the action that was taken, as an observer of the episode would; so the recorded states and actions
-    determine what it would do at every state.
+    The script remembers the action that was taken, so the recorded states and actions determine the script's action in
+    every state.
     """
     player = policy_player(env, script, params, EGO, chance.shape[0])
     fold = jax.vmap(jax.random.fold_in)
@@ -223,6 +222,6 @@ def _noisy_script(env: Environment, script: Policy, params: Any, chance: Float[A
         choice, memory = player.act(memory, state, key)
         own = fold(env.episode_key(state), jnp.full_like(state.clock, _NOISE))
         action = jax.vmap(sometimes_random)(fold(own, state.clock), chance, choice.action)
-        return NoisyChoice(action, choice.action), with_taken(memory, action)
+        return NoisyChoice(action, choice.action), with_taken_action(memory, action)
 
     return player._replace(act=act)

@@ -1,7 +1,7 @@
-"""One task of the source `ppo` -> the files of its artefact.
+"""Generate the artefact of a task with source `ppo`: train an ego and record its histories.
 
-The learner's state is saved at intervals, always after the histories that it led to. A killed task resumes from there,
-and since an update is a pure function of the state, the artefact has the bits of an uninterrupted run.
+The learner's state is saved at intervals, after the histories recorded so far. A killed task resumes from the last
+save. Every update is a pure function of the state, so the artefact is identical to that of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from icrl4aht_generation.profiles import Profile, Work
 from icrl4aht_generation.teammates.registry import build_teammate
 
 TEAMMATE_NOISE: Noise = "seeded"
-"""Heuristic teammates of training histories draw from each episode's own key."""
+"""Noise of heuristic teammates in training histories: a new key in every episode."""
 
 TASK_SAVE_SECONDS = 30.0
-"""Interval of saves: the work that a kill can cost."""
+"""Seconds between two saves; a killed task loses at most the work of this time."""
 
 
 def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Learner:
@@ -47,7 +47,7 @@ def make_learner(task: Task, profile: Profile, suite: Path | None = None) -> Lea
 def learn_histories(
     work: Work, profile: Profile, partial: Path, on_update: OnUpdate, suite: Path | None, save_seconds: float
 ) -> None:
-    """Train the ego of a task and record its histories into a partial artefact, see `collection.job.CollectionJob`."""
+    """Train the ego of a task, and record its histories in a partial artefact."""
     task, saved = work.task, StateFile(partial / LEARNER, artefact_settings(work, profile) | software_versions())
     learner = make_learner(task, profile, suite)
     first, init, key = saved_progress(saved), jax.jit(learner.init), learner_key(work)
@@ -56,7 +56,7 @@ def learn_histories(
 
     with reserve_disk(partial, needed):
         interval = SaveInterval(learner.config.updates, seconds=save_seconds)
-        unwritten: Any = None  # written while the device plays the next update
+        unwritten: Any = None  # the rollout to write while the device computes the next update
         with closing(ArtefactWriter(partial, task, learner.config, first)) as writer:
             for number in range(first, learner.config.updates):
                 state, rollout, metrics = update(state)
@@ -72,7 +72,7 @@ def learn_histories(
 
 
 def saved_progress(saved: StateFile) -> int:
-    """Return the number of pieces saved under the same settings; if there are none, empty the folder and return 0."""
+    """Return the number of updates saved under the same settings; without a save, empty the folder and return 0."""
     try:
         done = saved.progress
     except OtherSettingsError:  # made by another profile or version, so it cannot be resumed
@@ -84,6 +84,6 @@ def saved_progress(saved: StateFile) -> int:
 
 
 def learner_key(work: Work) -> Any:
-    """Return the typed key of a learner: the task's seed decides the first one's, the others' are independent of it."""
+    """Return the typed JAX key of a learner; the learners of a task have independent keys from the task's seed."""
     key = jax.random.key(work.task.seed)
     return jax.random.fold_in(key, work.learner) if work.learner else key

@@ -1,14 +1,14 @@
-"""A task's artefact on disk: its files, when it counts as finished, and how it is filled.
+"""Files of a task's artefact on disk, and functions that write and validate them.
 
-<task_id>/            finished: its hashes match; -l1 behind the id for a second learner, and so on
+<task_id>/            finished artefact: all hashes match; the name of a second learner's artefact ends in -l1
   metadata.json       task, settings, versions, SHA-256 of the files below
   state.npy actions.npy teammate_actions.npy rewards.npy episode_end_state.npy
   metrics.jsonl       one line per update
-  checkpoints/c<k>/   policy.safetensors policy.json, the ego at evenly spaced moments; the last one is the final ego
-  timing.jsonl        wall-clock figures, not hashed
+  checkpoints/c<k>/   policy.safetensors policy.json, the ego after evenly spaced updates; the last is the final ego
+  timing.jsonl        seconds and steps per second, not hashed
   labeller_returns.json   added by packing, not hashed
 <task_id>.partial/    the same files while the task runs, and the last saved state, `learner.safetensors`
-.<task_id>.lock       held by the collector that works on it
+.<task_id>.lock       lock of the process that generates the artefact
 """
 
 from __future__ import annotations
@@ -54,24 +54,24 @@ from icrl4aht_generation.profiles import Profile, Work
 
 METADATA, LEARNER = "metadata.json", "learner.safetensors"
 LABELLER_RETURNS = "labeller_returns.json"
-"""File that packing adds: what the ego's checkpoints earn as labellers."""
+"""File with the mean returns of the ego's checkpoints, which packing adds to choose the labeller."""
 
-_LINE_BYTES = 600  # field of an update's number, in metrics and timing
+_LINE_BYTES = 600  # upper bound of the bytes of an update's lines in metrics and timing
 
 
 SCRIPT_ARRAYS = ("script_actions", "noise")
-"""Arrays that artefacts of scripted sources have besides those of `HistoryArrays`, see `collection.scripted`."""
+"""Arrays in artefacts of scripted sources that `HistoryArrays` does not list, see `collection.scripted`."""
 
 
 class HistoryArrays(NamedTuple):
-    """N histories of E episodes and T = 100 E steps; NumPy arrays or memory maps.
+    """Arrays of N histories with E episodes and T = 100 E steps; NumPy arrays or memory maps.
 
     Attributes:
         state: uint8 (N, T, S), state records before each step.
         actions: int8 (N, T), the ego's sampled actions.
-        teammate_actions: int8 (N, T).
-        rewards: int8 (N, T), the team's, unshaped.
-        episode_end_state: uint8 (N, E, S), state records after each episode's last kept step.
+        teammate_actions: int8 (N, T), the teammate's actions.
+        rewards: int8 (N, T), the team's rewards without shaping.
+        episode_end_state: uint8 (N, E, S), state records after the last stored step of each episode.
     """
 
     state: np.ndarray
@@ -95,15 +95,15 @@ def array_shapes(layout: Layout, histories: int, episodes: int) -> dict[str, tup
 
 
 def arrays_bytes(shapes: Mapping[str, tuple[tuple[int, ...], str]]) -> int:
-    """Return the uncompressed size of arrays, given their shapes and dtypes by name."""
+    """Return the uncompressed size in bytes of arrays, given their shapes and dtypes by name."""
     return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in shapes.values())
 
 
 def record_rollout(histories: HistoryArrays, update: int, rollout: Rollout) -> None:
-    """Write the kept steps of one roll-out into the histories.
+    """Write the steps of a rollout that are stored into the histories.
 
-    All environments start together and never end early, so the number of a step determines its episode and its clock;
-    writing a roll-out twice changes nothing, which a resumed task relies on.
+    All environments start episodes in the same steps, so a step's number determines its episode and its clock. Writing
+    a rollout twice changes nothing, so a resumed task may write it again.
     """
     length = rollout.record.shape[0]
     step = np.arange(update * length, (update + 1) * length)
@@ -122,17 +122,17 @@ def record_rollout(histories: HistoryArrays, update: int, rollout: Rollout) -> N
 
 
 def partial_folder(folder: Path) -> Path:
-    """Return the path of an artefact that is not finished."""
+    """Return the folder of an artefact while it is not finished."""
     return folder.with_name(f"{folder.name}.partial")
 
 
 def checkpoint_path(folder: Path, number: int) -> Path:
-    """Return the folder of the ego's checkpoint of this number in an artefact."""
+    """Return the folder of the ego's checkpoint with a given number in an artefact."""
     return folder / "checkpoints" / f"c{number}"
 
 
 def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
-    """Return the settings that an artefact depends on, as JSON has them; if any of them changes, it is made again."""
+    """Return all settings that an artefact depends on, as JSON values; if any changes, the artefact is outdated."""
     settings: dict[str, Any] = {
         "task": asdict(work.task),
         "source": work.source,
@@ -145,7 +145,7 @@ def artefact_settings(work: Work, profile: Profile) -> dict[str, Any]:
     else:
         ego = profile.ego_on(layout)
         settings |= {"ego_hash": json_hash(asdict(ego)), "checkpoint_updates": checkpoint_updates(ego)}
-    return json.loads(json.dumps(settings))  # lists, as in the file, not tuples
+    return json.loads(json.dumps(settings))  # turns tuples into lists, as in the stored file
 
 
 def hashed_files(work: Work, profile: Profile) -> list[str]:
@@ -159,7 +159,7 @@ def hashed_files(work: Work, profile: Profile) -> list[str]:
 
 
 def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
-    """Return whether a folder has this artefact under these settings, with all its files unchanged."""
+    """Return whether a folder contains the complete artefact of these settings with unchanged files."""
     settings = artefact_settings(work, profile)
     try:
         metadata = parse_json(read_text(folder / METADATA))
@@ -171,10 +171,10 @@ def is_task_finished(folder: Path, work: Work, profile: Profile) -> bool:
 
 
 def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
-    """Disk space of an unfinished artefact: histories, checkpoints, log, and two copies of the learner's state.
+    """Return the disk space in bytes of an unfinished artefact, including two copies of the learner's state.
 
     Args:
-        task: the task.
+        task: task of the artefact.
         config: the ego's hyper-parameters.
         state: the learner's state.
     """
@@ -185,16 +185,16 @@ def needed_bytes(task: Task, config: PPOConfig, state: Any) -> int:
 
 @contextmanager
 def reserve_disk(partial: Path, needed: int) -> Iterator[None]:
-    """Check that a disk has room for an artefact, and turn errors of a full disk into a `DiskFullError`.
+    """Check that the disk has space for an artefact, and raise errors of a full disk as `DiskFullError`.
 
-    An artefact without a saved state to resume from is removed.
+    If the disk is full, an artefact without a saved state to resume from is removed.
 
     Args:
-        partial: the unfinished artefact.
-        needed: its size in bytes.
+        partial: folder of the unfinished artefact.
+        needed: disk space of the artefact in bytes.
 
     Raises:
-        DiskFullError: if the disk is full; names the folder and the needed space.
+        DiskFullError: if the disk is full; the message names the folder and the needed space.
     """
     try:
         if not (partial / LEARNER).exists() and needed > shutil.disk_usage(partial).free:
@@ -213,7 +213,7 @@ def reserve_disk(partial: Path, needed: int) -> Iterator[None]:
 
 
 def finish_artefact(partial: Path, work: Work, profile: Profile) -> None:
-    """Write the metadata, the last file; the artefact is complete, and `publish_artefact` renames it."""
+    """Write the metadata file of an artefact, which completes its partial folder."""
     settings = artefact_settings(work, profile) | {"profile": profile.name}
     if work.source == "ppo":
         settings |= {"ego": asdict(profile.ego_on(work.task.layout.name))}
@@ -228,27 +228,27 @@ def finish_artefact(partial: Path, work: Work, profile: Profile) -> None:
 
 
 def publish_artefact(partial: Path, folder: Path) -> None:
-    """Rename a complete artefact to its final name."""
+    """Rename a complete artefact from its partial folder to its final folder."""
     (partial / LEARNER).unlink(missing_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
     partial.rename(folder)
 
 
 class ArrayWriter:
-    """Fills the arrays and the log of a partial artefact, piece by piece.
+    """Writer of the arrays and the log of a partial artefact.
 
-    The arrays are memory maps of files whose space on the disk is allocated at the start. `sync` writes them out and
-    maps them again, so that memory holds only what came since the last `sync`.
+    The arrays are memory maps of files with disk space allocated at the start. `sync` flushes the arrays and maps them
+    again, so memory only holds data written after the last `sync`.
 
     Args:
         partial: an existing folder.
-        shapes: name of an array -> its shape and dtype.
+        shapes: shape and dtype of each array by name.
         is_new: whether to create the files.
-        kept: lines of the log with an `update` from this number on are cut off.
+        kept: number of updates for which lines of an existing log are kept; later lines are removed.
 
     Attributes:
-        arrays: name -> memory map.
-        log: the log of metrics and timing.
+        arrays: memory map of each array by name.
+        log: log of metrics and timing.
 
     Raises:
         OSError: if the disk is full.
@@ -263,23 +263,22 @@ class ArrayWriter:
             for name, (shape, dtype) in shapes.items():
                 new_mapped_array(partial / f"{name}.npy", shape, np.dtype(dtype))
         self.log = RunLog(partial, keep=lambda line: line["update"] < kept)
-        self.arrays = self._mapped()
+        self.arrays = self._map_arrays()
 
-    def _mapped(self) -> dict[str, Any]:
+    def _map_arrays(self) -> dict[str, Any]:
         return {name: np.lib.format.open_memmap(self._partial / f"{name}.npy", "r+") for name in self._names}
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """Count the time that is spent within this context as time of recording."""
+        """Context manager that adds the time inside it to the seconds spent on recording."""
         began = time.perf_counter()
         yield
         self._recording += time.perf_counter() - began
 
     def timing(self, steps: int) -> dict[str, float]:
-        """Return the timing after a recorded piece of some steps.
+        """Return the steps per second, the seconds in all and the seconds spent on recording, after `steps` more steps.
 
-        Timing counts from the end of the first piece, which includes compiling: `steps_per_second`, `seconds`, and how
-        many of these were spent on `recording`.
+        The numbers start at the end of the first batch, because the first batch includes compilation.
         """
         now = time.perf_counter()
         self._steps, seconds = self._steps + steps, now - self._started
@@ -288,17 +287,17 @@ class ArrayWriter:
             "seconds": round(seconds, 6),
             "recording": round(self._recording, 6),
         }
-        # The first piece is compiled, which says nothing about the speed of the others.
+        # The first batch includes compilation, so measure the speed from the second batch on.
         if not self._has_written:
             self._started, self._steps, self._recording, self._has_written = now, 0, 0.0, True
         return timing
 
     def sync(self) -> None:
-        """Force everything written so far to the disk, and out of memory."""
+        """Flush everything written so far to the disk, and release its memory."""
         with self.recording():
             for array in self.arrays.values():
                 array.flush()
-            self.arrays = self._mapped()
+            self.arrays = self._map_arrays()
             self.log.sync()
 
     def close(self) -> None:
@@ -308,13 +307,13 @@ class ArrayWriter:
 
 
 class ArtefactWriter(ArrayWriter):
-    """Fills an artefact's histories, metrics and timing, update by update.
+    """Writer of an artefact's histories, metrics and timing after each update of the ego.
 
     Args:
         partial: an existing folder.
-        task: the task.
+        task: task of the artefact.
         config: the ego's hyper-parameters.
-        first: the first update to write; 0 creates the files, otherwise the log is cut at that update.
+        first: the first update to write; 0 creates the files, a larger number removes later lines of the log.
 
     Raises:
         OSError: if the disk is full.
@@ -325,7 +324,7 @@ class ArtefactWriter(ArrayWriter):
         self._task, self._config = task, config
 
     def write(self, number: int, rollout: Any, metrics: dict[str, Any]) -> float:
-        """Record one update; returns the steps per second."""
+        """Record one update, and return the average steps per second so far."""
         jax.block_until_ready((rollout, metrics))
         with self.recording():
             record_rollout(HistoryArrays(**self.arrays), number, rollout)
@@ -338,7 +337,7 @@ class ArtefactWriter(ArrayWriter):
         return timing["steps_per_second"]
 
     def save(self, saved: StateFile, state: Any, updates: int) -> None:
-        """Save the learner's state after everything that led to it is on the disk."""
+        """Flush the histories to the disk, then save the learner's state."""
         self.sync()
         with self.recording():
             saved.save(state, updates)
@@ -346,7 +345,7 @@ class ArtefactWriter(ArrayWriter):
     def write_checkpoint(self, updates: int, network: ActorCritic, params: Any) -> None:
         """Write and sync a checkpoint of the ego if this number of updates is among `checkpoint_updates`.
 
-        Call before the state after these updates is saved, so that a resumed task has all checkpoints.
+        Call this before `save`, so that a resumed task has all checkpoints.
         """
         moments = checkpoint_updates(self._config)
         if updates in moments:
@@ -356,5 +355,5 @@ class ArtefactWriter(ArrayWriter):
 
 
 def last_timing(folder: Path) -> dict[str, Any] | None:
-    """Return the last line of an artefact's timing, finished or not; None if there is none yet."""
+    """Return the last timing line of an artefact, finished or not; None before the first line."""
     return last_line(partial_folder(folder) / TIMING) or last_line(folder / TIMING)

@@ -1,4 +1,4 @@
-"""What the oracle knows of a layout before it starts: reach, ways and their times, where it would be in the way. NumPy.
+"""Facts about a layout that the oracle uses, computed in advance with NumPy: reachable cells and travel times.
 
 Shapes: `cells` cells, `P` pots, `O` obstacles. All times are in steps.
 """
@@ -16,31 +16,31 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.tables import Array, Tables, stack_padded
 
 FAR = 1000
-"""Time to a cell that cannot be reached, or only when the teammate steps aside; stored as NOWHERE."""
+"""Steps to a cell that cannot be reached, or not while the teammate blocks the way; stored as NOWHERE."""
 
 NEVER = 10_000
-"""Cost of what cannot or should not be done."""
+"""Cost of actions that are impossible or undesirable."""
 
 
 class LayoutFacts(NamedTuple):
-    """Knowledge of a layout, computed before the ego starts; NumPy until a program makes it an argument.
+    """Facts about a layout, computed before an episode: NumPy arrays, or traced arrays in a compiled function.
 
     Attributes:
         matters: bool (), whether the ego can serve, or reaches a pot or a counter that the teammate also reaches.
-        serves: bool (), whether the ego can plate and deliver.
+        serves: bool (), whether the ego can plate and deliver soups.
         mate_serves: bool (), whether the teammate can plate and deliver the ego's soups.
-        shares_room: bool (), whether both agents walk in one room.
+        shares_room: bool (), whether both agents can walk on the same cells.
         mine: bool (cells,), cells that the ego can face.
         shared: bool (cells,), cells that both agents can face.
         pots: bool (P,), pots that the ego reaches, of all pots of the layout.
         recipes: uint8 (R,), item bytes of the layout's recipes.
         piles: bool (3, cells), piles of each ingredient that the ego can face.
-        passed: bool (P,), pots that the teammate, walking from its piles, leaves for a nearer one.
-        obstacle: uint8 (cells,), number of the obstacle if the teammate is on a cell: 0, none, in rooms that are apart.
-        ways: uint8 (O, cells, cells), steps until the ego on a cell faces another one that it does not face yet.
+        passed: bool (P,), pots that are farther from the teammate's piles than another pot of the ego.
+        obstacle: uint8 (cells,), index in `ways` for each cell of the teammate; 0 (no obstacle) in separate rooms.
+        ways: uint8 (O, cells, cells), steps from each cell until the ego faces each other cell, around an obstacle.
         leg: uint8 (cells, P), steps from facing a cell to facing a pot, without a teammate in the way.
         trip: int32 (P, 3), steps to carry a piece of each ingredient from its pile to a pot and to return.
-        hindrance: int16 (3, cells, cells), see `_hindrance`.
+        hindrance: int16 (3, cells, cells), how much an ego that waits hinders the teammate; see `_hindrance`.
     """
 
     matters: Array
@@ -66,9 +66,9 @@ def stack_facts(layouts: Sequence[Layout]) -> LayoutFacts:
 
 
 def study_layout(layout: Layout) -> LayoutFacts:
-    """Return the facts of a layout."""
+    """Compute the facts of one layout."""
     kinds, tables = layout.kinds, layout.tables
-    # Reach is what the agents can face, not where they can stand: counters between two rooms belong to both.
+    # An agent reaches the cells that it can face, so both agents reach a counter between their rooms.
     mine, theirs = (np.isin(np.arange(layout.cells), layout.ahead[room]) for room in layout.rooms)
     shared = mine & theirs
     cells = np.array(layout.pots, int)
@@ -78,14 +78,14 @@ def study_layout(layout: Layout) -> LayoutFacts:
     piles = np.zeros((3, layout.cells), bool)
     for number, ingredient in enumerate(layout.ingredients):
         piles[number] = (layout.piles == layout.ingredient_item(ingredient)) & mine
-    # A teammate that carries ingredients to its nearest pot leaves the others free for soups in advance.
-    their_way = np.zeros(len(cells), int)
+    # A teammate carries ingredients to its nearest pot, so the ego can cook ahead in the other pots.
+    their_steps = np.zeros(len(cells), int)
     for pile in np.flatnonzero((kinds == PILE) & theirs):
         for start in np.flatnonzero((layout.ahead == pile).any(axis=1) & layout.walkable):
-            their_way += _far(tables.target_distance[start, cells], NEVER)
-    passed = their_way > their_way[pots].min(initial=NEVER)
+            their_steps += _steps_or_far(tables.target_distance[start, cells], NEVER)
+    passed = their_steps > their_steps[pots].min(initial=NEVER)
 
-    # In a room of its own the ego never meets the teammate, so one table of ways without an obstacle is enough.
+    # In separate rooms the teammate never blocks the ego, so one table of ways without an obstacle is enough.
     shares_room = np.array_equal(*layout.rooms)
     obstacles = np.array([-1, *(layout.rooms[EGO] if shares_room else [])], int)
     number = np.zeros(layout.cells, np.uint8)
@@ -94,7 +94,7 @@ def study_layout(layout: Layout) -> LayoutFacts:
     leg = np.full((layout.cells, layout.cells), FAR)
     room = layout.rooms[EGO]
     from_facing = np.where(
-        layout.ahead[room][:, :, None] == np.arange(layout.cells), 0, _far(ways[0, room], FAR)[:, None]
+        layout.ahead[room][:, :, None] == np.arange(layout.cells), 0, _steps_or_far(ways[0, room], FAR)[:, None]
     )
     np.minimum.at(leg, layout.ahead[room], from_facing)
     trip = np.where(piles[:, :, None], leg + leg.T + 2, FAR).min(axis=1).T[cells]
@@ -117,12 +117,12 @@ def study_layout(layout: Layout) -> LayoutFacts:
     )
 
 
-def _far(steps: np.ndarray, far: int) -> np.ndarray:
+def _steps_or_far(steps: np.ndarray, far: int) -> np.ndarray:
     return np.where(steps == NOWHERE, far, steps.astype(int))
 
 
 def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
-    """Return `LayoutFacts.ways`: walk as near as possible, then make the move that ends facing the cell."""
+    """Return `LayoutFacts.ways`: the steps of the shortest walk whose last move ends facing a cell."""
     room = layout.rooms[EGO].astype(int)
     position = np.zeros(layout.cells, int)  # index of each cell within the ego's room
     position[room] = range(len(room))
@@ -133,7 +133,7 @@ def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
     for action in range(4):
         end = ends[..., action]
         faced = layout.ahead[end, FACING_OF[action]].astype(int)
-        # Two cells at most lead to facing the same one: one from which the agent walks, one where it only turns.
+        # At most two cells lead to facing the same cell: from one the agent walks, on the other it only turns.
         for walks in (False, True):
             obstacle, start = np.nonzero((end != room) == walks)
             own = obstacle[:, None], room, faced[obstacle, start][:, None]
@@ -142,17 +142,17 @@ def _shortest_ways(layout: Layout, obstacles: np.ndarray) -> np.ndarray:
 
 
 def _walking_steps(ends: np.ndarray) -> np.ndarray:
-    """Return the steps from each cell of a room to each other one, uint8 (O, room, room), at most NOWHERE - 2.
+    """Return the steps from each cell of a room to each other cell, uint8 (O, room, room), at most NOWHERE - 2.
 
     Args:
-        ends: number of the cell in the room to which a move leads, int (O, room, actions).
+        ends: index within the room of the cell that each move leads to, int (O, room, actions).
     """
     steps = np.where(np.eye(ends.shape[1], dtype=bool), 0, np.uint8(NOWHERE - 2))
     steps = np.tile(steps.astype(np.uint8), (len(ends), 1, 1))
     each = np.arange(len(ends))[:, None]
     total = None
-    while total != (total := int(steps.sum())):  # until no way becomes shorter
-        for action in range(ends.shape[2]):  # each uses what those before it found, which halves the passes
+    while total != (total := int(steps.sum())):  # until no walk becomes shorter
+        for action in range(ends.shape[2]):  # updating in place between actions halves the number of passes
             after = np.minimum(steps[each, ends[..., action]], NOWHERE - 3)
             np.minimum(steps, after + 1, out=steps)
     return steps
@@ -161,11 +161,11 @@ def _walking_steps(ends: np.ndarray) -> np.ndarray:
 def _hindrance(layout: Layout, tables: Tables) -> np.ndarray:
     """Return how much the ego would hinder the teammate by waiting on a cell, (3, teammate's cell, ego's cell).
 
-    The first axis is what the teammate carries: a dish, a plate or an ingredient, or nothing. The next cell of each way
-    that the teammate may be taking counts 16, cells next to that one 8, and cells from which something other than a
-    counter is used 4.
+    The first axis is what the teammate carries: 0 a dish, 1 a plate or an ingredient, 2 nothing. The next cell of each
+    way that the teammate may take counts 16, the neighbours of this cell 8, and cells in front of goals, pots, piles
+    and plates 4.
     """
-    # The ego does not know the teammate's target: every cell where the teammate could use what it carries is one.
+    # The teammate's target is unknown: any cell where the teammate could use what it carries may be the target.
     used = np.isin(layout.kinds, [GOAL, POT, PILE, PLATES])[layout.ahead].any(axis=1) & layout.walkable
     hindrance = np.tile(4 * used, (3, layout.cells, 1)).astype(np.int16)
     near = (8 * np.maximum(2 - tables.distance.astype(int), 0)).astype(np.int16)

@@ -1,13 +1,13 @@
 """Scripted ego that sees the complete state, to estimate how much an ego can add to the return of `stay`.
 
-It is agent 0. It fills one pot at a time with the ingredients that the recipe still needs, fetches the plate so that it
-arrives when the soup is done, and delivers only soups of the current recipe; it puts other soups on a counter until
-its recipe comes up. With a second pot it cooks ahead. It learns what to expect of the teammate by watching: it leaves
-the work to one that cooks and delivers, and forestalls one that does only half of that. It hands nothing over, which no
-layout rewards. It never presses a button, and stays in layouts where it cannot matter. It is deterministic.
+The oracle is agent 0 and deterministic. It fills one pot at a time with the ingredients that the recipe still needs,
+fetches a plate in time for the soup, and delivers only soups of the current recipe; other soups wait on a counter.
+With a second pot the oracle cooks ahead. It watches the teammate: it leaves the work to a teammate that cooks and
+delivers, but acts before a teammate that does only half of this. It hands over no items, because no layout rewards
+this, never presses a button, and does not move on layouts where it cannot contribute.
 
-Shapes: `P` pots, `Q` recipes that it may cook (the current one, then the layout's), `S` bytes of a state record. All
-times are in steps. Arrays of pots have entries for pots that the ego does not reach, which no mask selects.
+Shapes: `P` pots, `Q` recipes that the ego may cook (the current recipe, then the layout's), `S` bytes of a state
+record. All times are in steps. Arrays of pots contain pots that the ego cannot reach, but no mask selects these pots.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _DISH = np.uint8(PLATE | COOKED)
 
 
 class OracleMemory(NamedTuple):
-    """Memory of the ego, which is kept from one episode to the next.
+    """Memory of the oracle, which lasts from one episode to the next.
 
     Attributes:
         record: uint8 (S,), state record before the previous step.
@@ -58,7 +58,7 @@ class OracleMemory(NamedTuple):
 
 
 def oracle(layout: Layout | Sequence[Layout]) -> Policy:
-    """Return the scripted ego.
+    """Return the oracle, a scripted ego.
 
     Args:
         layout: one layout, for a policy that sees its state records; or several layouts, for a policy that sees a
@@ -70,35 +70,35 @@ def oracle(layout: Layout | Sequence[Layout]) -> Policy:
 
 
 def oracle_params(layouts: Sequence[Layout]) -> Any:
-    """Return the parameters of `SITUATION_ORACLE` for some layouts: their facts, and an empty state record."""
+    """Return the parameters of `SITUATION_ORACLE`: the facts of some layouts, and an empty state record."""
     return stack_facts(layouts), np.zeros(record_size(*layouts), np.uint8)
 
 
-def _begin(params: Any, key: Key[Array, ""]) -> OracleMemory:
+def _initial_memory(params: Any, key: Key[Array, ""]) -> OracleMemory:
     zero, no = jnp.int32(0), jnp.asarray(False)
     return OracleMemory(jnp.asarray(params[1]), zero + STAY, zero, zero, zero, no, no, no)
 
 
 def _act(params: Any, memory: OracleMemory, view: Situation, key: Key[Array, ""]):
-    # The facts of all layouts are stacked, so that one program plays any of them.
+    # The facts of all layouts are stacked, so one compiled function plays any layout.
     facts = LayoutFacts(*(jnp.asarray(leaf)[view.layout] for leaf in params[0]))
     scene = Scene(view.tables, view.record, EGO)
-    memory = _remember(scene, memory)
-    action = jnp.where(facts.matters, _decide(_view_state(facts, scene, memory)), STAY).astype(jnp.int32)
+    memory = _update_memory(scene, memory)
+    action = jnp.where(facts.matters, _choose_action(_view_state(facts, scene, memory)), STAY).astype(jnp.int32)
     return action, memory._replace(action=action)
 
 
-SITUATION_ORACLE = Policy((), _begin, _act, "situation")
-"""The ego for any layouts; its parameters are `oracle_params` of these."""
+SITUATION_ORACLE = Policy((), _initial_memory, _act, "situation")
+"""The oracle for any layouts; the `params` to set are `oracle_params` of the layouts."""
 
 
-def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
-    """Return the memory updated by a state; `action` remains the previous action."""
+def _update_memory(scene: Scene, last: OracleMemory) -> OracleMemory:
+    """Return the memory updated by a new state; `action` is still the previous action."""
     new, old = scene.state, unpack(scene.tables, last.record)
     same = jnp.all(new.pot_items == old.pot_items) & (new.recipe == old.recipe)
     ego_rests, mate_rests = new.positions[EGO] == old.positions[EGO], new.positions[TEAMMATE] == old.positions[TEAMMATE]
     bumped = ego_rests & mate_rests & (jnp.asarray(scene.tables.moves)[scene.me, last.action] != scene.me)
-    # What left the teammate's hand went onto a counter, into a pot or out: the counters and pots tell which.
+    # The counters and pots show whether the teammate put its item onto a counter, into a pot or into a goal.
     had = old.hands[TEAMMATE]
     put = (had >> 2 > 0) & (new.hands[TEAMMATE] == 0)
     onto_counter = jnp.any((new.counters > 0) & (old.counters == 0))
@@ -116,7 +116,7 @@ def _remember(scene: Scene, last: OracleMemory) -> OracleMemory:
 
 
 class OracleView(NamedTuple):
-    """Features of one state from the ego's point of view; arrays are traced.
+    """Features of one state from the ego's point of view, as traced arrays.
 
     Attributes:
         facts: facts of the layout.
@@ -130,12 +130,12 @@ class OracleView(NamedTuple):
         timers: int32 (P,), steps until a pot's soup is done.
         full: bool (P,), whether a pot has three ingredients.
         right: bool (P,), full pots with the current recipe, done or not.
-        recipes: uint8 (Q,), the recipes.
+        recipes: uint8 (Q,), item bytes of the recipes that the ego may cook.
         stock: int32 (Q,), soups of each recipe that need no more ingredients.
         missing: int32 (P, Q, 3), ingredients that each pot still needs for each recipe; negative for surplus.
         risky: bool (), the teammate is likely to take any soup out of the ego's pots, also a wrong one.
-        careful: bool (), the teammate also fills them, and a wrong soup keeps it from cooking the right one.
-        mate_delivers: bool (), the teammate is about to change the recipe.
+        careful: bool (), the teammate also fills these pots, where a wrong soup would block the right soup.
+        mate_delivers: bool (), the teammate is about to deliver a right soup, which changes the recipe.
     """
 
     facts: LayoutFacts
@@ -158,11 +158,11 @@ class OracleView(NamedTuple):
 
     @property
     def dish(self) -> UInt8[Array, ""]:
-        """The current recipe's soup on a plate."""
+        """Item byte of the current recipe's soup on a plate."""
         return self.recipes[0] | _DISH
 
     def cost(self, mask: Bool[Array, " cells"] | np.ndarray, then: Array | int = 0) -> Int[Array, " cells"]:
-        """Return the time to the cells of a mask plus the time that follows; NEVER for other cells."""
+        """Return the steps to each cell of a mask plus the later steps `then`; NEVER for other cells."""
         return jnp.where(mask & self.facts.mine, self.time + then, NEVER)
 
     @property
@@ -171,55 +171,55 @@ class OracleView(NamedTuple):
         return self.time[jnp.minimum(jnp.asarray(self.scene.tables.pots), self.time.shape[0] - 1)]
 
     @property
-    def leg(self) -> Int[Array, "cells P"]:
+    def steps_to_pots(self) -> Int[Array, "cells P"]:
         """Steps from facing each cell to facing each pot."""
         return _steps(jnp.asarray(self.facts.leg))
 
-    def at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
-        """Return the time to some of the pots plus the time that follows; NEVER for other cells."""
+    def cost_at_pots(self, which: Bool[Array, " P"], then: Array | int = 0) -> Int[Array, " cells"]:
+        """Return the steps to each cell of the given pots plus the later steps `then`; NEVER for other cells."""
         there = jnp.where(which & self.facts.pots, self.pot_times + then, NEVER)
-        return jnp.where(self.scene.static(POT), self.scene.at(POT, there), NEVER)
+        return jnp.where(self.scene.cells_of_kind(POT), self.scene.at(POT, there), NEVER)
 
     @property
-    def parking(self) -> Int[Array, " cells"]:
-        """Cost of putting an item down: out of the teammate's reach, or near a pot if the ego only fills pots."""
+    def parking_cost(self) -> Int[Array, " cells"]:
+        """Cost of putting an item on each counter: low out of the teammate's reach, or near a pot if it only cooks."""
         facts = self.facts
-        near = 2 * jnp.min(self.leg, axis=1, initial=FAR)
+        near = 2 * jnp.min(self.steps_to_pots, axis=1, initial=FAR)
         return self.cost(self.scene.empty_counters, jnp.where(facts.serves, 3 * jnp.asarray(facts.shared), near))
 
     @property
-    def plates(self) -> Bool[Array, " cells"]:
+    def plate_cells(self) -> Bool[Array, " cells"]:
         """Cells where the ego can take a plate."""
         return (self.scene.plate_piles | (self.items == PLATE)) & self.facts.mine
 
     @property
-    def plans(self) -> Int[Array, "P Q"]:
-        """Cost of cooking each recipe in each pot: the recipe least in stock first, then the least work."""
+    def plan_costs(self) -> Int[Array, "P Q"]:
+        """Cost of cooking each recipe in each pot: prefers recipes with few soups in stock, then little work."""
         trip = jnp.asarray(self.facts.trip)[:, None]
         enough = jnp.all((self.missing >= 0) & ((self.missing == 0) | (trip < FAR)), axis=-1)
         # A surplus ingredient makes a recipe impossible: nothing can be taken out of a pot.
         possible = enough & (self.facts.pots & ~self.full)[:, None]
         current, short = self.recipes == self.recipes[0], self.stock[0] == 0
-        # With a cooking teammate: cook nothing ahead in a pot that it uses, unless nothing else is left to do.
+        # If the teammate cooks, cook ahead only in pots it does not use, or when the current recipe is impossible.
         wanted = jnp.where(short, current, jnp.asarray(self.facts.passed)[:, None]) | (short & ~jnp.any(possible[:, 0]))
         work = jnp.sum(self.missing * jnp.minimum(trip, FAR // 10), axis=-1)
-        # A soup in stock outweighs any walk, which is shorter than 200 steps.
+        # A soup in stock counts more than any walk, because walks are shorter than 200 steps.
         return jnp.where(possible & (wanted | ~self.careful), 200 * (self.stock - current + 1) + work, NEVER)
 
     @property
-    def spoiled(self) -> Bool[Array, " P"]:
-        """Pots whose contents fit no recipe, to be filled up with anything and cleared if nothing else helps."""
-        nowhere = self.facts.pots & ~self.full & (self.contents > 0) & (jnp.min(self.plans, axis=1) == NEVER)
+    def spoiled_pots(self) -> Bool[Array, " P"]:
+        """Pots with contents that fit no recipe, which the ego fills up and clears if no other pot is left."""
+        nowhere = self.facts.pots & ~self.full & (self.contents > 0) & (jnp.min(self.plan_costs, axis=1) == NEVER)
         return nowhere & (self.stock[0] == 0) & self.facts.serves
 
     @property
-    def clears(self) -> Bool[Array, ""]:
-        """Whether soups of no current recipe have to leave their pots."""
-        return self.risky | ((self.stock[0] == 0) & (jnp.min(self.plans[:, 0]) == NEVER))
+    def must_clear(self) -> Bool[Array, ""]:
+        """Whether the ego must take wrong soups out of pots."""
+        return self.risky | ((self.stock[0] == 0) & (jnp.min(self.plan_costs[:, 0]) == NEVER))
 
     @property
-    def mate_takes(self) -> Bool[Array, " P"]:
-        """Soup left to the teammate to serve: the first right one, if it also cooks and does not idle."""
+    def left_to_teammate(self) -> Bool[Array, " P"]:
+        """Soups left for the teammate to serve: the first right soup, if the teammate also cooks and is not idle."""
         first = jnp.arange(len(self.timers)) == jnp.argmin(jnp.where(self.right, self.timers, NEVER))
         elsewhere = (self.scene.partner_hand & COOKED > 0) | (
             self.scene.holds_plate & (self.scene.partner_hand != PLATE)
@@ -229,11 +229,11 @@ class OracleView(NamedTuple):
         return self.right & first & self.careful & ~self.memory.parks & ~elsewhere & ~idles
 
     @property
-    def too_early(self) -> Bool[Array, " P"]:
+    def waiting_pots(self) -> Bool[Array, " P"]:
         """Pots in front of which the ego waits instead of interacting."""
         hand, mixed = self.scene.hand, self.contents + self.scene.hand
         completes = self.careful & (ingredient_count(mixed) == 3)
-        # A wrong soup, or a second one, should finish soon after one that the teammate waits for.
+        # Start a wrong or a second soup only while a right soup still needs at least WAIT_LIMIT steps.
         ahead = (mixed != self.recipes[0]) | (self.stock[0] > 0)
         spoils = ahead & ~jnp.any(self.right & (self.timers >= WAIT_LIMIT))
         leaves_it = (self.scene.partner_hand == hand) & (self.memory.calm < WAIT_LIMIT)
@@ -244,7 +244,7 @@ class OracleView(NamedTuple):
 
 def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> OracleView:
     state, mine = scene.state, jnp.asarray(facts.mine)
-    # Obstacle 0 is none, also if the teammate stands where it is in nobody's way.
+    # Obstacle 0 means that the teammate blocks no way of the ego.
     obstacle = jnp.asarray(facts.obstacle)[scene.partner].astype(jnp.int32)
     faced = jnp.asarray(scene.tables.ahead)[scene.me, state.facings[EGO].astype(jnp.int32)]
     items = scene.at(WALL, state.counters)
@@ -254,7 +254,7 @@ def _view_state(facts: LayoutFacts, scene: Scene, memory: OracleMemory) -> Oracl
     recipes = jnp.concatenate([state.recipe[None], jnp.asarray(facts.recipes)])
     cooked = (full[:, None] & (contents[:, None] == recipes)).sum(axis=0)
     plated = ((items[:, None] == recipes | _DISH) & mine[:, None]).sum(axis=0) + (scene.hand == recipes | _DISH)
-    # A teammate that never held a plate takes no soups, whatever the layout allows.
+    # Assume that a teammate which has never held a plate takes no soups.
     risky = memory.plates & facts.mate_serves
     return OracleView(
         facts,
@@ -281,8 +281,8 @@ def _steps(stored: UInt8[Array, "*B"]) -> Int[Array, "*B"]:
     return jnp.where(stored < NOWHERE, stored.astype(jnp.int32), FAR)
 
 
-def _way(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Array, ""]) -> Int[Array, ""]:
-    """Return the first action of the shortest way around an obstacle to facing a cell; INTERACT if it is faced."""
+def _first_move(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Array, ""]) -> Int[Array, ""]:
+    """Return the first action of the shortest way to face a cell around an obstacle; INTERACT if already faced."""
     scene, ahead = view.scene, jnp.asarray(view.scene.tables.ahead)
     ends = jnp.asarray(scene.tables.moves)[scene.me, :STAY].astype(jnp.int32)
     # The teammate is the obstacle: a move onto its cell only turns the ego.
@@ -293,11 +293,11 @@ def _way(view: OracleView, obstacle: Int[Array, ""] | int, target: Int[Array, ""
 
 
 class Subgoal(NamedTuple):
-    """A row of the ego's table of decisions: go to the cheapest cell and interact.
+    """Row of the ego's decision table: go to the cheapest cell and interact.
 
     Attributes:
         when: bool (), whether the subgoal applies.
-        cost: int32 (cells,), cost of going to each cell in steps; NEVER for cells that do not serve it.
+        cost: int32 (cells,), cost of going to each cell in steps; NEVER for unsuitable cells.
         reason: purpose of the subgoal, for readers of the code.
     """
 
@@ -306,22 +306,22 @@ class Subgoal(NamedTuple):
     reason: str
 
 
-def _decide(view: OracleView) -> Int[Array, ""]:
+def _choose_action(view: OracleView) -> Int[Array, ""]:
     """Return the action towards the first subgoal that applies and has a cell that can be reached."""
     facts = view.facts
-    rows = _with_dish(view) + _with_plate(view) + _with_ingredient(view) + _with_nothing(view)
+    rows = _dish_subgoals(view) + _plate_subgoals(view) + _ingredient_subgoals(view) + _empty_hand_subgoals(view)
     possible = jnp.stack([row.when & (jnp.min(row.cost) < NEVER) for row in rows])
     target = jnp.argmin(jnp.stack([row.cost for row in rows])[jnp.argmax(possible)])
-    action = _way(view, view.obstacle, target)
+    action = _first_move(view, view.obstacle, target)
     at_pot = (jnp.asarray(view.scene.tables.pots) == target) & facts.pots
-    # An interaction too early would spoil the pot, or be lost.
-    waits = jnp.any(at_pot & view.too_early) & (action == INTERACT)
+    # Interacting too early would spoil the pot or have no effect.
+    waits = jnp.any(at_pot & view.waiting_pots) & (action == INTERACT)
     action = jnp.where(waits, STAY, action)
     alone = jnp.where(jnp.any(possible), action, STAY)
     return jnp.where(facts.shares_room, _act_in_shared_room(view, jnp.any(possible), target, action), alone)
 
 
-def _with_dish(view: OracleView) -> list[Subgoal]:
+def _dish_subgoals(view: OracleView) -> list[Subgoal]:
     scene, facts = view.scene, view.facts
     # A dish on a counter is worth a trip only if the ego can carry it to a goal.
     wanted = (view.items == view.dish) & facts.mine & jnp.any(scene.goals & facts.mine)
@@ -329,88 +329,88 @@ def _with_dish(view: OracleView) -> list[Subgoal]:
     comes = scene.holds_nothing & (scene.partner_hand == view.dish) & ~jnp.any(facts.pots)
     return [
         Subgoal(scene.hand == view.dish, view.cost(scene.goals), "deliver the current recipe"),
-        Subgoal(scene.holds_dish, view.parking, "a wrong delivery costs 20: keep the dish for its recipe"),
-        Subgoal(scene.holds_nothing, view.cost(wanted), "a dish that is ready earns most for its steps"),
-        Subgoal(jnp.any(wanted), view.parking, "a free hand for that dish"),
-        Subgoal(comes, near, "be there when the teammate puts the dish down that only the ego will deliver"),
+        Subgoal(scene.holds_dish, view.parking_cost, "keep a dish for its recipe: a wrong delivery costs 20"),
+        Subgoal(scene.holds_nothing, view.cost(wanted), "take a ready dish: it earns most per step"),
+        Subgoal(jnp.any(wanted), view.parking_cost, "free the hand for a ready dish"),
+        Subgoal(comes, near, "wait where the teammate puts down a dish that only the ego can deliver"),
     ]
 
 
-def _with_plate(view: OracleView) -> list[Subgoal]:
-    holds, building = view.scene.holds_plate, jnp.min(view.plans) < NEVER
-    right = view.right & ~view.mate_takes
+def _plate_subgoals(view: OracleView) -> list[Subgoal]:
+    holds, building = view.scene.holds_plate, jnp.min(view.plan_costs) < NEVER
+    right = view.right & ~view.left_to_teammate
     soon = jnp.min(jnp.where(right, view.timers, NEVER)) <= WAIT_LIMIT
     # The ego waits in front of a soup that is not done, so waiting counts like walking.
     rest = jnp.maximum(view.timers - view.pot_times, 0)
     return [
-        Subgoal(holds & (soon | ~building), view.at_pots(right, rest), "plate the soup of the current recipe"),
+        Subgoal(holds & (soon | ~building), view.cost_at_pots(right, rest), "plate the soup of the current recipe"),
         Subgoal(
-            holds & (view.clears | ~building),
-            view.at_pots(view.full & ~view.right, rest),
+            holds & (view.must_clear | ~building),
+            view.cost_at_pots(view.full & ~view.right, rest),
             "empty a pot of a wrong soup",
         ),
-        Subgoal(holds, view.parking, "no soup for the plate, but ingredients to carry"),
+        Subgoal(holds, view.parking_cost, "put the plate down: no soup needs it, but a pot needs ingredients"),
     ]
 
 
-def _with_ingredient(view: OracleView) -> list[Subgoal]:
+def _ingredient_subgoals(view: OracleView) -> list[Subgoal]:
     holds, kind = view.scene.holds_ingredient, view.scene.counts(view.scene.hand) > 0
     takes = jnp.any((view.missing > 0) & kind, axis=-1)
     # An ingredient for a later recipe goes into a pot only if another pot is left for the current recipe.
-    fits = view.plans[:, 0] < NEVER
+    fits = view.plan_costs[:, 0] < NEVER
     spare = (view.recipes == view.recipes[0]) | (view.stock[0] > 0) | (jnp.sum(fits) > fits)[:, None]
-    plans = jnp.min(jnp.where(takes & (spare | ~jnp.any(fits)), view.plans, NEVER), axis=1)
+    plans = jnp.min(jnp.where(takes & (spare | ~jnp.any(fits)), view.plan_costs, NEVER), axis=1)
     return [
-        Subgoal(holds, view.at_pots(plans < NEVER, plans), "cook: the pot and recipe that cost least"),
-        Subgoal(holds & ~jnp.any(fits), view.at_pots(view.spoiled), "a spoiled pot must be full to be emptied"),
+        Subgoal(holds, view.cost_at_pots(plans < NEVER, plans), "cook the recipe in the pot that cost least together"),
+        Subgoal(holds & ~jnp.any(fits), view.cost_at_pots(view.spoiled_pots), "fill a spoiled pot to clear it"),
         Subgoal(
             holds & ~view.facts.serves,
-            view.at_pots(view.full | view.mate_delivers),
+            view.cost_at_pots(view.full | view.mate_delivers),
             "wait at the pot for the teammate, who serves",
         ),
-        Subgoal(holds, view.parking, "an ingredient that no recipe needs"),
+        Subgoal(holds, view.parking_cost, "put down an ingredient that no recipe needs"),
     ]
 
 
-def _with_nothing(view: OracleView) -> list[Subgoal]:
-    facts, scene, plans = view.facts, view.scene, view.plans
+def _empty_hand_subgoals(view: OracleView) -> list[Subgoal]:
+    facts, scene, plans = view.facts, view.scene, view.plan_costs
     empty = scene.holds_nothing
-    to_pot, first = view.leg, jnp.argmax(facts.pots)
+    to_pot, first = view.steps_to_pots, jnp.argmax(facts.pots)
 
     def fetch(ingredients: Bool[Array, " types"], then: Array) -> Int[Array, " cells"]:
         return view.cost(jnp.any(view.sources & ingredients[:, None], axis=0), then)
 
     def plate_for(which: Bool[Array, " P"], reason: str) -> Subgoal:
         then = jnp.min(jnp.where(which, to_pot, FAR), axis=1)
-        return Subgoal(empty & jnp.any(which), view.cost(view.plates, then), reason)
+        return Subgoal(empty & jnp.any(which), view.cost(view.plate_cells, then), reason)
 
     pot, recipe = jnp.unravel_index(jnp.argmin(plans), plans.shape)
     builds = empty & (jnp.min(plans) < NEVER)
     missing = view.missing[pot, recipe]
-    # The piece in the teammate's hand counts as in the pot, unless the teammate has been carrying it in vain.
+    # Count the teammate's ingredient as already in the pot, unless the pots have not changed for WAIT_LIMIT steps.
     delivering = (scene.partner_hand & PLATE == 0) & (view.memory.calm < WAIT_LIMIT)
     coming = scene.counts(scene.partner_hand) * delivering
     ingredients = fetch(missing > coming, to_pot[:, pot])
     quick = jnp.sum(missing * jnp.asarray(facts.trip)[pot]) <= WAIT_LIMIT - 4
 
-    # The earliest step in which the ego can face each pot with a plate in its hand: first to a plate, then to the pot.
-    arrival = jnp.min(jnp.where(view.plates[:, None], view.time[:, None] + to_pot, NEVER), axis=0)
+    # The earliest step in which the ego can face each pot after it has fetched a plate.
+    arrival = jnp.min(jnp.where(view.plate_cells[:, None], view.time[:, None] + to_pot, NEVER), axis=0)
     due = view.timers <= arrival + 2
-    right = view.right & ~view.mate_takes & facts.serves
-    wrong = view.full & ~view.right & view.clears & facts.serves
+    right = view.right & ~view.left_to_teammate & facts.serves
+    wrong = view.full & ~view.right & view.must_clear & facts.serves
     used = jnp.any(scene.counts(view.recipes) > 0, axis=0)
     return [
         Subgoal(builds & quick & ~view.risky, ingredients, "finish a pot that needs few steps, then fetch a plate"),
-        plate_for(right & due, "the plate arrives when the soup is done"),
+        plate_for(right & due, "fetch a plate so that it arrives when the soup is done"),
         plate_for(wrong & due & view.risky, "take a wrong soup before the teammate serves it"),
-        Subgoal(builds, ingredients, "cook"),
-        plate_for(right, "wait with a plate, as there is nothing to cook"),
+        Subgoal(builds, ingredients, "fetch an ingredient to cook"),
+        plate_for(right, "wait with a plate, because nothing can be cooked"),
         plate_for(wrong, "empty a pot that blocks the current recipe"),
-        Subgoal(empty & jnp.any(view.spoiled), fetch(used, to_pot[:, first]), "fill up a spoiled pot"),
+        Subgoal(empty & jnp.any(view.spoiled_pots), fetch(used, to_pot[:, first]), "fill up a spoiled pot"),
         Subgoal(
             empty & (jnp.any(view.full) | view.mate_delivers) & ~facts.serves,
             fetch(used, to_pot[:, first]),
-            "an ego that only fills pots holds a piece ready for the next soup",
+            "hold an ingredient ready for the next soup, as an ego that only fills pots",
         ),
     ]
 
@@ -422,11 +422,11 @@ def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Ar
     ahead = jnp.asarray(tables.ahead)[scene.partner, scene.state.facings[TEAMMATE].astype(jnp.int32)]
     pushed = (ahead == scene.me) & (still > 0)
     reachable = found & (view.time[target] < FAR)
-    # A teammate on the ego's way may leave it in this very step; one that does not may be waiting for the ego.
+    # A teammate that blocks the way may leave in this step; if it stays, it may be waiting for the ego.
     follows = found & ~reachable & ~pushed & (still < 3)
-    through = _way(view, 0, target)
+    through = _first_move(view, 0, target)
 
-    # What the teammate carries tells where it may be going; see `LayoutFacts.hindrance`.
+    # What the teammate carries shows where it may be going; see `LayoutFacts.hindrance`.
     carries = jnp.where(scene.partner_hand & COOKED > 0, 0, jnp.where(scene.partner_hand > 0, 1, 2))
     ends = jnp.asarray(tables.moves)[scene.me, : STAY + 1].astype(jnp.int32)
     stays = jnp.arange(STAY + 1) == STAY
@@ -436,8 +436,8 @@ def _act_in_shared_room(view: OracleView, found: Bool[Array, ""], target: Int[Ar
     hindrance = jnp.asarray(facts.hindrance)[carries, scene.partner, ends].astype(jnp.int32)
     aside = jnp.argmin(jnp.where(taken, NEVER, hindrance + away - stays))
 
-    # With a plate the ego waits in front of the pot; with anything else it had better step aside than stay.
+    # With a plate the ego waits in front of the pot; otherwise it steps aside instead of staying.
     proceeds = reachable & ((action != STAY) | scene.holds_plate)
     action = jnp.where(proceeds, action, jnp.where(follows, through, aside))
-    # Two agents that step towards one cell block each other for ever, so the ego rests after a failed move.
+    # Two agents that move to the same cell block each other forever, so the ego stays after a failed move.
     return jnp.where(view.memory.bumps % 2 == 1, STAY, action)

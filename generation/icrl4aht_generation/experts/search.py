@@ -1,9 +1,10 @@
-"""Scripted ego that finds out which dish its teammate wants: it tries dishes, and repeats the one that was paid.
+"""Scripted ego that finds out which dish its teammate wants: it tries dishes, and repeats the dish that was rewarded.
 
-It plays like the oracle, but acts on a belief in place of the current recipe. It remembers over the episodes of a task
-which dishes were refused and which one was paid. Until one was paid it believes in the dish that best fits what the
-teammate has put into pots, in random order among equals, and changes its mind only when nothing is being cooked.
-It is meant for tasks that want one dish throughout, see `Task.recipes`.
+The searcher plays like the oracle, but cooks a believed recipe instead of the current recipe. It remembers over the
+episodes of a task which dishes were refused and which dish was paid (rewarded). Before a dish is paid, the searcher
+believes in the dish that best fits the ingredients that the teammate has put into pots, and breaks ties at random. The
+belief changes only while nothing is being cooked. This ego is for tasks that want one dish in all episodes, see
+`Task.recipes`.
 
 Shapes: `D` dishes that can be made of the layout's ingredients, `S` bytes of a state record.
 """
@@ -29,11 +30,11 @@ _FLAGS = np.uint8(PLATE | COOKED)
 _NO_DISH = 0
 
 MOST_DISHES = 10
-"""D: dishes of three pieces that can be made of three ingredients."""
+"""Number D of dishes that can be made of three pieces of three ingredients."""
 
 
 class SearchMemory(NamedTuple):
-    """Memory of the ego, which is kept from one episode to the next.
+    """Memory of the searcher, which lasts from one episode to the next.
 
     Attributes:
         oracle: memory of the oracle; its record has the believed recipe.
@@ -41,7 +42,7 @@ class SearchMemory(NamedTuple):
         refused: bool (D,), dishes that were delivered and not paid.
         paid: bool (D,), the dish that was paid.
         seen: int32 (3,), pieces of each ingredient that the teammate put into pots.
-        belief: int32 (), number of the dish that it cooks.
+        belief: int32 (), index of the dish that the ego cooks.
     """
 
     oracle: OracleMemory
@@ -53,7 +54,7 @@ class SearchMemory(NamedTuple):
 
 
 def searcher(layouts: Layout | Sequence[Layout]) -> Policy:
-    """Return the scripted ego for one layout or several, in the order of their numbers in the environment."""
+    """Return the searcher, a scripted ego, for one layout or for several layouts in the environment's order."""
     known = [layouts] if isinstance(layouts, Layout) else list(layouts)
     return SITUATION_SEARCHER._replace(params={"oracle": oracle_params(known), "dishes": padded_dishes(known)})
 
@@ -67,14 +68,14 @@ def padded_dishes(layouts: Sequence[Layout]) -> np.ndarray:
     return dishes
 
 
-def with_taken(memory: OracleMemory | SearchMemory, action: Int[Array, "*B"]) -> Any:
-    """Return the memory of the oracle or the searcher after another action than its own was taken."""
+def with_taken_action(memory: OracleMemory | SearchMemory, action: Int[Array, "*B"]) -> Any:
+    """Return the memory of the oracle or the searcher with the action that was taken instead of its own action."""
     if isinstance(memory, SearchMemory):
         return memory._replace(oracle=memory.oracle._replace(action=action))
     return memory._replace(action=action)
 
 
-def _begin(params: Any, key: Key[Array, ""]) -> SearchMemory:
+def _initial_memory(params: Any, key: Key[Array, ""]) -> SearchMemory:
     dishes = params["dishes"].shape[-1]
     no = jnp.zeros(dishes, bool)
     order = jax.random.uniform(jax.random.fold_in(key, 1), (dishes,))
@@ -84,7 +85,7 @@ def _begin(params: Any, key: Key[Array, ""]) -> SearchMemory:
 
 def _act(params: Any, memory: SearchMemory, view: Situation, key: Key[Array, ""]) -> tuple[Int[Array, ""], Any]:
     dishes = jnp.asarray(params["dishes"])[view.layout]
-    memory = _learn(memory, view, dishes)
+    memory = _update_belief(memory, view, dishes)
     believed = dishes[memory.belief]
     facts, blank = params["oracle"]
     facts = facts._replace(recipes=jnp.full_like(jnp.asarray(facts.recipes), believed))
@@ -93,14 +94,14 @@ def _act(params: Any, memory: SearchMemory, view: Situation, key: Key[Array, ""]
     return action, memory._replace(oracle=oracle)
 
 
-SITUATION_SEARCHER = Policy((), _begin, _act, "situation")
-"""The ego for any layouts; its parameters are a dictionary of `oracle_params` and `padded_dishes` of these."""
+SITUATION_SEARCHER = Policy((), _initial_memory, _act, "situation")
+"""The searcher for any layouts; the `params` to set are `oracle_params` and `padded_dishes` of the layouts."""
 
 
-def _learn(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"]) -> SearchMemory:
+def _update_belief(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"]) -> SearchMemory:
     """Return the memory updated by what happened in the previous step."""
     new, old = unpack(view.tables, view.record), unpack(view.tables, memory.oracle.record)
-    # The first step of an episode shows no outcome. Its starts are drawn: seldom can both agents have walked there.
+    # The first step of an episode shows no outcome: random starts are rarely one step from the last positions.
     moves = jnp.asarray(view.tables.moves)[old.positions.astype(jnp.int32)]
     follows = jnp.all(jnp.any(moves == new.positions[:, None], axis=1))
     ahead = jnp.asarray(view.tables.ahead)[old.positions.astype(jnp.int32), old.facings.astype(jnp.int32)]
@@ -108,10 +109,10 @@ def _learn(memory: SearchMemory, view: Situation, dishes: UInt8[Array, " D"]) ->
     same_pose = (new.positions == old.positions) & (new.facings == old.facings)
     gave = (old.hands & COOKED > 0) & (new.hands == 0) & at_goal & same_pose & follows
     is_dish = (old.hands[:, None] == dishes | _FLAGS) & gave[:, None]  # (2, D)
-    # If both deliver in one step, the reward does not tell whose dish was right.
+    # If both agents deliver in one step, the reward does not show whose dish was right.
     paid = memory.paid | (is_dish.any(axis=0) & (new.delivered > 0) & ~gave.all())
     refused = memory.refused | (is_dish[EGO] & (new.delivered == 0))
-    # The teammate may know which dish it wants, so what it cooks is a hint, although it may err.
+    # What the teammate cooks is a hint to the wanted dish, although the teammate may make mistakes.
     had = old.hands[TEAMMATE]
     into_pot = jnp.sum(ingredient_count(new.pot_items)) > jnp.sum(ingredient_count(old.pot_items))
     put = (had >> 2 > 0) & (had & PLATE == 0) & (new.hands[TEAMMATE] == 0) & into_pot

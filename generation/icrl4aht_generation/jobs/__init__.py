@@ -1,1 +1,1 @@
-"""A queue of long jobs, run by local processes or Ray: tasks of a rebuild, populations, best responses, trainings."""
+"""A queue of long jobs that run in local processes or with Ray, such as tasks, populations and best responses."""

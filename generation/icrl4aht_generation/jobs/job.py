@@ -1,4 +1,4 @@
-"""What the executors of a queue share: jobs, their outcomes, the log of failures, and the progress."""
+"""Code that the executors of a queue share: jobs, outcomes, the log of failures, and the progress display."""
 
 from __future__ import annotations
 
@@ -14,80 +14,80 @@ from icrl4aht_generation.jobs.options import request_determinism
 from icrl4aht_generation.learners.resume import BusyError, limit_xla_threads
 
 FAILED = "failed.jsonl"
-"""File name of the log of failed jobs and their errors; its `task_id` is the name of the job."""
+"""File name of the log of failed jobs and their errors; the field `task_id` is a job's name."""
 
 OnUpdate = Callable[[int, float], None]
-"""Called with (updates done, steps per second)."""
+"""Function called after an update with the number of finished updates and the steps per second."""
 
 
 class FailedJobsError(Icrl4ahtError):
-    """Error: some jobs have not finished."""
+    """Error: some jobs of a queue failed or did not finish."""
 
 
 class Job(Protocol):
-    """A long computation that makes one folder and resumes by itself. Jobs are pickled for workers."""
+    """A long computation that writes one folder and can resume. Jobs are pickled for worker processes."""
 
     @property
     def name(self) -> str:
-        """Name that no other job of the queue has."""
+        """Name of the job, unique in its queue."""
         ...
 
     @property
     def label(self) -> str:
-        """Name for people."""
+        """Text that describes the job to a person."""
         ...
 
     @property
     def updates(self) -> int:
-        """Number of its updates, the unit of its progress."""
+        """Number of updates of the job; progress is counted in updates."""
         ...
 
     @property
     def xla_threads(self) -> int | None:
-        """Threads of XLA on a CPU, on which its bits depend; None for all cores."""
+        """Number of CPU threads of XLA, which affects the last bits of results; None for all cores."""
         ...
 
     @property
     def is_quick(self) -> bool:
-        """Whether it takes seconds. Quick jobs share a process and what it compiled; others have their own process, so
-        that its memory is released."""
+        """Whether the job takes seconds. Quick jobs share a process and its compiled functions; every other job has a
+        new process, which releases its memory."""
         ...
 
     def is_finished(self) -> bool:
-        """Return whether its result is complete and unchanged."""
+        """Return whether the result of the job is complete and unchanged."""
         ...
 
     def progress(self) -> tuple[int, float] | None:
-        """Return updates done and steps per second as its folder states them, perhaps written by another process."""
+        """Return finished updates and steps per second from the job's folder, perhaps written by another process."""
         ...
 
     def finished_text(self) -> str:
-        """Return the text on the finished job."""
+        """Return a message on the finished job."""
         ...
 
     def run(self, on_update: OnUpdate, wait: bool) -> None:
-        """Do it, or what is left of it.
+        """Run the job, or resume it from its last save.
 
         Args:
             on_update: called after each update.
-            wait: whether to wait for another process that does it.
+            wait: whether to wait while another process runs the job.
 
         Raises:
-            BusyError: if another process does it and this one is not to wait.
+            BusyError: if another process runs the job and `wait` is false.
         """
         ...
 
 
 @dataclass(frozen=True)
 class JobOutcome:
-    """Outcome of a job.
+    """Status of a job after it was run, and its last error.
 
     Attributes:
-        job: the job.
-        status: "done", now or before; "busy", another process does it; "failed".
-        attempts: how often it was tried.
+        job: job that was run.
+        status: "done" if finished now or earlier, "busy" if another process runs the job, or "failed".
+        attempts: number of attempts.
         error: type and message of the last error.
-        trace: its traceback.
+        trace: traceback of the last error.
     """
 
     job: Job
@@ -98,7 +98,7 @@ class JobOutcome:
 
 
 def run_job(job: Job, wait: bool, on_update: OnUpdate = lambda update, speed: None) -> Literal["done", "busy"]:
-    """Run a job in this process."""
+    """Run a job in this process, and return whether it is done or another process is busy with it."""
     try:
         job.run(on_update, wait)
     except BusyError:
@@ -107,7 +107,7 @@ def run_job(job: Job, wait: bool, on_update: OnUpdate = lambda update, speed: No
 
 
 def run_in_worker(job: Job, wait: bool) -> Literal["done", "busy"]:
-    """Run a job in a process that runs nothing but jobs with this number of threads."""
+    """Run a job in a worker process, in which all jobs have the same number of XLA threads."""
     request_determinism()
     if job.xla_threads:
         limit_xla_threads(job.xla_threads)
@@ -115,14 +115,14 @@ def run_in_worker(job: Job, wait: bool) -> Literal["done", "busy"]:
 
 
 def update_failures(path: Path, lines: dict[str, Any]) -> bool:
-    """Write the log of failed jobs that still have no result, one line each. Several processes may share the file.
+    """Update the log of failed jobs, one line for each job; several processes may share the file.
 
     Args:
-        path: the file; without failures there is none.
-        lines: name of a job -> its new line, or None to remove it. Other jobs keep theirs.
+        path: path of the log, which is deleted if no failures remain.
+        lines: new line of each job by name, or None to remove the job's line. Lines of other jobs remain.
 
     Returns:
-        False if the disk is full: the file is unchanged.
+        Whether the log is up to date; False if the disk is full and the log is unchanged.
     """
     try:
         with process_lock(path.with_name(f".{path.name}.lock")):
@@ -142,11 +142,11 @@ def update_failures(path: Path, lines: dict[str, Any]) -> bool:
 
 
 class JobBoard:
-    """Progress display that sums the reports of single jobs.
+    """Progress display that sums the progress of all jobs.
 
     Args:
-        show: function of `progress_bars`.
-        updates: name of each job -> number of its updates.
+        show: display function that `progress_bars` returns.
+        updates: number of updates of each job by name.
     """
 
     def __init__(self, show: Callable[..., None], updates: Mapping[str, int]) -> None:
@@ -156,12 +156,12 @@ class JobBoard:
         self._show()
 
     def show_running(self, name: str, updates: int, steps_per_second: float) -> None:
-        """Show the number of updates that a running job has done."""
+        """Show the number of finished updates of a running job."""
         self._running[name] = updates, steps_per_second
         self._show()
 
-    def show_stated(self, jobs: Iterable[Job]) -> None:
-        """Show what the folders of running jobs state."""
+    def show_recorded(self, jobs: Iterable[Job]) -> None:
+        """Show the progress that is recorded in the folders of running jobs."""
         for job in jobs:
             if progress := job.progress():
                 self.show_running(job.name, *progress)

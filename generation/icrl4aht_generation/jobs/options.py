@@ -14,24 +14,25 @@ from icrl4aht_data.utils.options import Count, Natural, Option, check_options, r
 
 @dataclass(frozen=True)
 class QueueOptions:
-    """Options of running jobs; the help text of each field describes it."""
+    """Options for running jobs; the help text of each field describes the option."""
 
     executor: Annotated[Literal["local", "ray"], Option("Run jobs in processes of this machine, or use Ray.")] = "local"
     address: Annotated[
         str | None, Option("HOST:PORT of a running Ray cluster.", default="start a local Ray for this command")
     ] = None
-    workers: Annotated[Count | None, Option("Jobs at a time.", default="one; with Ray one per GPU, or per core")] = None
+    workers: Annotated[Count | None, Option("Parallel jobs.", default="one; with Ray one per GPU, or per core")] = None
     retries: Annotated[Natural, Option("Further attempts for a job that failed.")] = 0
-    fail_fast: Annotated[bool, Option("Start no job after one has failed.")] = False
+    fail_fast: Annotated[bool, Option("Start no more jobs after one has failed.")] = False
 
     def __post_init__(self) -> None:
         check_options(self)
 
 
 def request_determinism() -> None:
-    """Make XLA choose only GPU operations that give the same bits in every run; call before JAX is first used.
+    """Make XLA choose only deterministic GPU operations; call this before JAX is first used.
 
-    On a CPU all of them do; on a GPU they are chosen by measured speed, and some sum in varying order.
+    Operations on a CPU are deterministic. By default XLA chooses GPU operations by measured speed, and some of these
+    operations sum in varying order.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_gpu_deterministic_ops" not in flags:
@@ -39,19 +40,19 @@ def request_determinism() -> None:
 
 
 queue_options = dataclass_options(QueueOptions, "queue")
-"""Decorator with the options of a queue; the command gets them as `queue`, a dict."""
+"""Decorator that adds the options of a queue to a command, which receives the dict `queue`."""
 
 
 def read_queue_options(queue: dict[str, Any]) -> QueueOptions:
-    """Return the options of a queue that a command was given, and set what JAX reads when it is first used.
+    """Return a command's options of a queue, and set the environment variables that JAX reads at its first use.
 
     Raises:
-        click.UsageError: for options that only another executor has.
+        click.UsageError: if an option is only valid for another executor.
     """
     options = replace_options(QueueOptions(), queue)
     if options.executor == "local" and options.address:
         raise click.UsageError("--address needs --executor ray")
     request_determinism()
-    if options.executor == "ray":  # by default JAX takes most of a GPU's memory at once, which other processes need
+    if options.executor == "ray":  # by default JAX reserves most of a GPU's memory, which other workers need
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     return options

@@ -1,4 +1,4 @@
-"""Jobs in this process, in several local ones or on Ray. Failures are logged, and the other jobs continue."""
+"""Run jobs in this process, in several local processes or on Ray; failures are logged, and other jobs continue."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ from icrl4aht_generation.jobs.options import QueueOptions
 from icrl4aht_generation.jobs.ray_executor import run_on_ray
 
 _POLL_SECONDS = 1.0
-_QUICK_JOBS = 256  # of a process, until its memory is released
+_QUICK_JOBS = 256  # jobs of one process, which is then replaced to release its memory
 
 _Pool = tuple[int | None, ProcessPoolExecutor]
-"""Number of threads, and a pool of one process: a worker that is killed breaks its own pool only."""
+"""Number of XLA threads and a pool of a single process, since a killed worker breaks its whole pool."""
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOptions) -> None:
-    """Do every job that is unfinished.
+    """Run every job that is unfinished.
 
-    Jobs that another process is doing are skipped, and awaited at the end.
+    Jobs that another process is running are skipped at first, and awaited at the end.
 
     Args:
-        jobs: the jobs.
+        jobs: jobs of the queue.
         out: folder of the log of failures.
         console: where outcomes are printed.
-        options: how to run them.
+        options: how to run the jobs.
 
     Raises:
-        FailedJobsError: if a job is unfinished at the end; out/failed.jsonl has the reasons.
+        FailedJobsError: if a job is unfinished at the end; out/failed.jsonl lists the reasons.
     """
     labels = {job.name: f"{number}/{len(jobs)} {job.label}" for number, job in enumerate(jobs, start=1)}
     todo = []
@@ -84,21 +84,21 @@ def run_jobs(jobs: Sequence[Job], out: Path, console: Console, options: QueueOpt
             update_failures(path, lines)
             last_error = outcome.error
             if options.fail_fast:
-                raise FailedJobsError(f"{path}: the first failure: {outcome.error}")
+                raise FailedJobsError(f"{path}: stopped after the first failure: {outcome.error}")
     is_written = update_failures(path, lines)
     if missing:
-        reasons = f"{path} has the reasons"
+        reasons = f"{path} lists the reasons"
         if not is_written:
-            reasons = f"{path} cannot be written, the disk is full; the last failure: {last_error}"
+            reasons = f"{path} cannot be written, because the disk is full; the last failure: {last_error}"
         raise FailedJobsError(
-            f"{len(missing)} of {len(jobs)} jobs are unfinished: {', '.join(sorted(missing))}; {reasons}, and the same "
-            f"command tries them again"
+            f"{len(missing)} of {len(jobs)} jobs are unfinished: {', '.join(sorted(missing))}; {reasons}; repeat the "
+            f"command to try these jobs again"
         )
 
 
 def _run_all(jobs: Sequence[Job], board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
-    """Run every job, then wait for those that another process was doing."""
-    execute = _run_here
+    """Run every job, then wait for jobs that another process was running."""
+    execute = _run_serially
     if options.executor == "ray":
         execute = run_on_ray
     elif (options.workers or 1) > 1:
@@ -115,8 +115,8 @@ def _run_all(jobs: Sequence[Job], board: JobBoard, options: QueueOptions) -> Gen
         jobs = busy
 
 
-def _run_here(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
-    """Run one job after the other in this process."""
+def _run_serially(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
+    """Run the jobs one after another in this process."""
     for job in jobs:
 
         def on_update(updates: int, speed: float, name: str = job.name) -> None:
@@ -126,18 +126,18 @@ def _run_here(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOp
             try:
                 outcome = JobOutcome(job, run_job(job, wait, on_update), attempt)
                 break
-            except Exception as error:  # any error: the other jobs continue
-                outcome = _failed(job, attempt, error)
+            except Exception as error:  # whatever the error is, the other jobs continue
+                outcome = _failed_outcome(job, attempt, error)
         yield outcome  # type: ignore[possibly-undefined]
 
 
 def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
-    """Run several jobs at a time in processes; quick ones share processes, see `Job.is_quick`."""
+    """Run jobs in several parallel processes; quick jobs share processes, see `Job.is_quick`."""
     if not jobs:
         return
     before: Any = None
     if current_thread() is main_thread():
-        # By default SIGTERM would end this process without a word to its workers.
+        # By default SIGTERM would end this process and leave its workers running.
         before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     waiting, running = list(jobs), {}
     idle: list[_Pool] = []
@@ -159,13 +159,13 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
                     pool[1].shutdown(wait=False)
                 if error is None:
                     yield JobOutcome(job, future.result(), attempts[job.name])
-                elif not isinstance(error, Exception):  # an interrupt or exit of the worker: no retry
+                elif not isinstance(error, Exception):  # no retry after an interrupt or exit of the worker
                     raise error
                 elif attempts[job.name] <= options.retries:
                     waiting.append(job)
                 else:
-                    yield _failed(job, attempts[job.name], error)
-            board.show_stated(job for job, _ in running.values())
+                    yield _failed_outcome(job, attempts[job.name], error)
+            board.show_recorded(job for job, _ in running.values())
     finally:
         for _, pool in (*(pool for _, pool in running.values()), *idle):
             pool.shutdown(wait=False, cancel_futures=True)
@@ -177,7 +177,7 @@ def _run_in_processes(jobs: Sequence[Job], wait: bool, board: JobBoard, options:
 
 
 def _start_job(job: Job, wait: bool, idle: list[_Pool]) -> tuple[Future[Any], _Pool]:
-    """Start a job in an idle process with its number of threads, or in a new one."""
+    """Start a job in an idle process with the same number of XLA threads, or in a new process."""
     for number, (threads, pool) in enumerate(idle):
         if threads == job.xla_threads:
             del idle[number]
@@ -185,13 +185,13 @@ def _start_job(job: Job, wait: bool, idle: list[_Pool]) -> tuple[Future[Any], _P
                 return pool.submit(run_in_worker, job, wait), (threads, pool)
             except BrokenExecutor:  # the idle process was killed
                 break
-    if idle:  # its process holds memory that the new one may need
+    if idle:  # an idle process holds memory that the new process may need
         idle.pop()[1].shutdown()
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(1, context, max_tasks_per_child=_QUICK_JOBS)
     return pool.submit(run_in_worker, job, wait), (job.xla_threads, pool)
 
 
-def _failed(job: Job, attempts: int, error: BaseException) -> JobOutcome:
+def _failed_outcome(job: Job, attempts: int, error: BaseException) -> JobOutcome:
     text = f"{type(error).__name__}: {error}"
     return JobOutcome(job, "failed", attempts, text, "".join(traceback.format_exception(error)))

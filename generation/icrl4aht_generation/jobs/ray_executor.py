@@ -1,6 +1,6 @@
-"""Jobs on Ray, which schedules them, assigns a GPU to each if there are any, and retries failed ones.
+"""Run jobs on Ray, which schedules jobs, assigns a GPU to each if the machines have any, and retries failed jobs.
 
-A Ray that is started here listens on 127.0.0.1 only, without dashboard and usage reports.
+A Ray that this module starts listens only on 127.0.0.1, without dashboard and usage reports.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from icrl4aht_generation.jobs.options import QueueOptions
 
 _POLL_SECONDS = 1.0
 _CONNECT_SECONDS = 10.0
-_OBJECT_STORE_BYTES = 100 * 2**20  # jobs go to the workers, results to the disk; nothing large passes through Ray
+_OBJECT_STORE_BYTES = 100 * 2**20  # small, since results go to the disk and not through Ray
 
 
 def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueOptions) -> Generator[JobOutcome]:
-    """Run jobs as workers are free. Their folders must be shared by all machines.
+    """Run jobs as soon as workers are free; all machines must share the folders of the jobs.
 
     Raises:
         OptionError: if Ray is not installed, or cannot be reached.
@@ -36,7 +36,7 @@ def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueO
         remote = ray.remote(
             num_cpus=1,
             num_gpus=int(accelerated),
-            max_calls=1,  # a process for each job, so that its memory is released
+            max_calls=1,  # every job has a new process, which releases its memory
             max_retries=options.retries,
             retry_exceptions=True,
         )(run_in_worker)
@@ -45,14 +45,14 @@ def run_on_ray(jobs: Sequence[Job], wait: bool, board: JobBoard, options: QueueO
             while pending:
                 ready, _ = ray.wait(list(pending), num_returns=1, timeout=_POLL_SECONDS)
                 for reference in ready:
-                    yield _outcome(ray, reference, pending.pop(reference), options)
-                board.show_stated(pending.values())  # workers report through their folders
+                    yield _job_outcome(ray, reference, pending.pop(reference), options)
+                board.show_recorded(pending.values())  # workers write their progress to the jobs' folders
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)
 
 
-def _outcome(ray: Any, reference: Any, job: Job, options: QueueOptions) -> JobOutcome:
+def _job_outcome(ray: Any, reference: Any, job: Job, options: QueueOptions) -> JobOutcome:
     try:
         return JobOutcome(job, ray.get(reference))
     except ray.exceptions.RayError as error:  # raised by the job, or the worker died
@@ -77,19 +77,18 @@ def _check_reachable(address: str | None) -> None:
 @contextmanager
 def _connected(options: QueueOptions) -> Iterator[Any]:
     if options.address is None:
-        # Read when Ray is first imported. The name is misleading: this makes Ray's servers listen on the loopback
-        # address.
+        # Ray reads this variable when it is imported. Despite its name, it makes Ray listen only on 127.0.0.1.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     elif options.workers is not None:
-        raise OptionError(f"workers = {options.workers}: the Ray at {options.address} has its own")
+        raise OptionError(f"workers = {options.workers}: the Ray at {options.address} sets its own number")
     try:
         import ray
     except ImportError as error:
         raise OptionError(f"the executor ray needs Ray: {install_command('cluster')}") from error
     _check_reachable(options.address)
     settings: dict[str, Any] = {"address": options.address or "local", "log_to_driver": False, "logging_level": "ERROR"}
-    if options.address is None:  # all cores by default; GPUs are found by Ray
+    if options.address is None:  # Ray uses all cores by default, and finds GPUs itself
         settings |= {
             "num_cpus": options.workers,
             "include_dashboard": False,

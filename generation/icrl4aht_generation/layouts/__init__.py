@@ -1,4 +1,4 @@
-"""Layouts without end: families of generated layouts, each a function of its family, seed and number."""
+"""Families of generated layouts; every layout depends only on its family, seed and number."""
 
 from icrl4aht_data.overcooked.solvable import check_solvable
 from icrl4aht_generation.layouts.families import find_generated, generate_layouts, split_of

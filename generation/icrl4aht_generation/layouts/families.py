@@ -1,4 +1,4 @@
-"""Families of generated layouts, their names and splits."""
+"""Families, names and splits of generated layouts."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ LAYOUT_FAMILIES: dict[str, Callable[[int], Iterator[LayoutDraw]]] = {
     "templates": draw_templates,
     "rooms": draw_rooms,
 }
-"""Family -> function that yields the layouts of a seed without their names."""
+"""Function of each family that yields the layouts of a seed, without names."""
 
 LAYOUT_SPLITS = {"train": 0.8, "validation": 0.1, "test": 0.1}
-"""Split -> share of the layouts that may be trained on; the others are divided equally among the last two."""
+"""Share of each split among layouts allowed in training; other layouts are divided between validation and test."""
 
 
 MOST_LAYOUTS = 100_000
-"""Number of layouts of a family and seed, unless it is exhausted before."""
+"""Maximum number of layouts of one family and seed."""
 
 
 def generate_layouts(family: str, seed: int, count: int, *, split: str | None = None) -> list[Layout]:
     """Return the first layouts of a family.
 
-    No two of them and none of the published layouts are equal, also when they are mirrored or rotated, and
-    `check_solvable` accepts each. A layout is a function of its family, seed and number, which make its name, such as
-    templates-0-17. With a smaller count the result is the beginning of a longer one.
+    All layouts differ from each other and from the published layouts, even if mirrored or rotated, and `check_solvable`
+    accepts each layout. A layout such as templates-0-17 depends only on its family, seed and number, so a smaller count
+    returns the first layouts of a larger count.
 
     Args:
         family: "rearranged", "templates" or "rooms".
@@ -48,8 +48,8 @@ def generate_layouts(family: str, seed: int, count: int, *, split: str | None = 
         split: "train", "validation" or "test": only layouts of this split, see `split_of`.
 
     Raises:
-        UnknownNameError: for an unknown family or split.
-        OptionError: if the family does not have so many layouts, or seed or count is not an integer of at least 0.
+        UnknownNameError: if the family or the split does not exist.
+        OptionError: if the family has fewer layouts, or seed or count is not an integer of at least 0.
     """
     check_choice("family of layouts", family, LAYOUT_FAMILIES)
     if split not in (None, *LAYOUT_SPLITS):
@@ -58,14 +58,14 @@ def generate_layouts(family: str, seed: int, count: int, *, split: str | None = 
     if count > MOST_LAYOUTS:
         raise OptionError(f"count = {count}: a family has at most {MOST_LAYOUTS} layouts of one seed; ask for fewer")
     found: list[Layout] = []
-    numbered = islice(_numbered(family, seed), MOST_LAYOUTS)  # with a split, far more may be drawn than are kept
+    numbered = islice(_named_layouts(family, seed), MOST_LAYOUTS)  # also limits layouts of other splits
     while len(found) < count:
         layout = next(numbered, None)
         if layout is None:
             kept = "" if split is None else f" of split {split}"
             raise OptionError(
-                f"family {family}, seed {seed}: it has {len(found)} layouts{kept}, expected {count}; ask for fewer, or "
-                f"give another seed or family"
+                f"family {family}, seed {seed}: found only {len(found)} layouts{kept}, expected {count}; ask for "
+                f"fewer, or give another seed or family"
             )
         if split is None or split_of(layout) == split:
             found.append(layout)
@@ -73,11 +73,11 @@ def generate_layouts(family: str, seed: int, count: int, *, split: str | None = 
 
 
 def find_generated(name: str) -> Layout:
-    """Return the generated layout with a name such as templates-0-17; draws it and all before it.
+    """Return the generated layout with a name such as templates-0-17, after generating all layouts before it.
 
     Raises:
         OptionError: if the name is not family-seed-number, or the family has fewer layouts, at most `MOST_LAYOUTS`.
-        UnknownNameError: for an unknown family.
+        UnknownNameError: if the family does not exist.
     """
     parts = re.fullmatch(r"(\w+)-(\d+)-(\d+)", name, re.ASCII)
     if not parts:
@@ -88,8 +88,8 @@ def find_generated(name: str) -> Layout:
     return generate_layouts(family, seed, number + 1)[number]
 
 
-def _numbered(family: str, seed: int) -> Iterator[Layout]:
-    """Yield the different layouts of a family with their names, until many draws in a row repeat earlier ones."""
+def _named_layouts(family: str, seed: int) -> Iterator[Layout]:
+    """Yield distinct layouts of a family with names, until `MOST_REPEATS` draws in a row repeat earlier layouts."""
     known = {canonical_map(get_layout(name)) for name in LAYOUT_NAMES}
     number = repeats = 0
     for drawn in LAYOUT_FAMILIES[family](seed):
@@ -106,12 +106,12 @@ def _numbered(family: str, seed: int) -> Iterator[Layout]:
 
 
 def split_of(layout: Layout) -> str:
-    """Return the split of a layout, "train", "validation" or "test", which is a hash of its `canonical_map`.
+    """Return the split of a layout, "train", "validation" or "test", from a hash of its `canonical_map`.
 
-    Layouts with the rooms of a published test layout, see `published_rooms`, are in no training split.
+    Layouts with the rooms of a published test layout, see `published_rooms`, are never in the split train.
     """
     splits = [split for split in LAYOUT_SPLITS if split != "train" or not has_tested_rooms(layout)]
     digest = hashlib.sha256("\n".join(canonical_map(layout)).encode()).digest()
     ends = np.cumsum([LAYOUT_SPLITS[split] for split in splits])
-    position = int.from_bytes(digest[:6], "big") / 2**48  # of six bytes, so that it is below 1
+    position = int.from_bytes(digest[:6], "big") / 2**48  # below 1, since a float represents six bytes exactly
     return splits[int(np.searchsorted(ends, position * ends[-1], side="right"))]

@@ -1,4 +1,4 @@
-"""Fixtures, recipes and starts of new layouts, drawn for given rooms, and checks that agents can deliver the recipes.
+"""Draw fixtures, recipes and starts of new layouts for given rooms, and check that agents can deliver the recipes.
 
 Shapes: `H` rows, `W` columns.
 """
@@ -14,27 +14,28 @@ import numpy as np
 from icrl4aht_generation.layouts.grids import neighbours, rows_of
 
 MORE_FIXTURES = (4, 6)
-"""Least and most fixtures besides those that a dish needs: one pile of each ingredient and of plates, a pot, a goal."""
+"""Minimum and maximum number of additional fixtures, beyond those that a dish needs (piles, plates, pot and goal)."""
 
 FREE_COUNTERS = 2
-"""Least number of counters that remain; in small rooms there are fewer fixtures for that."""
+"""Minimum number of counters without a fixture; small rooms get fewer fixtures instead."""
 
 LayoutDraw = tuple[tuple[str, ...], tuple[tuple[int, int, int], ...], bool]
-"""Arguments of a `Layout` after its names: the map, recipes, and whether it has the delivery indicator."""
+"""Arguments of a `Layout` after its names: map, recipes, and whether the layout has a delivery indicator."""
 
 _INGREDIENT_IDS = 4  # ids 0 to 3 have canonical channels
-_MOST = {"P": 3, "L": 2}  # most copies of a fixture; others have no limit
-_ARRANGEMENTS = 60  # tries with one choice of fixtures
+_MOST = {"P": 3, "L": 2}  # maximum copies of a fixture; other fixtures have no limit
+_ARRANGEMENTS = 60  # maximum number of tries to place the chosen fixtures
 
 
-def is_easy(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> bool:
-    """Return whether in two rooms one agent can deliver every recipe, or one can only cook and the other only serve.
+def needs_no_handover(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> bool:
+    """Return whether two agents in separate rooms can deliver every recipe without handing items over on counters.
 
-    The scripted experts need that: they hand nothing over on counters, and cook in each pot that they reach.
+    The scripted experts need this: either one agent does everything, or one agent only cooks, in pots that both agents
+    reach, and the other agent only serves.
 
     Args:
         grid: the map, str (H, W).
-        reach: bool (2, H, W), the cells that each agent can face.
+        reach: bool (2, H, W), cells that each agent can face.
         recipes: triples of ingredient ids.
     """
     ingredients = _ingredient_letters(recipes)
@@ -50,8 +51,8 @@ def is_easy(grid: np.ndarray, reach: np.ndarray, recipes: Sequence[tuple[int, in
 def waiting_cells(grid: np.ndarray, room: np.ndarray, recipes: Sequence[tuple[int, int, int]]) -> np.ndarray:
     """Return the cells of a shared room on which one agent can wait while the other delivers every recipe alone.
 
-    Others are the only cell from which a pot, or something else that a recipe needs, can be reached. If there is
-    another pot, the scripted expert may still wait for this one. No cell may cut the room in two.
+    All other cells are the only access to a pot, or to all fixtures of a kind that a recipe needs. Every single pot
+    counts, because the scripted expert may wait for a blocked pot. No cell may divide the room into two parts.
 
     Args:
         grid: the map, str (H, W).
@@ -82,15 +83,15 @@ def faced_cells(rooms: np.ndarray) -> np.ndarray:
     return np.stack([neighbours(room) & ~room for room in rooms])
 
 
-def furnished(rooms: np.ndarray, rng: np.random.Generator) -> LayoutDraw | None:
+def furnish_rooms(rooms: np.ndarray, rng: np.random.Generator) -> LayoutDraw | None:
     """Return a layout with these rooms and random fixtures, recipes and starts.
 
-    They are such that the scripted experts can deliver, see `is_easy` and `waiting_cells`. In a shared room, one of the
-    agents starts on a cell of the latter.
+    The scripted experts can deliver soups on the result, see `needs_no_handover` and `waiting_cells`. In a shared room,
+    one agent starts on one of the `waiting_cells`.
 
     Args:
-        rooms: bool (2, H, W), the floor of each agent; the same one if they share a room.
-        rng: source of the draws.
+        rooms: bool (2, H, W), the floor of each agent; equal floors if the agents share a room.
+        rng: random number generator.
 
     Returns:
         The layout, or None if the rooms have too few walls, or no arrangement was found.
@@ -105,7 +106,7 @@ def furnished(rooms: np.ndarray, rng: np.random.Generator) -> LayoutDraw | None:
         grid.flat[walls] = "W"
         grid.flat[rng.permutation(walls)[: len(fixtures)]] = fixtures
         first = waiting_cells(grid, rooms[0], recipes) if shared else np.flatnonzero(rooms[0])
-        if len(first) and (shared or is_easy(grid, reach, recipes)):
+        if len(first) and (shared or needs_no_handover(grid, reach, recipes)):
             start = rng.choice(first)
             second = np.flatnonzero(rooms[1])
             grid.flat[[start, rng.choice(second[second != start])]] = "A"
@@ -114,7 +115,7 @@ def furnished(rooms: np.ndarray, rng: np.random.Generator) -> LayoutDraw | None:
 
 
 def _draw_fixtures(walls: int, rng: np.random.Generator) -> tuple[list[str], tuple[tuple[int, int, int], ...]]:
-    """Return the letters of fixtures, and recipes: 2 to 4 of two ingredients, or 2 to 10 of three."""
+    """Return random letters of fixtures and random recipes: 2 to 4 of two ingredients, or 2 to 10 of three."""
     types = sorted(rng.choice(_INGREDIENT_IDS, rng.integers(2, 4), replace=False).tolist())
     dishes = list(combinations_with_replacement(types, 3))
     chosen = rng.choice(len(dishes), rng.integers(2, len(dishes) + 1), replace=False)

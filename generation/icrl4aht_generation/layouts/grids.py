@@ -1,4 +1,4 @@
-"""Maps as arrays: rooms, mirror images and rotations, and the form that symmetric maps share.
+"""Maps as arrays: rooms, mirror images, rotations, and a canonical form of symmetric maps.
 
 Shapes: `H` rows, `W` columns. A grid is an array (H, W) of map letters, see `icrl4aht_data.overcooked.layouts`.
 """
@@ -18,7 +18,7 @@ def grid_of(layout: Layout) -> np.ndarray:
 
 
 def rows_of(grid: np.ndarray) -> tuple[str, ...]:
-    """Return a grid's rows as texts, as a layout has them."""
+    """Return the rows of a grid as strings, the form of `Layout.rows`."""
     return tuple("".join(row) for row in grid.tolist())
 
 
@@ -33,7 +33,7 @@ def neighbours(mask: np.ndarray) -> np.ndarray:
 
 
 def agent_rooms(layout: Layout) -> np.ndarray:
-    """Return the floor that each agent can reach, bool (2, H, W)."""
+    """Return the floor cells that each agent can reach, bool (2, H, W)."""
     rooms = np.zeros((2, layout.cells), bool)
     for room, cells in zip(rooms, layout.rooms, strict=True):
         room[cells] = True
@@ -47,9 +47,9 @@ def symmetric_images(grid: np.ndarray) -> list[np.ndarray]:
 
 @lru_cache(maxsize=64)
 def _wide_images(height: int, width: int) -> tuple[np.ndarray, int]:
-    """Return the cells of each symmetric image of a map that is not taller than wide, int (images, cells); its width.
+    """Return the cell order of all symmetric images not taller than wide, int (images, cells), and their width.
 
-    A map that is not square has four such images, and a square one eight.
+    A square map has eight such images, any other map four.
     """
     images = symmetric_images(np.arange(height * width).reshape(height, width))
     wide = [image for image in images if image.shape[0] <= image.shape[1]]
@@ -57,10 +57,11 @@ def _wide_images(height: int, width: int) -> tuple[np.ndarray, int]:
 
 
 def canonical_map(layout: Layout) -> tuple[str, ...]:
-    """Return the map of a layout in the form that it shares with all layouts that differ by symmetry only.
+    """Return the canonical map of a layout, which is equal for all layouts that differ only by symmetry.
 
-    It is the least of the map's mirror images and rotations that are not taller than wide, with starts in the first
-    cells of the agents' rooms: an episode starts anywhere in them. Recipes and the delivery indicator do not matter.
+    The result is the alphabetically first mirror image or rotation that is not taller than wide. Starts are moved to
+    the first cells of the agents' rooms, because episodes start anywhere in a room. Recipes and the delivery indicator
+    have no influence.
     """
     images, width = _wide_images(layout.height, layout.width)
     letters = np.frombuffer("".join(layout.rows).replace("A", " ").encode("ascii"), np.uint8)[images]
@@ -70,16 +71,16 @@ def canonical_map(layout: Layout) -> tuple[str, ...]:
     letters[every, start] = ord("A")
     second[every, start] = False
     letters[every, second.argmax(axis=1)] = ord("A")
-    return _least_rows(letters, width)
+    return _first_rows(letters, width)
 
 
 def canonical_floor(floor: np.ndarray) -> tuple[str, ...]:
-    """Return the least of the mirror images and rotations of a floor, bool (H, W), that are not taller than wide."""
+    """Return the alphabetically first mirror image or rotation, not taller than wide, of a floor, bool (H, W)."""
     images, width = _wide_images(*floor.shape)
-    return _least_rows(np.where(floor.ravel()[images], ord(" "), ord("W")).astype(np.uint8), width)
+    return _first_rows(np.where(floor.ravel()[images], ord(" "), ord("W")).astype(np.uint8), width)
 
 
-def _least_rows(images: np.ndarray, width: int) -> tuple[str, ...]:
-    """Return the rows of the least of some maps of one width, uint8 (maps, cells)."""
+def _first_rows(images: np.ndarray, width: int) -> tuple[str, ...]:
+    """Return the rows of the alphabetically first of several maps of equal width, uint8 (maps, cells)."""
     text = min(image.tobytes() for image in images).decode("ascii")
     return tuple(text[start : start + width] for start in range(0, len(text), width))

@@ -1,4 +1,4 @@
-"""Check by play: whether the scripted expert, alone or with another one, delivers a soup."""
+"""Test layouts by play: whether the oracle, alone or with a second oracle, delivers a soup."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from icrl4aht_generation.experts.padded import largest_layouts
 from icrl4aht_generation.learners.rollout import Player, RolloutCarry, init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Situation
 
-_AT_ONCE = 512  # layouts of one batch; every batch runs the same program
+_AT_ONCE = 512  # number of layouts in a batch; all batches share one compilation
 _STEPS = 100
 
 _BOTH, _EGO, _TEAMMATE = (True, True), (True, False), (False, True)
 _QUICK = ((1, _BOTH, True), (1, _EGO, True), (1, _TEAMMATE, True))
 _THOROUGH = ((4, _BOTH, True), (4, _EGO, True), (4, _TEAMMATE, True), (4, _BOTH, False))
-"""Tries in order: hundreds of steps, which of the two agents play while the other stays, and whether they begin on the
-map's starts rather than on drawn cells. Few layouts need the thorough ones."""
+"""Tries in order: hundreds of steps, which of the two agents play and do not just stay, and whether the agents start on
+the map's start cells instead of random cells. Few layouts need the thorough tries."""
 
 
 def layouts_delivered(
     layouts: Sequence[Layout], checked: Callable[[int], None] = lambda count: None
 ) -> Bool[np.ndarray, " layouts"]:
-    """Return for each layout whether an oracle, or a pair of them, delivers at least once in an episode of 400 steps.
+    """Return for each layout whether one or two oracles deliver at least once in an episode of 400 steps.
 
     Args:
-        layouts: the layouts.
-        checked: called with the number of layouts whose answer was found since the last call, for progress.
+        layouts: layouts to test.
+        checked: called with the number of layouts decided since the last call, to show progress.
     """
     found, largest = np.zeros(len(layouts), bool), largest_layouts(layouts)
     for tries in (_QUICK, _THOROUGH):
@@ -58,17 +58,17 @@ def _delivered(
     numbers: np.ndarray,
     tries: Sequence[tuple[int, tuple[bool, bool], bool]],
 ) -> Bool[np.ndarray, " numbers"]:
-    # The largest layouts give all batches equal shapes, and short batches repeat layouts, so that all share a program.
+    # All batches share a compilation: the largest layouts give them equal shapes, and short batches repeat layouts.
     own = [layouts[number] for number in np.resize(numbers, _AT_ONCE)] + largest
     tables, keys = stack_tables(own), jax.random.split(jax.random.key(0), len(own))
-    # Computing the oracles' facts takes longer than an episode, so all tries of a batch share them.
-    egos = oracle_params(own), oracle_params([_exchanged(layout) for layout in own])
+    # Computing the oracles' facts takes longer than an episode, so all tries of a batch share the facts.
+    egos = oracle_params(own), oracle_params([_with_exchanged_agents(layout) for layout in own])
     starts = np.array([layout.agent_cells for layout in own], np.uint8)
     earned = np.zeros(len(own), bool)
     for hundreds, playing, at_starts in tries:
         if earned[: len(numbers)].all():
             break
-        carry = _begin(tables, egos, keys, starts, at_starts)
+        carry = _start_episodes(tables, egos, keys, starts, at_starts)
         for _ in range(hundreds):
             carry, reward = _play(tables, egos, jnp.array(playing), carry)
             earned |= np.asarray(reward) >= DELIVERY_REWARD
@@ -76,7 +76,7 @@ def _delivered(
 
 
 def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) -> list[Player]:
-    """Return an oracle as either agent of every environment, or one that stays."""
+    """Return a player for each agent of every environment: an oracle, or a player that only stays."""
 
     def act(agent: int) -> Callable[..., Any]:
         def act_if_playing(params: Any, memory: Any, view: Situation, key: Any) -> Any:
@@ -93,8 +93,8 @@ def _players(env: Environment, egos: tuple[Any, Any], playing: Any, count: int) 
 
 
 @jax.jit
-def _begin(tables: Tables, egos: tuple[Any, Any], keys: Any, starts: Any, at_starts: Any) -> RolloutCarry:
-    """Return the carry of episodes on drawn cells or on the maps' starts, where an agent is in nobody's way."""
+def _start_episodes(tables: Tables, egos: tuple[Any, Any], keys: Any, starts: Any, at_starts: Any) -> RolloutCarry:
+    """Return the carry of new episodes, with agents on random cells or on the maps' start cells."""
     env = Environment(tables)
     carry = init_rollout(env, _players(env, egos, (True, True), len(keys)), keys)
     record = carry.env.record
@@ -110,8 +110,8 @@ def _play(tables: Tables, egos: tuple[Any, Any], playing: Any, carry: RolloutCar
     return carry, played.reward.max(axis=0)
 
 
-def _exchanged(layout: Layout) -> Layout:
-    """Return a layout whose agents are exchanged, for a policy that only plays the ego."""
+def _with_exchanged_agents(layout: Layout) -> Layout:
+    """Return a layout with exchanged agents, for a policy that can only play the ego."""
     return _ExchangedLayout(layout.name, layout.alias, layout.rows, layout.recipes, layout.indicates_delivery)
 
 

@@ -1,4 +1,4 @@
-"""New rooms: one that both agents share, two next to each other with counters between them, or a ring.
+"""Random new rooms: a room that both agents share, two rooms with counters between them, or a ring.
 
 Shapes: `H` rows, `W` columns, at most 9 and 11.
 """
@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import binary_erosion, label
 
-from icrl4aht_generation.layouts.fixtures import LayoutDraw, furnished
+from icrl4aht_generation.layouts.fixtures import LayoutDraw, furnish_rooms
 from icrl4aht_generation.layouts.grids import canonical_floor, neighbours
 from icrl4aht_generation.layouts.templates import published_rooms
 
 MOST_ROWS, MOST_COLUMNS = 9, 11
 
-_FEWEST_CELLS = 6  # of a room for two agents
+_FEWEST_CELLS = 6  # minimum size of a shared room
 
 
 def draw_rooms(seed: int) -> Iterator[LayoutDraw]:
-    """Yield layouts, of the three kinds in turn, none with the rooms of a published layout."""
+    """Yield layouts with new rooms, the three kinds in turn; none has the rooms of a published layout."""
     rng = np.random.default_rng([seed, *b"rooms"])
     published = published_rooms(tested=False) | published_rooms(tested=True)
     while True:
@@ -30,15 +30,15 @@ def draw_rooms(seed: int) -> Iterator[LayoutDraw]:
             while drawn is None:
                 rooms = np.stack(draw(rng))
                 if canonical_floor(rooms[0] | rooms[1]) not in published:
-                    drawn = furnished(rooms, rng)
+                    drawn = furnish_rooms(rooms, rng)
             yield drawn
 
 
 def _shared_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a room of one to three rectangles, perhaps with islands of one counter.
+    """Return a shared room of one to three rectangles, perhaps with islands of one counter.
 
-    Rectangles are at least two cells wide and overlap in at least two cells, and islands are surrounded by floor: no
-    agent can block the way of the other.
+    No agent can block the way of the other: rectangles are at least two cells wide and overlap in at least two cells,
+    and islands are surrounded by floor.
     """
     floor = np.zeros((MOST_ROWS, MOST_COLUMNS), bool)
     for _ in range(rng.integers(1, 4)):
@@ -54,18 +54,18 @@ def _shared_room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         surrounded = np.argwhere(binary_erosion(floor, np.ones((3, 3), bool)))
         if len(surrounded):
             floor[tuple(rng.choice(surrounded))] = False
-    floor = _cropped(floor)
+    floor = _crop(floor)
     return floor, floor
 
 
-def _cropped(floor: np.ndarray) -> np.ndarray:
-    """Return a floor with one wall around it."""
+def _crop(floor: np.ndarray) -> np.ndarray:
+    """Return a floor cropped to its cells and a border of walls."""
     rows, columns = np.flatnonzero(floor.any(axis=1)), np.flatnonzero(floor.any(axis=0))
     return np.pad(floor[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)
 
 
 def _two_rooms(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return two rooms with a line of counters between them, which may have a step; a corner of each may be cut off."""
+    """Return two rooms with a line of counters, perhaps with a step, between them; each may lack a corner."""
     upright = bool(rng.integers(2))
     rows, columns = (MOST_ROWS, MOST_COLUMNS) if upright else (MOST_COLUMNS, MOST_ROWS)
     while True:
@@ -85,12 +85,12 @@ def _two_rooms(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 def _is_room(floor: np.ndarray) -> bool:
     """Return whether a floor has at least two cells, and all of them are connected."""
-    connected: Any = label(floor)  # the numbers of its parts, and how many there are
+    connected: Any = label(floor)  # array of component numbers, and number of components
     return floor.sum() > 1 and connected[1] == 1
 
 
 def _ring(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a room around an island of at least two counters; the ways around it may be one cell wide."""
+    """Return a room around an island of at least two counters; the ways around the island may be one cell wide."""
     while True:
         height, width = rng.integers(3, MOST_ROWS - 1), rng.integers(3, MOST_COLUMNS - 1)
         tall, wide = rng.integers(1, height - 1), rng.integers(1, width - 1)

@@ -1,4 +1,4 @@
-"""Rooms of the published layouts with other fixtures, mirrored and rotated."""
+"""Generated layouts with the rooms of published layouts, mirrored and rotated, and with other fixtures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from icrl4aht_data.benchmark.facts import LAYOUT_NAMES, TESTED_ON
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
-from icrl4aht_generation.layouts.fixtures import LayoutDraw, furnished
+from icrl4aht_generation.layouts.fixtures import LayoutDraw, furnish_rooms
 from icrl4aht_generation.layouts.grids import agent_rooms, canonical_floor, symmetric_images
 
 
@@ -18,34 +18,33 @@ def published_rooms(tested: bool) -> dict[tuple[str, ...], list[np.ndarray]]:
     """Return the rooms of the published layouts, without repeats.
 
     Args:
-        tested: whether to return the rooms on which no layout is only trained. The layouts of the teammate track are
-            trained and tested on; only trained on are asymm_both and cramped_up, which share their rooms with the
-            layouts that their models are tested on.
+        tested: False for the rooms of asymm_both and cramped_up, the layouts that are only used in training; True for
+            all other rooms. Test layouts with the rooms of asymm_both or cramped_up count as False.
 
     Returns:
-        Floor, in the form of `canonical_floor` -> symmetric images of the agents' rooms, each bool (2, H, W).
+        Symmetric images of the agents' rooms, each bool (2, H, W), by the `canonical_floor` of the rooms.
     """
-    trained = {_floor(get_layout(name)) for name in TESTED_ON if name not in TESTED_ON.values()}
+    trained = {_layout_floor(get_layout(name)) for name in TESTED_ON if name not in TESTED_ON.values()}
     found: dict[tuple[str, ...], list[np.ndarray]] = {}
     for layout in map(get_layout, LAYOUT_NAMES):
-        floor = _floor(layout)
+        floor = _layout_floor(layout)
         if (floor not in trained) == tested:
             pairs = zip(*map(symmetric_images, agent_rooms(layout)), strict=True)
             found.setdefault(floor, [np.stack(pair) for pair in pairs])
     return found
 
 
-def _floor(layout: Layout) -> tuple[str, ...]:
+def _layout_floor(layout: Layout) -> tuple[str, ...]:
     return canonical_floor(layout.walkable.reshape(layout.height, layout.width))
 
 
 def has_tested_rooms(layout: Layout) -> bool:
-    """Return whether a layout has the rooms of a test layout, which no layout is only trained on."""
-    return _floor(layout) in published_rooms(tested=True)
+    """Return whether a layout has rooms that are reserved for tests, see `published_rooms`."""
+    return _layout_floor(layout) in published_rooms(tested=True)
 
 
 def draw_templates(seed: int) -> Iterator[LayoutDraw]:
-    """Yield layouts, every second one with rooms that may be trained on, see `published_rooms`."""
+    """Yield layouts with published rooms; every second layout has rooms allowed in training, see `published_rooms`."""
     rng = np.random.default_rng([seed, *b"templates"])
     groups = [list(published_rooms(tested).values()) for tested in (False, True)]
     while True:
@@ -53,5 +52,5 @@ def draw_templates(seed: int) -> Iterator[LayoutDraw]:
             drawn = None
             while drawn is None:
                 images = group[rng.integers(len(group))]
-                drawn = furnished(images[rng.integers(len(images))], rng)
+                drawn = furnish_rooms(images[rng.integers(len(images))], rng)
             yield drawn

@@ -1,1 +1,1 @@
-"""The one network and the one PPO; each algorithm adds only what differs."""
+"""The network and the PPO implementation that all learning algorithms share, and the learners."""

@@ -23,16 +23,16 @@ from icrl4aht_generation.learners.network import ActorCritic
 POLICY_WEIGHTS, POLICY_CARD = "policy.safetensors", "policy.json"
 
 _ROWS = "@rows"
-"""Ending of the name of the array with the numbers of a matrix's stored rows."""
+"""Suffix in the name of an array that lists the indices of a matrix's stored rows."""
 
 POLICY_CHECKPOINTS = 5
-"""Checkpoints of each policy, evenly spaced over its training (paper, App. B.1)."""
+"""Number of checkpoints of each policy, evenly spaced over its training (paper, App. B.1)."""
 
 
 def checkpoint_updates(config: PPOConfig) -> tuple[int, ...]:
-    """Return the number s of updates after which a checkpoint is kept, ascending; the last one is the end of training.
+    """Return the numbers of updates after which a checkpoint is saved, ascending; the last is the end of training.
 
-    Fewer than `POLICY_CHECKPOINTS` if there are fewer updates.
+    A training with fewer updates than `POLICY_CHECKPOINTS` has a checkpoint after each update.
     """
     moments = (-(-config.updates * (number + 1) // POLICY_CHECKPOINTS) for number in range(POLICY_CHECKPOINTS))
     return tuple(dict.fromkeys(moments))
@@ -46,7 +46,7 @@ def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str,
     weights = {name: np.asarray(w) for name, w in flatten_dict(params, sep="/").items()}
     shapes = {name: list(w.shape) for name, w in weights.items()}
     content = card | {"widths": asdict(network.widths), "partners": network.partners, "shapes": shapes}
-    # `save_file` raises an error of its own for a full disk.
+    # Not `save_file`, which does not raise an OSError for a full disk.
     (partial / POLICY_WEIGHTS).write_bytes(to_bytes(_without_zero_rows(weights)))
     (partial / POLICY_CARD).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     for name in (POLICY_WEIGHTS, POLICY_CARD):
@@ -56,17 +56,17 @@ def save_policy(folder: Path, network: ActorCritic, params: Any, card: dict[str,
 
 
 def load_card(folder: Path) -> dict[str, Any]:
-    """Return a policy's card.
+    """Return the card of a stored policy.
 
     Raises:
-        OptionError: if it is missing or not a JSON object.
+        OptionError: if the card is missing or not a JSON object.
     """
     try:
         card = parse_json(read_text(folder / POLICY_CARD))
     except IndexFormatError as error:
-        raise _no_checkpoint(folder, repr(error)) from error
+        raise _checkpoint_error(folder, repr(error)) from error
     if not isinstance(card, dict):
-        raise _no_checkpoint(folder, f"{POLICY_CARD} is not an object")
+        raise _checkpoint_error(folder, f"{POLICY_CARD} is not an object")
     return card
 
 
@@ -74,7 +74,7 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
     """Return a policy's network, its parameters, and its card.
 
     Raises:
-        OptionError: if the files are missing or unreadable, or the weights' shapes are not those of the card.
+        OptionError: if the files are missing or unreadable, or the shapes of the weights differ from the card.
     """
     card = load_card(folder)
     try:
@@ -84,17 +84,17 @@ def load_policy(folder: Path) -> tuple[ActorCritic, Any, dict[str, Any]]:
         weights = _with_zero_rows(load_file(folder / POLICY_WEIGHTS), expected)
         tree = unflatten_dict(weights, sep="/")
     except Exception as error:  # the file may be damaged, and each of three libraries raises its own errors
-        raise _no_checkpoint(folder, repr(error)) from error
+        raise _checkpoint_error(folder, repr(error)) from error
     shapes = {name: list(w.shape) for name, w in weights.items()}
     if shapes != expected or "params" not in tree:
-        raise OptionError(f"{folder}: weights have shapes {shapes}, the card states {expected}")
+        raise OptionError(f"{folder}: the weights have shapes {shapes}, but the card states {expected}")
     return network, tree, card
 
 
 def _without_zero_rows(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the weights as stored: matrices that are mostly rows of zeros become their other rows and row numbers.
+    """Return the weights to store: of a matrix with mostly zero rows, only the nonzero rows and their indices.
 
-    The kernel of encoder `mlp` is one: most entries of the flat window are always 0 on a layout.
+    This shortens the kernel of encoder `mlp`, because most entries of the flat window are always 0 on a layout.
     """
     stored = {}
     for name, matrix in weights.items():
@@ -108,10 +108,10 @@ def _without_zero_rows(weights: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _with_zero_rows(stored: dict[str, np.ndarray], shapes: dict[str, list[int]]) -> dict[str, np.ndarray]:
-    """Return the weights of a file, see `_without_zero_rows`; `shapes` are the complete ones.
+    """Return complete weights with the given shapes from stored weights, see `_without_zero_rows`.
 
     Raises:
-        ValueError, IndexError, KeyError: if rows and shapes do not fit.
+        ValueError, IndexError, KeyError: if the stored rows do not match the shapes.
     """
     weights = {name: matrix for name, matrix in stored.items() if not name.endswith(_ROWS)}
     for name in stored.keys() - weights.keys():
@@ -125,5 +125,5 @@ def _with_zero_rows(stored: dict[str, np.ndarray], shapes: dict[str, list[int]])
     return weights
 
 
-def _no_checkpoint(folder: Path, problem: str) -> OptionError:
+def _checkpoint_error(folder: Path, problem: str) -> OptionError:
     return OptionError(f"{folder}: not a checkpoint ({problem}); expected {POLICY_WEIGHTS} and {POLICY_CARD}")

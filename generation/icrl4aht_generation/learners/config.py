@@ -1,4 +1,4 @@
-"""Hyper-parameters of the learners; no JAX, so that command lines can import them."""
+"""Hyper-parameters of the learners, in a module without JAX that commands can import quickly."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from icrl4aht_data.utils.options import Count, NotNegative, Positive, Share, che
 EncoderKind = Literal["paper", "words", "mlp"]
 """How a network encodes observations.
 
-`paper`: the paper's convolutions. `words`: the same parameters, with the first layers computed once per word of a cell,
-see `learners.encoder`. `mlp`: one dense layer of the flat window, in place of the convolutions.
+`paper`: the paper's convolutions. `words`: the same convolutions, but the 1 x 1 layers are computed only once for equal
+contents of cells, see `learners.encoder`. `mlp`: one dense layer of the flat window instead of convolutions.
 """
 
 # Larger values are a mistake, or an attack that exhausts memory.
@@ -29,8 +29,8 @@ class Widths:
     """Encoder and layer widths of the network; the defaults are the paper's (273,375 parameters at C = 40).
 
     Attributes:
-        pointwise: widths of the 1 x 1 convolutions. Encoder `mlp` has none, whatever was given.
-        spatial: widths of the 3 x 3 convolutions. Encoder `mlp` has none, whatever was given.
+        pointwise: widths of the 1 x 1 convolutions; always empty for encoder `mlp`.
+        spatial: widths of the 3 x 3 convolutions; always empty for encoder `mlp`.
         dense: width of the encoder's dense layer.
         gru: width of the recurrent state.
         head: width of the actor's and the critic's hidden layers.
@@ -57,24 +57,24 @@ class PPOConfig:
 
     Attributes:
         total_steps: environment steps, over all environments.
-        environments: environments that are stepped in parallel.
+        environments: number of environments that are stepped in parallel.
         rollout: steps of each environment between two updates.
         epochs: passes over the steps of an update.
         minibatches: minibatches of an epoch; a divisor of the environments.
         learning_rate: peak learning rate.
         warmup: share of the updates in which the learning rate rises.
-        discount: discount of rewards, gamma.
-        gae_lambda: decay of the advantage estimate's trace, lambda.
+        discount: discount factor of rewards, gamma.
+        gae_lambda: decay factor lambda of generalized advantage estimation.
         clip: largest change of the probability ratio and of the value.
         entropy: weight of the entropy bonus.
         value: weight of the value loss.
         max_grad_norm: largest global norm of a gradient.
         shaping_horizon: environment steps until shaped rewards have the weight 0.
-        forgiveness: shaped reward of a wrong delivery: with 20, its penalty grows from 0 to 20 as the shaping ends.
+        forgiveness: shaped reward of a wrong delivery; with 20, its penalty grows from 0 to 20 while shaping fades out.
         widths: encoder and layer widths of the network.
 
     Raises:
-        OptionError: for a value out of bounds, or if the environments cannot be divided into the minibatches.
+        OptionError: if a value is out of bounds, or the environments cannot be divided into the minibatches.
     """
 
     total_steps: Count = PAPER_EGO_STEPS
@@ -101,7 +101,7 @@ class PPOConfig:
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps of an update, over all environments."""
+        """Number of environment steps of an update, over all environments."""
         return self.environments * self.rollout
 
     @property
@@ -111,5 +111,5 @@ class PPOConfig:
 
     @property
     def episodes(self) -> int:
-        """Episodes of each environment whose kept steps, and the state after them, are within the updates."""
+        """Number of episodes of each environment whose stored steps, and the next state, are within the updates."""
         return max(0, (self.updates * self.rollout - KEPT_STEPS - 1) // EPISODE_STEPS + 1)

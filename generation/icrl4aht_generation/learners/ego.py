@@ -32,15 +32,15 @@ from icrl4aht_generation.policy import Policy
 
 
 class LearnerState(NamedTuple):
-    """State of a `Learner`: an update maps it to the next one, and a resume needs nothing else.
+    """Complete state of a `Learner`; an update maps a state to the next state.
 
     Attributes:
         params: the ego's parameters, a pytree of float32.
         optimizer: state of the optimizer.
-        carry: environments and memories before the next roll-out.
-        teammate: the teammate's parameters. In the state, not in the compiled update, so that all teammates of one
+        carry: environments and memories before the next rollout.
+        teammate: the teammate's parameters; the compiled update takes them as an argument, so all teammates of one
             family share one compilation.
-        key: typed key, scalar, constant; every update folds its number into it.
+        key: typed JAX key, scalar, constant; every update folds its number into this key.
         update: int32 scalar, number of updates so far.
     """
 
@@ -57,9 +57,9 @@ class Learner:
     """Trains an ego, agent 0, with one teammate, agent 1.
 
     Attributes:
-        env: the environment.
+        env: environment with one layout.
         teammate: the teammate's policy.
-        config: hyper-parameters.
+        config: hyper-parameters of PPO.
     """
 
     env: Environment
@@ -78,7 +78,7 @@ class Learner:
 
     @cached_property
     def ppo(self) -> PPO:
-        """The algorithm of the updates."""
+        """PPO algorithm that computes the updates."""
         return PPO(self.network, self.config)
 
     def init(self, key: Key[Array, ""]) -> LearnerState:
@@ -91,16 +91,16 @@ class Learner:
         return LearnerState(params, optimizer, carry, self.teammate.params, running_key, jnp.int32(0))
 
     def update(self, state: LearnerState) -> tuple[LearnerState, Rollout, dict[str, Array]]:
-        """Play one roll-out and learn from it; a pure function of the state.
+        """Play one rollout and learn from it, as a pure function of the state.
 
         Returns:
-            The next state, the roll-out, and scalar metrics.
+            The next state, the rollout, and scalar metrics.
         """
         play_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.update))
         players = self.players(state.params, state.teammate)
         carry, rollout = roll_out(self.env, players, state.carry, self.config.rollout, play_key)
         ego = players[EGO]
-        # Only for the value of the observation after the roll-out: the action is drawn again in the next one.
+        # This call only gives the value after the rollout: the next rollout draws the action again.
         after, _ = ego.act(carry.memories[EGO], carry.env, play_key)
         shaping = shaping_weight(self.config, state.update)
         memory, forgiveness = state.carry.memories[EGO], self.config.forgiveness
@@ -128,12 +128,12 @@ def stream_keys(key: Key[Array, ""], environments: int) -> Key[Array, " N"]:
 def compiled_update(learner: Learner) -> Callable[[LearnerState], tuple[LearnerState, Rollout, dict[str, Array]]]:
     """Return the learner's compiled update, which reuses the memory of its argument.
 
-    It is compiled once for all teammates of one family on one layout.
+    All teammates of one family on one layout share the compilation.
     """
     teammate = learner.teammate
-    return _compiled(learner.env.layout, learner.env.max_steps, teammate._replace(params=()), learner.config)
+    return _jitted_update(learner.env.layout, learner.env.max_steps, teammate._replace(params=()), learner.config)
 
 
 @lru_cache(maxsize=8)
-def _compiled(layout, max_steps: int, teammate: Policy, config: PPOConfig):
+def _jitted_update(layout, max_steps: int, teammate: Policy, config: PPOConfig):
     return jax.jit(Learner(Environment(layout, max_steps), teammate, config).update, donate_argnums=0)

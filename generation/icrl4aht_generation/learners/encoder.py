@@ -1,9 +1,9 @@
 """The encoder of observations, for learners and sequence models: convolutions, or one dense layer of the flat window.
 
-Its input are observations, or a compact form that is made of state records; parameters are the same, and so are the
-results, up to the order of summation. `WindowWords` are for the convolutions: a 1 x 1 convolution sees one cell, so it
-is computed once per word of the layouts and looked up. `WindowEntries` are for the dense layer: of the flat window of
-an agent, most entries are always 0, since it stays in its room. B denotes the batch dimensions.
+Inputs are observations, or a compact form that is computed from state records. Both forms have equal parameters, and
+equal results up to the order of summation. `WindowWords` are for the convolutions: a 1 x 1 convolution sees one cell,
+so it is computed once per word, which is a possible content of a cell. `WindowEntries` are for the dense layer: most
+entries of an agent's flat window are always 0, because the agent stays in its room. B denotes the batch dimensions.
 
 Convolutions are matrix products: a 3 x 3 SAME convolution of a 5 x 5 patch is one dense matrix built from its kernel.
 """
@@ -31,7 +31,7 @@ MLP_WIDTH = 64
 
 
 class WindowWords(NamedTuple):
-    """Observations as words of cells.
+    """Observations as word ids, one for the content of each visible cell.
 
     Attributes:
         ids: int32 (*B, 25), see `CellWords.ids`.
@@ -51,13 +51,13 @@ class WindowEntries(NamedTuple):
 
 
 class GroupedWords(NamedTuple):
-    """Observations as words of cells, with equal ones in groups, so that one of each is encoded.
+    """Observations as word ids of cells, in groups of equal observations that are encoded only once.
 
     N denotes the number of observations, the product of B.
 
     Attributes:
         ids: int32 (*B, 25), see `CellWords.ids`.
-        first: int32 (N,), for each group the number of one of its observations, then zeros.
+        first: int32 (N,), index of one observation of each group, padded with zeros.
         group: int32 (*B,), the group of each observation.
         groups: int32 (), number of groups.
     """
@@ -72,18 +72,18 @@ Seen = Num[Array, "*B 5 5 C"] | WindowWords | GroupedWords | WindowEntries
 """Input of an encoder: observations, uint8 or float, or one of their compact forms."""
 
 _BLOCKS = 4
-"""Grouped observations are encoded in so many blocks; those without a group are skipped."""
+"""Number of blocks in which grouped observations are encoded; blocks without groups are skipped."""
 
 
 @dataclass(frozen=True)
 class CompactView:
-    """State records -> input of an encoder: `WindowWords`, `WindowEntries`, or plain observations for kind `paper`.
+    """Converter of state records to inputs of an encoder: `WindowWords`, `WindowEntries`, or observations for `paper`.
 
     Attributes:
         kind: kind of the encoder.
         layouts: layouts of the records.
-        agents: the agents that observe, each as the first agent of its records; see `CellWords.entries`.
-        canonical: whether observations have the canonical channels, or the layouts' own.
+        agents: agents that observe, each as the first agent of its state records; see `CellWords.entries`.
+        canonical: whether observations have the canonical channels instead of the layouts' channels.
     """
 
     kind: EncoderKind
@@ -93,17 +93,17 @@ class CompactView:
 
     @property
     def words(self) -> CellWords:
-        """The words of the layouts."""
+        """Words of the layouts: the possible contents of a visible cell."""
         return cell_words(self.layouts, self.canonical)
 
     @property
     def channels(self) -> int:
-        """C, the number of channels of an observation."""
+        """Number C of channels of an observation."""
         return self.words.channels.shape[-1]
 
     @property
     def entries(self) -> np.ndarray:
-        """int64 (E,): entries of the flat observation that `WindowEntries` consist of."""
+        """Indices of the flat observation's entries that `WindowEntries` contain, int64 (E,)."""
         return self.words.entries(self.agents)
 
     def __call__(self, record: UInt8[Array, "*B S"], layout_number: Array | None = None) -> Seen:
@@ -119,7 +119,7 @@ class CompactView:
         return obs if self.kind == "paper" else WindowEntries(obs.reshape(*batch, -1)[..., self.entries])
 
     def observations(self, seen: Seen) -> Num[Array, "*B 5 5 C"]:
-        """Return the observations that an encoder's input was made of."""
+        """Convert an encoder's input back to observations."""
         if isinstance(seen, (WindowWords, GroupedWords)):
             flat = jnp.asarray(self.words.channels)[seen.ids]
         elif isinstance(seen, WindowEntries):
@@ -131,22 +131,23 @@ class CompactView:
 
 
 def group_equal(seen: Seen) -> Seen:
-    """Return words of cells with equal observations in groups, and any other input unchanged.
+    """Group equal observations of an input of kind `WindowWords`, and return any other input unchanged.
 
-    Observations are sorted by a hash, and then compared exactly: if two that differ have one hash, every observation
-    becomes a group of its own. Sorting needs all observations on one device, so with several nothing is grouped.
+    Observations are sorted by a hash, and then compared exactly: if different observations have equal hashes, every
+    observation becomes a separate group. Sorting needs all observations on one device, so with several devices nothing
+    is grouped.
     """
     if not isinstance(seen, WindowWords) or jax.device_count() > 1:
         return seen
     shape, ids = seen.ids.shape[:-1], jnp.asarray(seen.ids).reshape(-1, VISIBLE)
     number = jnp.arange(len(ids), dtype=jnp.int32)
     *hashes, order = jax.lax.sort((*_hash_words(ids), number), num_keys=2)
-    # Rows of one hash are neighbours now; a group starts where a hash changes.
+    # Rows with equal hashes are now adjacent, so a group starts where a hash changes.
     starts = jnp.append(True, (jnp.diff(hashes[0]) != 0) | (jnp.diff(hashes[1]) != 0))
     group_of_sorted = jnp.cumsum(starts, dtype=jnp.int32) - 1
     group = jnp.zeros_like(number).at[order].set(group_of_sorted, unique_indices=True)
     first = jnp.zeros_like(number).at[jnp.where(starts, group_of_sorted, len(ids))].set(order, mode="drop")
-    # Two observations with equal hashes are next to impossible, but would be mixed up silently.
+    # Different observations with equal hashes are very unlikely, but would be confused without an error.
     exact = (ids[first[group]] == ids).all()
     first, group = (jnp.where(exact, found, number) for found in (first, group))
     count = jnp.where(exact, group_of_sorted[-1] + 1, len(ids))
@@ -154,7 +155,7 @@ def group_equal(seen: Seen) -> Seen:
 
 
 def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
-    """Return two uint32 (N,) that equal rows have in common: sums of the words times random odd numbers."""
+    """Return two hashes of each row, uint32 (N,): sums of the word ids times random odd numbers."""
     # Odd factors are invertible modulo 2**32, so no word's bits are lost.
     factors = np.random.default_rng(0).integers(2**31, size=(2, VISIBLE), dtype=np.uint32) * 2 + 1
     one, two = ((ids.astype(jnp.uint32) * row).sum(axis=-1, dtype=jnp.uint32) for row in factors)
@@ -162,21 +163,21 @@ def _hash_words(ids: Int[Array, "N 25"]) -> tuple[Array, Array]:
 
 
 def encoding_log(seen: Seen) -> dict[str, Array]:
-    """Return the log entries of an encoder's input: the share of distinct observations, if known."""
+    """Return metrics of an encoder's input for the log: the share of distinct observations, if known."""
     return {"distinct_observations": seen.groups / seen.group.size} if isinstance(seen, GroupedWords) else {}
 
 
 class WindowEncoder(nn.Module):
-    """Maps observations, each by itself, to features (paper, App. B.1 and E.1).
+    """Maps each observation to features (paper, App. B.1 and E.1).
 
     Args:
         features: width of the result.
-        kind: see `EncoderKind`.
+        kind: how observations are encoded, see `EncoderKind`.
         pointwise: widths of the 1 x 1 convolutions of kinds `paper` and `words`.
-        spatial: widths of their 3 x 3 convolutions.
+        spatial: widths of the 3 x 3 convolutions of kinds `paper` and `words`.
         normalize: whether ReLU and a layer norm follow the last dense layer, as in learners.
-        view: view that makes the compact inputs; None if all inputs are observations.
-        dtype: of the arithmetic.
+        view: view that computes the compact inputs; None if all inputs are observations.
+        dtype: dtype of the computation.
     """
 
     features: int
@@ -204,7 +205,7 @@ class WindowEncoder(nn.Module):
         return nn.LayerNorm()(nn.relu(x)) if self.normalize else x
 
     def _encode_groups(self, seen: GroupedWords) -> Float[Array, "*B F"]:
-        """Encode one observation of each group."""
+        """Return the features of all observations by encoding one observation of each group."""
         # Flax modules cannot be called inside `cond` and `scan`; an unbound clone with explicit variables can.
         encoder, variables = self.clone(parent=None), self.variables
         size = -(-len(seen.first) // _BLOCKS)
@@ -226,9 +227,9 @@ class WindowEncoder(nn.Module):
         return features.reshape(-1, self.features)[seen.group]
 
     def _encode_cells(self, seen: Num[Array, "*B 5 5 C"] | WindowWords | WindowEntries) -> Float[Array, "*B 25 F"]:
-        """Apply the 1 x 1 convolutions. What the rules cannot produce becomes NaN: it has no word."""
+        """Apply the 1 x 1 convolutions to each cell; contents that the rules cannot produce become NaN."""
         if isinstance(seen, WindowWords):
-            x = jnp.asarray(_required(self.view).words.channels, self.dtype)
+            x = jnp.asarray(_required_view(self.view).words.channels, self.dtype)
         else:
             obs: Any = seen
             x = obs.reshape(*obs.shape[:-3], VISIBLE, obs.shape[-1]).astype(self.dtype)
@@ -238,10 +239,10 @@ class WindowEncoder(nn.Module):
 
 
 class FlatDense(nn.Module):
-    """A dense layer of flat observations; its kernel has rows for all 25 * C entries, whatever the input has.
+    """Dense layer of flat observations; the kernel has a row for each of 25 * C entries, also for compact inputs.
 
-    Initial rows of entries that are always 0 in `view` are zeros: they never learn, and random ones would add noise on
-    other layouts.
+    Rows of entries that are always 0 in `view` start as zeros: these rows never learn, and random rows would add noise
+    on other layouts.
     """
 
     features: int
@@ -251,7 +252,7 @@ class FlatDense(nn.Module):
     @nn.compact
     def __call__(self, seen: Seen) -> Float[Array, "*B F"]:
         if isinstance(seen, WindowEntries):
-            x, rows = seen.values, VISIBLE * _required(self.view).channels
+            x, rows = seen.values, VISIBLE * _required_view(self.view).channels
         else:
             obs: Any = seen
             x = obs.reshape(*obs.shape[:-3], -1)
@@ -259,11 +260,11 @@ class FlatDense(nn.Module):
         kernel = self.param("kernel", self._initial_kernel, (rows, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
         if isinstance(seen, WindowEntries):
-            kernel = kernel[_required(self.view).entries]
+            kernel = kernel[_required_view(self.view).entries]
         return x.astype(self.dtype) @ kernel + bias
 
     def _initial_kernel(self, key: Array, shape: tuple[int, int]) -> Array:
-        kernel = nn.initializers.orthogonal(2**0.5)(key, shape)  # before the zeros: scales are those of all rows
+        kernel = nn.initializers.orthogonal(2**0.5)(key, shape)  # scaled before any rows become zero
         if self.view is None:
             return kernel
         varies = np.zeros((shape[0], 1), bool)
@@ -281,14 +282,14 @@ class Conv3x3(nn.Module):
         channels = x.shape[-1] // VISIBLE
         kernel = self.param("kernel", nn.initializers.orthogonal(2**0.5), (3, 3, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
-        # The tenth tap is zero and connects the pairs of cells that are not adjacent.
+        # The tenth tap is zero, for pairs of cells that are not adjacent.
         taps = jnp.concatenate([kernel.reshape(9, channels, self.features), jnp.zeros_like(kernel[:1, 0])])
         matrix = taps[_tap_of_cells()].transpose(0, 2, 1, 3).reshape(VISIBLE * channels, VISIBLE * self.features)
         return x @ matrix + jnp.tile(bias, VISIBLE)
 
 
 def _tap_of_cells() -> np.ndarray:
-    """int (25, 25): number of the kernel tap, 0..8, between an input and an output cell; 9 if they are not adjacent."""
+    """Return the index of the kernel tap between input and output cells, int (25, 25); 9 for cells not adjacent."""
     cell = np.arange(VISIBLE)
     dy = cell[:, None] // WINDOW - cell // WINDOW + 1
     dx = cell[:, None] % WINDOW - cell % WINDOW + 1
@@ -297,11 +298,11 @@ def _tap_of_cells() -> np.ndarray:
 
 
 def orthogonal_dense(width: int, scale: float = 2**0.5, name: str | None = None) -> nn.Dense:
-    """Return a dense layer with orthogonal initial weights of this scale."""
+    """Return a dense layer with orthogonal initial weights of a given scale."""
     return nn.Dense(width, kernel_init=nn.initializers.orthogonal(scale), name=name)
 
 
-def _required(view: CompactView | None) -> CompactView:
+def _required_view(view: CompactView | None) -> CompactView:
     if view is None:
-        raise TypeError("expected `view` for a compact input")
+        raise TypeError("a compact input needs the argument `view`, found None")
     return view

@@ -1,7 +1,7 @@
 """The CNN-GRU actor-critic of teammates and egos (paper, App. B.1 and C.2.1), in a form that is fast on a CPU.
 
-N denotes sequences, T steps. Parameters and outputs are those of the plain form (convolutions and a GRU cell); the
-arithmetic differs: see `encoder`, and the GRU's input products are computed for all steps outside the scan.
+N denotes sequences, T steps. Parameters and outputs equal those of ordinary convolutions and a GRU cell, but the order
+of computation differs: see `encoder`, and the GRU's input products are computed for all steps outside the scan.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def recurrent_states(
 
 
 def _scan_states(hidden, gates, reset, recurrent, bias):
-    """Return the states, and the residuals for their gradient."""
+    """Return the states of a GRU after every step, and the residuals for the gradient."""
     width = recurrent.shape[0]
 
     def step(hidden, inputs):
@@ -76,9 +76,9 @@ def _scan_states(hidden, gates, reset, recurrent, bias):
 
 
 def _states_gradient(saved, to_states):
-    """Return the gradients of all inputs, in up to half the time of JAX's automatic ones.
+    """Return the gradients of all inputs of `recurrent_states`, up to twice as fast as JAX's automatic gradients.
 
-    The loop computes only what depends on the step after it; all else, the weights' gradient above all, is one
+    The loop computes only values that depend on the next step. Everything else, such as the weights' gradient, is one
     operation over all steps.
     """
     (before, r, z, memory, candidate), reset, recurrent = saved
@@ -110,10 +110,10 @@ class ActorCritic(nn.Module):
 
     Args:
         widths: encoder and layer widths.
-        partners: number of policies among which the critic distinguishes the partner (BRDiv, Rahman et al. 2023,
-            Sec. 5); 0 for a critic without that input. The actor never has it.
-        critic: False for policies that only act; their values are 0.
-        view: view that makes the compact inputs; None if all inputs are observations.
+        partners: number of partner policies, for a critic that receives the partner as a one-hot vector (BRDiv, Rahman
+            et al. 2023, Sec. 5); 0 for a critic without this input. The actor never receives the partner.
+        critic: whether to compute values; False for policies that only act, which return the value 0.
+        view: view that computes the compact inputs; None if all inputs are observations.
     """
 
     widths: Widths = Widths()
@@ -152,7 +152,7 @@ class ActorCritic(nn.Module):
         )(obs)
         hidden, states = GRU(widths.gru, name="gru")(hidden, features, reset)
         actor = nn.relu(orthogonal_dense(widths.head, 2.0, "actor_hidden")(states))
-        # Small weights: an untrained policy is nearly uniform.
+        # Small weights make an untrained policy nearly uniform.
         logits = orthogonal_dense(len(ACTIONS), 0.01, "actor")(actor)
         if not self.critic:
             return hidden, logits, jnp.zeros(logits.shape[:2])
@@ -165,7 +165,7 @@ class ActorCritic(nn.Module):
         return hidden, logits, value[..., 0]
 
     def untrained(self, key: Array, channels: int) -> Any:
-        """Return initial parameters for observations 5 x 5 x channels."""
+        """Return random initial parameters for observations of shape (5, 5, channels)."""
         obs = jnp.zeros((1, 1, WINDOW, WINDOW, channels), jnp.uint8)
         return self.init(key, self.initial_hidden(1), obs, jnp.ones((1, 1), bool))
 
@@ -175,6 +175,6 @@ class ActorCritic(nn.Module):
 
 
 def _orthogonal_gates(key: Array, shape: tuple[int, int], dtype=jnp.float32) -> Array:
-    # Each gate is orthogonal by itself, as in Flax, so that returns do not depend on the fused form.
+    # Each gate's matrix is orthogonal, as in Flax, so fusing the gates does not change training.
     one = nn.initializers.orthogonal()
     return jnp.concatenate([one(k, (shape[0], shape[0]), dtype) for k in jax.random.split(key, 3)], axis=1)

@@ -1,9 +1,9 @@
 """Recurrent PPO for egos and populations (paper, App. B.1 and C.2).
 
-T denotes the steps of a roll-out, M the agent slots of one policy: pairs of an environment and one of its two agents
+T denotes the steps of a rollout, M the agent slots of one policy: pairs of an environment and one of its two agents
 that the policy controls. A sequence is the T steps of one slot. Minibatches consist of complete sequences, because the
-recurrent state is recomputed from the one before the first step. The network's inputs are made once per roll-out. The
-algorithms for egos and populations differ only in the partner and in the weight of each sequence's advantage.
+recurrent states are computed again from the state before the first step. The network's inputs are computed once per
+rollout. The algorithms for egos and populations differ only in the partner and in the weight of each advantage.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ def shaping_weight(config: PPOConfig, update: Int[Array, ""]) -> Float[Array, ""
 
 
 class Sequences(NamedTuple):
-    """T steps in the M agent slots of one policy. Slots are on axis 1 of every array.
+    """Sequences of T steps in the M agent slots of one policy; slots are on axis 1 of every array.
 
     Attributes:
         seen: the network's input, leaves (T, M, ..).
         reset: bool (T, M), whether the record starts an episode.
         action: int32 (T, M), the actions taken, 0..5.
-        log_prob: float32 (T, M), log-probability of the action when it was played.
-        value: float32 (T, M), the critic's estimate when it was played.
+        log_prob: float32 (T, M), log-probability of the action in the rollout.
+        value: float32 (T, M), the critic's estimate in the rollout.
         reward: float32 (T, M), the team's reward plus the agent's shaped reward times its weight.
         done: bool (T, M), whether the step ended an episode.
         hidden: float32 (1, M, H), recurrent state before the first step.
         partner: int32 (1, M), number of the other agent's policy, an input of the critic.
         weight: float32 (1, M), factor of the advantage; negative to minimize the return.
         last_value: float32 (1, M), the critic's estimate for the observation after the last step.
-        expert: int32 (T, M), an expert's actions in the same states, to be imitated as well; None for none.
-        imitation: float32 (1, M), weight of the cross-entropy of these actions; None for none.
+        expert: int32 (T, M), an expert's actions in the same states, which are also imitated; None without an expert.
+        imitation: float32 (1, M), weight of the cross-entropy of the expert's actions; None without an expert.
     """
 
     seen: Seen
@@ -84,18 +84,18 @@ def sequences(
     """Return the sequences in one player's agent slots, all with partner 0 and weight 1.
 
     Args:
-        view: makes the network's input of state records.
-        rollout: the roll-out.
-        player: number of the player in the roll-out.
+        view: view that converts state records to inputs of the network.
+        rollout: the rollout.
+        player: number of the player in the rollout.
         agent_slots: int (M,), the player's slots; slot a * N + n is agent a of environment n.
-        hidden: float32 (M, H), the player's recurrent state before the roll-out.
-        last_value: float32 (M,), the critic's estimates for the observations after the roll-out.
+        hidden: float32 (M, H), the player's recurrent state before the rollout.
+        last_value: float32 (M,), the critic's estimates for the observations after the rollout.
         shaping: float32 scalar or (M,), weight of shaped rewards.
         forgiveness: shaped reward of a wrong delivery, see `PPOConfig`.
     """
     agent, env = np.divmod(agent_slots, rollout.done.shape[1])
     choice = rollout.choices[player]
-    # Presses of both agents cost less than a wrong delivery, so the team's reward shows whether there was one.
+    # Two button presses cost less than a wrong delivery, so the team's reward reveals a wrong delivery.
     shaped = rollout.shaped[:, env, agent] + forgiveness * (rollout.reward[:, env] < 2 * PRESS_REWARD)
     return Sequences(
         seen=view(slot_records(rollout.record, agent_slots)),
@@ -119,7 +119,7 @@ class RecurrentNetwork(Protocol):
         """Return the recurrent state after T steps of M sequences, logits (T, M, A), and values (T, M).
 
         Args:
-            variables: the parameters.
+            variables: parameters of the network.
             inputs: recurrent state before the first step (M, H), and `seen`, `reset` and `partner` as in `Sequences`.
         """
         ...
@@ -140,22 +140,22 @@ class PPO:
     def learn(
         self, params: Any, optimizer: optax.OptState, played: Sequences, key: Key[Array, ""]
     ) -> tuple[Any, optax.OptState, dict[str, Array]]:
-        """Update a policy with `config.epochs` passes over the sequences of one roll-out.
+        """Update a policy with `config.epochs` passes over the sequences of one rollout.
 
-        Minibatches are of equal size; the remaining sequences are skipped, different ones in every epoch.
+        Minibatches have equal size; every epoch skips the sequences that remain after shuffling.
 
         Args:
             params: parameters of the network.
             optimizer: state of `ppo_optimizer`.
-            played: the sequences.
-            key: shuffles the sequences.
+            played: sequences of the rollout.
+            key: JAX key that shuffles the sequences.
 
         Returns:
-            New parameters and optimizer state, and loss -> mean over all minibatches, float32 ().
+            New parameters, new optimizer state, and the mean of each loss over all minibatches by name, float32 ().
         """
         config, adam = self.config, ppo_optimizer(self.config)
         count = played.done.shape[1] - played.done.shape[1] % config.minibatches
-        # From the values at playing time: advantages and targets stay fixed over the epochs.
+        # Advantages and targets use the values of the rollout, so they are fixed over the epochs.
         advantage = generalised_advantage(played.reward, played.value, played.done, played.last_value[0], config)
         batch = Batch(played, advantage, advantage + played.value)
 
@@ -177,7 +177,7 @@ class PPO:
     def loss(self, params: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
         """Return the loss of a minibatch, and its parts by name: clipped surrogate, clipped value error, entropy.
 
-        If an expert's actions are given, their cross-entropy is a part, too (kickstarting, Schmitt et al. 2018).
+        If an expert's actions are given, the loss includes their cross-entropy (kickstarting, Schmitt et al. 2018).
         Source: paper, App. B.1, table of PPO hyper-parameters; Schulman et al. 2017, eq. 7.
         """
         config, played = self.config, batch.played
@@ -186,11 +186,11 @@ class PPO:
         log_probs = jax.nn.log_softmax(logits)
         log_prob = jnp.take_along_axis(log_probs, played.action[..., None], axis=-1)[..., 0]
         ratio = jnp.exp(log_prob - played.log_prob)
-        # Weights multiply after the normalization, which would otherwise undo them.
+        # The weights are applied after the normalization, which would otherwise cancel them.
         advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8) * played.weight
         clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
         policy = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
-        # The larger of both errors, so that clipping never hides a value that moved the wrong way.
+        # Use the larger of both errors: clipping must not hide a value that moved in the wrong direction.
         near = played.value + jnp.clip(value - played.value, -config.clip, config.clip)
         error = jnp.maximum((value - batch.target) ** 2, (near - batch.target) ** 2)
         value_loss = 0.5 * error.mean()
@@ -205,10 +205,10 @@ class PPO:
 
 
 class Batch(NamedTuple):
-    """Sequences with their advantages and targets. Agent slots are on axis 1 of every array.
+    """Sequences with advantages and targets; agent slots are on axis 1 of every array.
 
     Attributes:
-        played: the sequences.
+        played: sequences of a rollout.
         advantage: float32 (T, M), generalised advantage estimates.
         target: float32 (T, M), targets of the critic.
     """
@@ -227,7 +227,7 @@ def generalised_advantage(
 ) -> Float[Array, "T M"]:
     """Return generalised advantage estimates (Schulman et al. 2016, eq. 16).
 
-    The end of an episode cuts both the bootstrap and the trace.
+    Neither the bootstrapped value nor the trace continues over the end of an episode.
     """
     following = jnp.concatenate([value[1:], last_value[None]])
     continues = 1.0 - done
@@ -242,7 +242,7 @@ def generalised_advantage(
 
 
 def episode_metrics(rollout: Rollout) -> dict[str, Array]:
-    """Return scalar metrics of a roll-out by name; `return` is the mean over ended episodes, 0 if there are none."""
+    """Return scalar metrics of a rollout by name; `return` is the mean over ended episodes, 0 if none ended."""
     ended = jnp.sum(rollout.done)
     return {
         "episodes": ended,

@@ -1,9 +1,9 @@
-"""Saving and resuming a training: its state, its log, its lock, and when to save.
+"""Save and resume a training: the saved state, the log, the lock of the folder, and the interval of saves.
 
-Every training of this project (egos, populations, in-context learners) is a pure function of its settings and of its
-state after the last update. So it resumes to the same bits if three things hold, and each has one class here:
-`StateFile` restores the state exactly and refuses one of other settings, `RunLog` drops the log lines that came after
-the state was saved, and `run_lock` keeps a second process out of the folder.
+Every training of this project (egos, populations, in-context learners) depends only on its settings and its state after
+the last update. A resumed training gives identical results with three parts of this module: `StateFile` restores the
+exact state and refuses states of other settings, `RunLog` removes log lines written after the state was saved, and
+`run_lock` keeps other processes out of the folder.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from filelock import Timeout
 from flax.traverse_util import flatten_dict
-from jax._src.xla_bridge import backends_are_initialized  # JAX has no public way to ask without initializing
+from jax._src.xla_bridge import backends_are_initialized  # no public function tells this without initializing
 from jax.experimental import multihost_utils
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as to_bytes
@@ -38,18 +38,18 @@ _SUFFIX = ".safetensors"
 
 
 class BusyError(OptionError):
-    """Error: another process is using this folder."""
+    """Error: another process is using the folder."""
 
 
 class OtherSettingsError(OptionError):
-    """Error: the saved state was made with other settings."""
+    """Error: the saved state belongs to other settings."""
 
 
 def xla_threads() -> int | None:
     """Return the number of threads that XLA splits one operation over on this CPU; None on other platforms.
 
-    It decides the order of floating-point sums, and so the bits of everything that is trained. XLA reads it once, when
-    JAX is first used: from `PJRT_NPROC` or `NPROC`, otherwise from the CPU cores that this process may use.
+    The number of threads decides the order of floating-point sums, and so the last bits of all trained parameters. XLA
+    reads the number when JAX is first used, from `PJRT_NPROC` or `NPROC`, or else from the available CPU cores.
     """
     if jax.default_backend() != "cpu":
         return None
@@ -60,22 +60,22 @@ def xla_threads() -> int | None:
 
 
 def limit_xla_threads(threads: int) -> None:
-    """Make XLA split operations over this many threads on a CPU; call before JAX is first used.
+    """Make XLA split operations over a given number of CPU threads; call this before JAX is first used.
 
     Raises:
-        OptionError: if JAX has been used with another number, which can no longer change.
+        OptionError: if JAX is already in use with another number of threads.
     """
     if not backends_are_initialized():
         os.environ[_XLA_THREADS[0]] = str(threads)
     elif xla_threads() not in (None, threads):
         raise OptionError(
             f"XLA runs with {xla_threads()} threads in this process, expected {threads}: set "
-            f"{_XLA_THREADS[0]}={threads} before it starts"
+            f"{_XLA_THREADS[0]}={threads} before the process starts"
         )
 
 
 def software_versions() -> dict[str, str | int | None]:
-    """Return the versions and threads that a resumed training needs to reach the bits of an uninterrupted one."""
+    """Return versions and number of threads that must stay equal for a resumed training to give identical results."""
     return {
         "jax": jax.__version__,
         "platform": jax.default_backend(),
@@ -85,14 +85,14 @@ def software_versions() -> dict[str, str | int | None]:
 
 
 def last_line(path: Path) -> dict[str, Any] | None:
-    """Return the last complete line of a log of JSON lines, perhaps still written; None if there is none."""
+    """Return the last line of a log of JSON lines; None if the log is missing, empty or ends in an incomplete line."""
     with suppress(OSError, ValueError, IndexError):
         return json.loads(path.read_text(encoding="utf-8").splitlines()[-1])
     return None
 
 
 def differing_settings(found: Mapping[str, Any], expected: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Settings that differ, by dotted name: (found, expected), None for a missing one. Tuples equal lists."""
+    """Return pairs (found, expected) of settings that differ, by dotted name; missing settings are None."""
     one, other = (flatten_dict(json.loads(json.dumps(each)), sep=".") for each in (found, expected))
     names = sorted(one.keys() | other.keys())
     return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
@@ -100,10 +100,10 @@ def differing_settings(found: Mapping[str, Any], expected: Mapping[str, Any]) ->
 
 @contextmanager
 def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Hold a folder's lock.
+    """Context manager that holds the lock of a training's folder.
 
     Args:
-        folder: need not exist; its parent is made.
+        folder: the folder, which need not exist; its parent is created.
         wait: whether to wait until another process releases the lock, instead of raising.
 
     Raises:
@@ -113,19 +113,19 @@ def run_lock(folder: Path, *, wait: bool = False) -> Iterator[None]:
         try:
             stack.enter_context(process_lock(lock_path(folder), wait=wait))
         except Timeout as error:
-            message = f"{folder}: another process works in this folder; wait for it, or choose another"
+            message = f"{folder}: another process works in this folder; wait for that process, or choose another folder"
             raise BusyError(message) from error
         yield
 
 
 class SaveInterval:
-    """Schedule for saving a training: after its last update, and whenever an interval has passed.
+    """Schedule for saving a training: after the last update, and after every interval.
 
     Args:
         last: number of the last update.
-        updates: save when the number of updates is a multiple of this.
-        seconds: save when this much time has passed since the last save. Processes must
-            call `save` together but their clocks differ, so one process decides for all.
+        updates: save when the number of updates is a multiple of this number.
+        seconds: save when this many seconds have passed since the last save. Processes that must call `save` together
+            have different clocks, so one process must decide for all.
     """
 
     def __init__(self, last: int, *, updates: int | None = None, seconds: float | None = None) -> None:
@@ -133,7 +133,7 @@ class SaveInterval:
         self._saved = time.monotonic()
 
     def due(self, update: int) -> bool:
-        """Return whether to save after this many updates; a positive answer starts the next interval."""
+        """Return whether to save after the given number of updates; if so, the next interval starts."""
         now = time.monotonic()
         due = (
             update == self._last
@@ -145,7 +145,7 @@ class SaveInterval:
 
 
 class StateFile:
-    """One safetensors file with the state of a training, the settings it belongs to, and its progress.
+    """A safetensors file with the state of a training, the training's settings, and its progress.
 
     Arrays are named by their path in the state's pytree ("params/actor/kernel"); typed keys (of JAX's default kind) are
     stored as their data. Metadata: `format`, `settings` (JSON), `progress` (number of updates). The file
@@ -153,8 +153,8 @@ class StateFile:
     process 0 writes, and every process can `load`.
 
     Args:
-        path: the file, which need not exist.
-        settings: values that JSON can hold; a state saved under others is refused. None accepts any.
+        path: path of the file, which need not exist.
+        settings: settings as JSON values; a state with other settings is refused. None accepts any state.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any] | None = None) -> None:
@@ -165,7 +165,7 @@ class StateFile:
         """Number of updates that led to the saved state; None if nothing is saved.
 
         Raises:
-            OtherSettingsError: if the state was saved under other settings; names the first that differs.
+            OtherSettingsError: if the state was saved with other settings; the message names the first difference.
             OptionError: if the file is damaged.
         """
         if not self.path.is_file():
@@ -182,13 +182,13 @@ class StateFile:
         for name, (found, expected) in different.items():
             resume = f"set {_XLA_THREADS[0]}={found} to resume it, " if name == "xla_threads" and found else ""
             raise OtherSettingsError(
-                f"{self.path}: saved by a training of other settings: {name} was {found!r}, now it is {expected!r}; "
+                f"{self.path}: saved by a training with other settings: {name} was {found!r}, now it is {expected!r}; "
                 f"{resume}remove the file to start again, or choose another folder"
             )
         return progress
 
     def save(self, state: Any, progress: int) -> None:
-        """Write a pytree of arrays and typed keys, sharded or replicated over any devices."""
+        """Save a state: a pytree of arrays and typed keys, sharded or replicated over any devices."""
         arrays = {name: _host_array(leaf) for name, leaf in _named_leaves(state).items()}
         if jax.process_index() == 0:
             metadata = {"format": _FORMAT, "progress": str(progress), "settings": json.dumps(self.settings or {})}
@@ -203,12 +203,12 @@ class StateFile:
 
         Args:
             like: a pytree of arrays or `jax.ShapeDtypeStruct`s with the state's structure, shapes and dtypes; leaves
-                with a sharding are placed by it, the others on the default device.
-            part: path of a subtree in the saved state ("params") to load alone; `like` describes that subtree.
+                without a sharding are placed on the default device.
+            part: path of the only subtree to load, such as "params"; `like` then describes this subtree.
 
         Raises:
-            OtherSettingsError: if the state was saved under other settings.
-            OptionError: if there is no file, if it is damaged, or if it holds other arrays.
+            OtherSettingsError: if the state was saved with other settings.
+            OptionError: if the file is missing or damaged, or contains other arrays.
         """
         if self.progress is None:
             raise self._unreadable("no such file")
@@ -221,7 +221,7 @@ class StateFile:
             raise self._unreadable(str(error)) from error
         expected = {name: _shape_text(_data_shape(leaf)) for name, leaf in wanted.items()}
         found = {name: _shape_text(array) for name, array in saved.items()}
-        # The first difference is enough: a state of another network differs in most arrays.
+        # Report only the first difference, because a state of another network differs in most arrays.
         for name in sorted(expected.keys() | found.keys()):
             if expected.get(name) != found.get(name):
                 raise self._unreadable(
@@ -235,12 +235,12 @@ class StateFile:
 
 
 class Checkpoints:
-    """The latest states of a training, one `StateFile` each: FOLDER/<step>.safetensors.
+    """The latest states of a training, each in a `StateFile` FOLDER/<step>.safetensors.
 
     Args:
-        folder: need not exist.
-        settings: see `StateFile`.
-        keep: how many to keep; older ones are removed.
+        folder: folder of the files, which need not exist.
+        settings: settings of the training, see `StateFile`.
+        keep: number of states to keep; older files are removed.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any] | None = None, keep: int = 2) -> None:
@@ -253,25 +253,25 @@ class Checkpoints:
 
     @property
     def latest(self) -> int | None:
-        """Step of the last checkpoint; None if there is none."""
+        """Step of the last checkpoint; None without a checkpoint."""
         return max(self.steps, default=None)
 
     def at(self, step: int) -> StateFile:
-        """Return the checkpoint of a step."""
+        """Return the state file of the checkpoint of a step."""
         return StateFile(self.folder / f"{step}{_SUFFIX}", self.settings)
 
     def save(self, state: Any, step: int) -> None:
-        """Write a checkpoint, then remove the oldest ones."""
+        """Write a checkpoint, then remove the oldest checkpoints."""
         self.at(step).save(state, step)
         if jax.process_index() == 0:
             for old in self.steps[: -self.keep]:
                 self.at(old).path.unlink()
 
     def load(self, like: Any, part: str = "") -> tuple[Any, int]:
-        """Return the last checkpoint's state, or a part of it, and its step; see `StateFile.load`.
+        """Return the state of the last checkpoint, or a part of the state, and the step; see `StateFile.load`.
 
         Raises:
-            OptionError: if there is no checkpoint, and as `StateFile.load`.
+            OptionError: if no checkpoint exists, or if `StateFile.load` raises the error.
         """
         step = self.latest
         if step is None:
@@ -282,13 +282,13 @@ class Checkpoints:
 class RunLog:
     """The log of a training: FOLDER/metrics.jsonl and FOLDER/timing.jsonl, JSON lines in the order of the updates.
 
-    Metrics are a function of the settings, timing is not, so the two are apart. Opening the log cuts both files at the
-    first line that `keep` refuses: lines that a killed run wrote after its last save, or half a line. Only process 0
-    writes.
+    The timing has a separate file, because unlike the metrics it differs between equal runs. Opening the log cuts both
+    files at the first line that `keep` rejects or that is incomplete, since a killed run may have written lines after
+    its last save. Only process 0 writes.
 
     Args:
         folder: an existing folder.
-        keep: whether a line was written before the state was saved from which the training resumes.
+        keep: function that returns whether a line belongs to an update before the last save.
     """
 
     def __init__(self, folder: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
@@ -296,33 +296,33 @@ class RunLog:
         paths = [folder / METRICS, folder / TIMING]
         if self._writes:
             for path in paths:
-                _cut(path, keep)
+                _truncate_log(path, keep)
         self._metrics, self._timing = (
             (path if self._writes else Path(os.devnull)).open("a", encoding="utf-8") for path in paths
         )
 
     def write(self, *metrics: dict[str, Any], timing: dict[str, Any] | None = None) -> None:
-        """Append lines; readers see them at once."""
+        """Append lines, and flush the files so that readers see the lines at once."""
         for file, lines in ((self._metrics, metrics), (self._timing, [timing] if timing else [])):
             file.writelines(json.dumps(line) + "\n" for line in lines)
             file.flush()
 
     def sync(self) -> None:
-        """Force the metrics to the disk; call before saving the state that they led to."""
+        """Flush the metrics to the disk; call this before saving the state of these updates."""
         if self._writes:
             os.fsync(self._metrics.fileno())
 
     def close(self) -> None:
         """Close both files."""
         for file in (self._metrics, self._timing):
-            with suppress(OSError):  # `write` leaves nothing to be written, unless it has raised the same error
+            with suppress(OSError):  # `write` flushes, so this error was already raised there
                 file.close()
 
 
-def _cut(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
+def _truncate_log(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
     lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
     kept: list[bytes] = []
-    with suppress(ValueError):  # half a line, written by a run that was killed
+    with suppress(ValueError):  # an incomplete line of a killed run
         for line in lines:
             if not (line.endswith(b"\n") and keep(json.loads(line))):
                 break
@@ -333,7 +333,7 @@ def _cut(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
 
 
 def _named_leaves(tree: Any, part: str = "") -> dict[str, Any]:
-    """Return the leaves by path: "params/actor/kernel" for attributes, items and indices alike."""
+    """Return the leaves of a pytree by path, such as "params/actor/kernel"."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves]
     named = {"/".join(filter(None, (part, name))): leaf for name, (_, leaf) in zip(names, leaves, strict=True)}
@@ -343,9 +343,9 @@ def _named_leaves(tree: Any, part: str = "") -> dict[str, Any]:
 
 
 def _file_bytes(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> bytes:
-    """Return a safetensors file whose bytes are a function of its content."""
-    # The library writes metadata in a random order, so they are put into the header of a file that has none. And it is
-    # not `save_file`, which has errors of its own for a full disk.
+    """Return the bytes of a safetensors file, which depend only on the content."""
+    # The library writes metadata in a random order, so this adds metadata to the header of a file without any.
+    # Not `save_file`, which does not raise an OSError for a full disk.
     content = to_bytes(arrays)
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.dumps({"__metadata__": metadata} | json.loads(content[8:end]), separators=(",", ":")).encode()
@@ -367,14 +367,14 @@ def _shape_text(array: Any) -> str:
 
 def _host_array(leaf: Any) -> np.ndarray:
     data = jax.random.key_data(leaf) if _is_key(leaf) else leaf
-    # Parts on devices of other processes have to be gathered, by all processes together.
+    # Parts on devices of other processes must be gathered by all processes together.
     if isinstance(data, jax.Array) and not (data.is_fully_addressable or data.is_fully_replicated):
         data = multihost_utils.process_allgather(data, tiled=True)
     return np.require(np.asarray(data), requirements="C")
 
 
 def _with_sharding(array: np.ndarray, like: Any) -> Any:
-    """Return a loaded array on the devices of `like`, if `like` has a sharding."""
+    """Return a loaded array with the sharding of `like`, or on the default device if `like` has no sharding."""
     sharding = getattr(like, "sharding", None)
     if _is_key(like):
         wrap: Any = jax.random.wrap_key_data

@@ -1,8 +1,8 @@
-"""The one roll-out that learners learn from: N environments, whose 2 N agents are shared out among players.
+"""Rollouts of N environments for all learners, with the 2 N agents divided among players.
 
 N denotes the number of environments, M the number of agent slots of one player, T the number of steps. An *agent slot*
 is one agent of one environment: slot a * N + e is agent a (0 the ego, 1 the teammate) of environment e. A player acts
-in a fixed set of slots, so every environment may pair other players, and a policy may play either agent.
+in a fixed set of slots, so environments may have different pairs of players, and a policy may play either agent.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class Choice(NamedTuple):
 
 
 class Player(NamedTuple):
-    """A policy, or several of one shape, in a fixed set of agent slots.
+    """A policy, or several policies of equal shape, in a fixed set of agent slots.
 
     Attributes:
-        agent_slots: int (M,), NumPy, so that the pairing is known when the roll-out is compiled.
-        init: environment states -> memories at the start of an episode, leaves (M, ...).
-        act: memories, environment states and a key -> choices and the memories after the step.
+        agent_slots: int (M,), a NumPy array, since a compiled rollout needs constant slots.
+        init: function of environment states that returns memories at the start of an episode, leaves (M, ...).
+        act: function of memories, environment states and a key that returns choices and the next memories.
     """
 
     agent_slots: np.ndarray
@@ -51,13 +51,13 @@ class Player(NamedTuple):
 
 
 class RolloutCarry(NamedTuple):
-    """State between two roll-outs.
+    """State of environments and players between two rollouts.
 
     Attributes:
         env: states of the N environments.
         ended: bool (N,), whether the last step ended an episode.
-        memories: one pytree per player, leaves (M, ...).
-        returns: float32 (N,), the team's unshaped reward of the running episode so far.
+        memories: memories of each player, a pytree with leaves (M, ...).
+        returns: float32 (N,), return of the running episode so far, without shaping.
     """
 
     env: EnvState
@@ -67,16 +67,16 @@ class RolloutCarry(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """T steps of N environments.
+    """Recorded T steps of N environments.
 
     Attributes:
         record: uint8 (T, N, S), state records before each step.
         reset: bool (T, N), whether `record` starts an episode.
         actions: int32 (T, N, 2), ids 0..5 of ego and teammate.
-        reward: float32 (T, N), the team's, unshaped.
-        shaped: float32 (T, N, 2), each agent's own shaped reward.
+        reward: float32 (T, N), the team's reward without shaping.
+        shaped: float32 (T, N, 2), shaped reward of each agent.
         done: bool (T, N), whether the step ended an episode.
-        returns: float32 (T, N), return of the episode so far; of the complete episode where `done`.
+        returns: float32 (T, N), return of the episode up to this step.
         choices: one `Choice` per player, leaves (T, M).
     """
 
@@ -91,7 +91,7 @@ class Rollout(NamedTuple):
 
 
 def init_rollout(env: Environment, players: Sequence[Player], keys: Key[Array, " N"]) -> RolloutCarry:
-    """Return the carry before the first step; one key per environment."""
+    """Return the carry before the first step, given one key for each environment."""
     state = env.init(keys)
     n = state.clock.shape[0]
     memories = tuple(player.init(state) for player in players)
@@ -110,14 +110,14 @@ def roll_out(
 
     Args:
         env: the environment.
-        players: players whose agent slots are 0..2N-1, each once.
-        carry: from `init_rollout` or the roll-out before.
-        steps: T.
-        key: for the players' draws; those of the environment come from the environments' own keys.
-        restart: changes the states of environments whose next episode starts, those with `done`.
+        players: players with agent slots that are 0..2N-1 together, each slot once.
+        carry: carry from `init_rollout` or the previous rollout.
+        steps: number T of steps.
+        key: JAX key for the players' random draws; environments use their own keys.
+        restart: function that may change the states of environments that are `done` and start their next episode.
     """
     n = carry.ended.shape[0]
-    # Players' actions are concatenated; this permutation puts them into the order of the slots.
+    # This permutation sorts the concatenated actions of all players by slot.
     order = np.argsort(np.concatenate([player.agent_slots for player in players]))
 
     def step(carry: RolloutCarry, key: Key[Array, ""]) -> tuple[RolloutCarry, Rollout]:
@@ -130,7 +130,7 @@ def roll_out(
         outcome = env.step(carry.env, actions)
         state = restart(outcome.state, outcome.done)
         returns = carry.returns + outcome.reward
-        # The memory of a new episode, in the slots whose environment is done.
+        # Slots of environments that are done get the memory of a new episode.
         memories = tuple(
             select_rows(outcome.done[player.agent_slots % n], player.init(state), memory)
             for player, (_, memory) in zip(players, acted, strict=True)
@@ -151,7 +151,7 @@ def roll_out(
 
 
 def select_rows(which: Bool[Array, " N"], one: Any, other: Any) -> Any:
-    """Return a pytree with the rows of `one` where `which`, and those of `other` elsewhere; rows are on axis 0."""
+    """Return a pytree with rows (axis 0) of `one` where `which` is true, and rows of `other` elsewhere."""
 
     def select(a: Array, b: Array) -> Array:  # leaves may be typed keys
         return jnp.where(which.reshape(which.shape + (1,) * (a.ndim - 1)), a, b)
@@ -167,15 +167,15 @@ def network_player(
     partner: Any,
     greedy: bool | Array = False,
 ) -> Player:
-    """Return a player that acts by one policy of the network, or by several at once.
+    """Return a player that acts by one or several policies of the same network.
 
     Args:
         env: the environment.
-        network: the actor-critic of all its policies.
+        network: actor-critic of all policies of the player.
         params: parameters of one policy for slots (M,); stacked on a leading axis of G policies for slots (G, M).
-        agent_slots: int (M,) or (G, M).
-        partner: int of the shape of `agent_slots`, number of the policy of the other agent, for the critic.
-        greedy: take the most probable action instead of drawing one; bool (), if compiled code decides it.
+        agent_slots: slots of the player, int (M,) or (G, M).
+        partner: number of the other agent's policy in each slot, an int array like `agent_slots`, for the critic.
+        greedy: whether to take the most probable action instead of a random action; may be a traced bool ().
     """
     flat, shape = agent_slots.reshape(-1), agent_slots.shape
     view = network.view or CompactView("paper", (env.only_layout,))
@@ -194,7 +194,7 @@ def network_player(
         apply: Any = jax.vmap(forward) if agent_slots.ndim == 2 else forward
         results = apply(params, hidden, seen, partner)
         hidden, logits, value = (x.reshape(flat.size, *x.shape[agent_slots.ndim :]) for x in results)
-        # Where `greedy` is a constant, the compiler drops the other way.
+        # If `greedy` is a constant, the compiler removes the unused branch.
         action = jnp.where(greedy, jnp.argmax(logits, axis=-1), jax.random.categorical(key, logits))
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), action[:, None], axis=-1)[:, 0]
         return Choice(action, log_prob, value), hidden
@@ -212,18 +212,18 @@ def policy_player(
     own_params: bool = False,
     only: np.ndarray | None = None,
 ) -> Player:
-    """Return a player that does not learn, as one agent of every environment, or of some.
+    """Return a player that follows a fixed policy as one agent of all or some environments.
 
-    Its memory is a function of the episode's own key, so that an episode does not depend on the others of the batch.
+    The initial memory depends only on the episode's key, so an episode does not depend on other episodes of the batch.
 
     Args:
         env: the environment.
-        policy: the policy's functions.
-        params: parameters for all its environments; with `own_params`, stacked on a leading axis, one for each.
-        agent: 0 or 1.
-        envs: N.
-        own_params: whether every environment has parameters of its own.
-        only: int (M,), numbers of its environments; all by default.
+        policy: policy with the functions of the player.
+        params: parameters for all environments; with `own_params`, stacked on a leading axis of environments.
+        agent: 0 for the ego, 1 for the teammate.
+        envs: number N of environments.
+        own_params: whether every environment has separate parameters.
+        only: int (M,), numbers of the player's environments; all by default.
     """
     axis, played = 0 if own_params else None, np.arange(envs) if only is None else only
 
@@ -245,11 +245,11 @@ def policy_player(
 def slot_records(record: UInt8[Array, "*B N S"], agent_slots: np.ndarray) -> UInt8[Array, "*B M S"]:
     """Return the state record of each slot's environment, with the slot's agent as the first agent.
 
-    The network always observes as the first agent; the columns of the two agents are swapped for slots of agent 1.
+    The network always observes as the first agent, so the columns of the two agents are swapped for slots of agent 1.
     """
     n = record.shape[-2]
     agent, env = np.divmod(agent_slots, n)
-    if not agent.any():  # the ego's slots in order need no gather
+    if not agent.any():  # ordered slots of the ego need no gather
         return record if np.array_equal(env, np.arange(n)) else record[..., env, :]
     own = record[..., env, :]
     return jnp.where((agent == 1)[:, None], swap_agents(own), own)

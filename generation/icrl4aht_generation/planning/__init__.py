@@ -1,1 +1,1 @@
-"""The cost of a rebuild: steps, disk space, hours."""
+"""Estimates of the cost of generating a release: steps, disk space, hours."""

@@ -1,7 +1,7 @@
-"""Cost of a rebuild, estimated before it starts: exact counts of steps and bytes, and hours within a factor of about 2.
+"""Estimate the cost of generating a release: counts of steps and bytes, and hours within a factor of about 2.
 
-The network takes most of the time, so its forward pass is measured here. The number of passes of an update follows from
-the hyper-parameters. Stored figures suffice for the speed of the environment and the time to compile.
+The network takes most of the time, so its forward pass is measured on this machine. The number of passes of an update
+follows from the hyper-parameters. Stored numbers give the speed of the environment and the time to compile.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from icrl4aht_generation.populations.build import population_runs
 from icrl4aht_generation.profiles import Profile
 from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
-BYTES: dict[tuple[Kind, str], float] = {
+BYTES_PER_STEP: dict[tuple[Kind, str], float] = {
     ("lite", "ppo"): 1.92,
     ("full", "ppo"): 9.23,
     ("lite", "noise"): 2.79,
@@ -41,29 +41,29 @@ BYTES: dict[tuple[Kind, str], float] = {
 }
 """Bytes of a transition in a release, by kind and source, measured on the bundled release."""
 
-HISTORY_BYTES = {"search": 570}
-"""Further bytes of a history by source, where histories are short: those of 500 and of 1,000 steps were measured."""
+BYTES_PER_HISTORY = {"search": 570}
+"""Additional bytes of each history by source, for sources with short histories (measured at 500 and 1,000 steps)."""
 
 ENVIRONMENT_STEPS_PER_SECOND = 180_000.0
-"""Environment with a scripted teammate, on 2 CPU cores."""
+"""Steps per second of the environment with a scripted teammate on 2 CPU cores."""
 
 COMPILE_SECONDS = 30.0
-"""Programs of a task or a population, on 2 CPU cores."""
+"""Seconds to compile the functions of a task or a population on 2 CPU cores."""
 
 SCRIPTED_SECONDS = 1.0
-"""Writing a task of scripted histories; its program is compiled once for a family of teammates."""
+"""Seconds to write the scripted histories of a task, without compilation, which a family of teammates shares."""
 
-_GRADIENT = 3.1  # time of a gradient step in forward passes: measured with the networks of `smoke` and `paper`
+_GRADIENT = 3.1  # time of a gradient step, in forward passes, measured with the profiles `smoke` and `paper`
 
 
 def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
-    """Estimate a rebuild's cost from the profile, the speed of its networks here, and stored figures.
+    """Estimate the cost of generating a profile's release, from measured network speeds and stored numbers.
 
-    Hours are those of learning, playing and recording: one process trains the populations one after the other, then
-    `devices` devices share the tasks, one task at a time each.
+    Hours include learning, playing and recording. One process trains the populations one after another; then `devices`
+    devices share the tasks, and each runs one task at a time.
 
     Args:
-        profile: the profile.
+        profile: profile of the release.
         devices: number of devices that share the tasks.
 
     Returns:
@@ -72,20 +72,20 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
         teammate_steps: environment steps of all populations.
         tasks: number of tasks.
         learners: number of egos that learn.
-        environment_steps: environment steps of all of them.
+        environment_steps: environment steps of all egos that learn.
         scripted_histories: number of histories that a script plays.
-        scripted_transitions: number of their transitions.
+        scripted_transitions: number of transitions in scripted histories.
         recorded_transitions: transitions of all streams and scripted histories, before the stream filter.
-        kept_transitions: transitions after the stream filter, at most.
+        kept_transitions: maximum number of transitions after the stream filter.
         artefact_bytes: size of the artefacts of all tasks.
         lite_bytes, full_bytes: sizes of a lite and of a full release.
-        device: the device on which the networks were measured.
-        steps_per_second: speed of egos that learn, the mean of all; None without egos.
+        device: device on which the networks were measured.
+        steps_per_second: mean speed of egos that learn; None without such egos.
         teammate_hours: hours to train all populations on one device.
         scripted_hours: hours to play all scripted histories on one device.
-        hours_on_one: hours of the complete rebuild on one device.
+        hours_on_one: total hours on one device.
         devices: number of devices.
-        hours_on_devices: hours of the complete rebuild on this number of devices.
+        hours_on_devices: total hours on this number of devices.
     """
     egos: list[tuple[Layout, PPOConfig]] = []
     scripted: list[tuple[Layout, NoiseConfig]] = []
@@ -110,8 +110,8 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
     scripted_seconds = [count / ENVIRONMENT_STEPS_PER_SECOND + SCRIPTED_SECONDS for count in transitions]
     seconds = [played + COMPILE_SECONDS for played in playing] + scripted_seconds
     teammate_seconds = sum(run.steps * step_seconds(run.config) + COMPILE_SECONDS for run in runs)
-    whole = sum(histories[source] * more for source, more in HISTORY_BYTES.items())
-    sizes = {kind: round(whole + sum(kept[source] * BYTES[kind, source] for source in kept)) for kind in KINDS}
+    extra = sum(histories[source] * more for source, more in BYTES_PER_HISTORY.items())
+    sizes = {kind: round(extra + sum(kept[each] * BYTES_PER_STEP[kind, each] for each in kept)) for kind in KINDS}
     device = jax.devices()[0]
     return {
         "profile": profile.name,
@@ -133,13 +133,13 @@ def estimate_cost(profile: Profile, devices: int) -> dict[str, Any]:
         "scripted_hours": round(sum(scripted_seconds) / 3600, 2),
         "hours_on_one": round((teammate_seconds + sum(seconds)) / 3600, 2),
         "devices": devices,
-        # Each round of tasks takes as long as its longest.
+        # Each round of tasks takes as long as its longest task.
         "hours_on_devices": round((teammate_seconds + sum(sorted(seconds, reverse=True)[::devices])) / 3600, 2),
     }
 
 
 def cost_rows(cost: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield the rows of the printed table of a cost, (quantity, value)."""
+    """Yield the rows (quantity, value) of the printed table of a cost estimate."""
     for key, value in cost.items():
         name = key.replace("_", " ")
         if key.endswith("_bytes"):
@@ -151,21 +151,21 @@ def cost_rows(cost: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def step_seconds(config: PPOConfig) -> float:
-    """Return the time of one environment step of a learner: acting, the environment, and learning in all epochs."""
+    """Return the seconds per environment step of a learner: acting, the environment, and learning in all epochs."""
     passes = 1 + _GRADIENT * config.epochs
-    # Layouts differ in the number of channels, which only the first layer of the network depends on.
+    # One layout is enough: layouts differ in the number of channels, which only affects the network's first layer.
     return passes * forward_seconds(get_layout("demo_wide"), config) + 1 / ENVIRONMENT_STEPS_PER_SECOND
 
 
 @lru_cache(maxsize=16)
 def forward_seconds(layout: Layout, config: PPOConfig) -> float:
-    """Measure the forward pass of a learner's network on one minibatch; return its time per step."""
+    """Measure the forward pass of a learner's network on one minibatch, and return the seconds per step."""
     steps, count = config.rollout, config.environments // config.minibatches
     view = CompactView(config.widths.encoder, (layout,))
     network = ActorCritic(config.widths, view=view)
     shapes = jax.eval_shape(lambda key: network.untrained(key, layout.channels), jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    # The same in all environments: encoder `words` computes equal observations once, and in training most are.
+    # All environments have equal records, because most observations in training are equal, which `words` exploits.
     record = np.random.default_rng(0).integers(0, 256, (steps, 1, record_size(layout)), np.uint8)
     records = jnp.asarray(np.repeat(record, count, axis=1))
     reset = jnp.zeros((steps, count), bool)
@@ -178,10 +178,10 @@ def forward_seconds(layout: Layout, config: PPOConfig) -> float:
         jax.block_until_ready(forward(params, records))
 
     call()  # compiles
-    # The fastest of a few calls, since other programs may slow some down.
+    # Take the fastest of a few calls, because other programs may slow down some calls.
     return min(repeat(call, number=1, repeat=3)) / (steps * count)
 
 
 def artefact_bytes(egos: Iterable[tuple[Layout, PPOConfig]]) -> int:
-    """Return the uncompressed size of the histories of egos."""
+    """Return the uncompressed size in bytes of the histories of all egos."""
     return sum(arrays_bytes(array_shapes(layout, ego.environments, ego.episodes)) for layout, ego in egos)

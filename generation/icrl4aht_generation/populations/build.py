@@ -1,4 +1,4 @@
-"""Builds a suite of learned teammates, and reports how they differ."""
+"""Build a suite of learned teammates, and report how much the teammates differ."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ from icrl4aht_generation.populations.train import (
     suite_checkpoints,
 )
 from icrl4aht_generation.profiles import Profile
-from icrl4aht_generation.teammates.distances import act_along, hamming_distances
+from icrl4aht_generation.teammates.distances import act_on_records, hamming_distances
 from icrl4aht_generation.teammates.instances import published_teammates
 from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.references import REFERENCE_EGOS, stacked_families
 from icrl4aht_generation.teammates.registry import build_teammate
 
-_EPISODES = 2  # of each policy, whose states are compared
+_EPISODES = 2  # number of episodes with each policy for the compared states
 
 
 def build_suite(
@@ -56,24 +56,24 @@ def build_suite(
     console: Console,
     options: QueueOptions | None = None,
 ) -> list[TeammateSelection]:
-    """Train what is unfinished, then write manifests of tasks with the teammates of every finished population.
+    """Train unfinished populations, then write manifests of tasks with teammates of every finished population.
 
-    Populations that another process is training are skipped, and awaited at the end.
+    Populations that another process is training are skipped at first, and awaited at the end.
 
     Args:
-        profile: sizes of the populations.
+        profile: profile with the sizes of the populations.
         suite: the suite's folder.
-        algorithms: layout -> algorithms.
+        algorithms: names of the algorithms for each layout.
         seed: seed of the suite.
         console: where progress is printed.
-        options: how populations are trained.
+        options: options of the queue that trains the populations.
 
     Returns:
         The selected teammates of each population in `algorithms`.
 
     Raises:
         FailedJobsError: if a population could not be trained.
-        UnknownNameError: for an unknown algorithm.
+        UnknownNameError: if an algorithm does not exist.
     """
     for name in chain(*algorithms.values()):
         check_choice("algorithm", name, ALGORITHMS)
@@ -100,7 +100,7 @@ def build_suite(
 
 
 def population_runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], seed: int) -> list[PopulationRun]:
-    """Return the populations by these algorithms of each layout, each with a seed of its own."""
+    """Return the populations to train for each layout and algorithm, with different seeds."""
     config = profile.teammates
     return [
         PopulationRun(
@@ -116,24 +116,24 @@ def population_runs(profile: Profile, algorithms: Mapping[str, Sequence[str]], s
 
 
 def training_layouts() -> list[str]:
-    """Return the layouts of all training tasks."""
+    """Return the names of all layouts with training tasks."""
     return list(dict.fromkeys(name for track in TRACKS for name in track_layouts(track, "train")))
 
 
 def report_diversity(
     suite: Path, layouts: Sequence[str], algorithms: Sequence[str], greedy: bool, console: Console
 ) -> None:
-    """Print, for each layout, self-play and cross-play of every population and the distances of families.
+    """Print self-play and cross-play returns of populations, and distances between families, for each layout.
 
     Args:
         suite: the suite's folder.
-        layouts: names; by default the layouts that have all their populations.
-        algorithms: the populations.
+        layouts: names of layouts; by default all layouts with a finished population of every algorithm.
+        algorithms: algorithms of the populations.
         greedy: whether teammates take their most probable actions.
         console: where to print.
 
     Raises:
-        OptionError: if a population is not finished, or no layout has all of them.
+        OptionError: if a population is not finished, or no layout has all populations.
     """
     names = list(dict.fromkeys(get_layout(name).name for name in layouts)) or [
         name for name in training_layouts() if all(is_trained(suite, name, algorithm) for algorithm in ALGORITHMS)
@@ -141,7 +141,7 @@ def report_diversity(
     if not names:
         raise OptionError(
             f"{suite}: no layout has all its populations finished; `icrl4aht-data teammates --suite {suite}` "
-            f"trains them, or name a --layout"
+            f"trains populations, or choose a --layout"
         )
     for name in names:
         layout = get_layout(name)
@@ -179,37 +179,37 @@ def _report_distances(suite: Path, layout: Layout, algorithms: Sequence[str], co
 
 
 def _matrix_text(names: list[str], values: np.ndarray) -> str:
-    """Return a square matrix as text, with the same names for rows and columns."""
+    """Return a square matrix as text, with equal names of rows and columns."""
     return pd.DataFrame(values, names, names).to_string(float_format="{:.2f}".format)
 
 
 def actions_on_common_states(
     layout: Layout, policies: Sequence[Policy], seed: int = 0, steps: int = EPISODE_STEPS
 ) -> np.ndarray:
-    """Return actions of every policy, as the teammate, on the same states.
+    """Return the actions of every policy as the teammate on the same states.
 
-    The states are those of roll-outs with a uniformly random ego and each policy in turn as the teammate, two episodes
-    each. Every policy acts on every state; its memory follows the episode that it observes.
+    The states are from two episodes of each policy with a uniformly random ego. Every policy acts on every state, with
+    the memory of a teammate that observed the episode up to this state.
 
     Returns:
-        int8 (policies, states), states = policies x 2 x steps.
+        Actions int8 (policies, states), with states = policies x 2 x steps.
     """
     env, key = Environment(layout, steps), jax.random.key(seed)
     played = [_visited_records(env, *family, key) for family in stacked_families(policies)]
     records = jnp.concatenate(played, axis=1)  # (T, episodes, S)
-    return act_along(layout, policies, records, seed).reshape(len(policies), -1)
+    return act_on_records(layout, policies, records, seed).reshape(len(policies), -1)
 
 
 def family_distances(distances: np.ndarray, families: Mapping[str, Sequence[int]]) -> np.ndarray:
-    """Return mean distances of families, over all pairs of their policies: (P, P) -> float64 (F, F).
+    """Return mean distances between F families over all pairs of their policies, float64 (F, F).
 
-    Within a family, pairs of a policy with itself count too, as in the paper's formula.
+    Within a family, pairs of a policy with itself also count, as in the paper's formula.
     """
     return np.array([[distances[np.ix_(a, b)].mean() for b in families.values()] for a in families.values()])
 
 
 def _visited_records(env: Environment, numbers: list[int], family: Policy, key: Any) -> jax.Array:
-    """Return records uint8 (T, policies x 2, S) of a random ego with each policy of the family."""
+    """Return state records, uint8 (T, policies x 2, S), of a random ego with each policy of a family."""
     n = len(numbers) * _EPISODES
 
     @jax.jit

@@ -1,4 +1,4 @@
-"""Return of learned policies with each other, over complete training episodes, by one compiled roll-out."""
+"""Returns of learned policies with each other over complete training episodes, in one compiled rollout."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.rollout import Player, init_rollout, network_player, roll_out
 
 EPISODES_PER_PAIR = 20
-"""Paper, App. B.1."""
+"""Number of episodes for each pair of policies (paper, App. B.1)."""
 
 
 def cross_play_returns(
@@ -32,36 +32,36 @@ def cross_play_returns(
     greedy: bool = False,
     paired: bool = False,
 ) -> np.ndarray:
-    """Return mean returns of all pairs over episodes of 400 steps.
+    """Return the mean returns of pairs of policies over episodes of 400 steps.
 
     Args:
-        layout: the layout.
+        layout: layout on which the policies play.
         network: the network of all policies.
         egos: parameters of A policies, stacked on a leading axis.
-        teammates: parameters of B policies.
+        teammates: parameters of B policies, stacked on a leading axis.
         seed: seed of the episodes and the actions.
-        episodes: episodes of each pair.
-        greedy: whether teammates take their most probable actions, as in the dataset. All other policies draw theirs,
-            as in training, since two greedy policies can block each other for ever.
-        paired: whether only ego i plays with teammate i.
+        episodes: number of episodes of each pair.
+        greedy: whether teammates take their most probable actions, as in the dataset. All other policies sample their
+            actions, as in training, because two greedy policies can block each other forever.
+        paired: whether ego i only plays with teammate i.
 
     Returns:
-        float64 (A, B), or (A,) of pairs.
+        Mean returns of all pairs, float64 (A, B); with `paired`, float64 (A,).
     """
     a, b = (jax.tree.leaves(params)[0].shape[0] for params in (egos, teammates))
     first, second = np.divmod(np.arange(a * b), b)
     if paired:
         first = second = np.arange(a)
-    play = _compiled(layout, network.widths, network.partners, tuple(first), tuple(second), episodes, greedy)
+    play = _compiled_play(layout, network.widths, network.partners, tuple(first), tuple(second), episodes, greedy)
     returns = np.asarray(play(egos, teammates, jax.random.key(seed)), np.float64)
     return returns if paired else returns.reshape(a, b)
 
 
 @lru_cache(maxsize=32)
-def _compiled(
+def _compiled_play(
     layout: Layout, widths: Widths, partners: int, first: tuple, second: tuple, episodes: int, greedy: bool
 ) -> Callable[[Any, Any, jax.Array], jax.Array]:
-    """Return a function of both stacks and a key that returns the mean return of each pair (first[k], second[k])."""
+    """Return a compiled function of egos, teammates and a key that returns mean returns of pairs (first, second)."""
     env, network = Environment(layout), ActorCritic(widths, partners)
     n = len(first) * episodes
     policies = [np.repeat(np.array(side), episodes) for side in (first, second)]

@@ -1,4 +1,4 @@
-"""Selects the teammates of tasks from a suite's checkpoints (paper, App. B.1 "Checkpoint Quality Filtering")."""
+"""Select teammates of tasks from the checkpoints of a suite (paper, App. B.1 "Checkpoint Quality Filtering")."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class TeammateSelection:
     Attributes:
         layout: name of the layout.
         algorithm: the population's algorithm.
-        candidates: number of its checkpoints.
-        good: number of those above the threshold.
+        candidates: number of the population's checkpoints.
+        good: number of checkpoints with returns above the threshold.
         train: teammates of training tasks.
         heldout: teammates of held-out tasks.
     """
@@ -43,18 +43,18 @@ class TeammateSelection:
 def select_teammates(
     suite: Path, layout: str, algorithm: str, train: int, heldout: int, seed: int = 0
 ) -> TeammateSelection:
-    """Draw teammates from the checkpoints whose return as teammates exceeds the threshold.
+    """Select random teammates from the checkpoints with a return, as teammates, above the threshold.
 
-    They are drawn from the sorted list with a fixed seed, from the members in turn: checkpoints of one member resemble
-    each other. If there are too few for both splits, at most a fifth are held out.
+    The members of the population take turns, because checkpoints of one member are similar. If the checkpoints are too
+    few for both splits, at most a fifth of them is held out.
 
     Args:
         suite: the suite's folder.
         layout: name of the layout.
         algorithm: the population's algorithm.
-        train: largest number of training teammates.
-        heldout: largest number of held-out teammates.
-        seed: seed of the draw.
+        train: maximum number of training teammates.
+        heldout: maximum number of held-out teammates.
+        seed: seed of the random selection.
 
     Raises:
         OptionError: if the population is not finished.
@@ -70,14 +70,14 @@ def select_teammates(
 
 
 def _members_in_turn(points: Sequence[SuiteCheckpoint]) -> list[SuiteCheckpoint]:
-    """Return the first of each member in the given order, then the second of each, and so on."""
+    """Reorder checkpoints: the first checkpoint of every member, then the second of every member, and so on."""
     members = pd.Series([point.card["member"] for point in points], dtype=int)
     turns = members.groupby(members).cumcount()
     return [points[k] for k in np.argsort(turns, kind="stable")]
 
 
 def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str) -> list[Task]:
-    """Return one task per teammate, each with a seed that does not depend on the rest of the suite."""
+    """Return one task for each teammate, with a seed that does not depend on the rest of the suite."""
     tasks = []
     for selection in selections:
         first = 10_000 * (layout_number(selection.layout) + 1) + 1_000 * ALGORITHMS.index(selection.algorithm)
@@ -96,7 +96,7 @@ def make_tasks(suite: Path, selections: Sequence[TeammateSelection], split: str)
 
 
 def write_manifests(suite: Path, selections: Sequence[TeammateSelection]) -> list[Path]:
-    """Write SUITE/manifests/<track>_train.jsonl and _heldout.jsonl for the tracks that have teammates; returns them."""
+    """Write and return SUITE/manifests/<track>_train.jsonl and _heldout.jsonl for all tracks with teammates."""
     folder = suite / "manifests"
     folder.mkdir(parents=True, exist_ok=True)
     written = []

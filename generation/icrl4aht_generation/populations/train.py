@@ -1,11 +1,11 @@
-"""The suite of learned teammates: populations trained into folders of checkpoints (paper, App. B.1).
+"""Training of populations of teammates into a suite, a folder of checkpoints (paper, App. B.1).
 
     SUITE/<layout>/<algorithm>/m<member>/c<checkpoint>/policy.safetensors, policy.json
     SUITE/<layout>/<algorithm>/responses/m<member>/...      best responses, if the algorithm trains them
     SUITE/<layout>/<algorithm>/metrics.jsonl, timing.jsonl, population.json
 
-`population.json` is written last and has the hash of every file. Before that, `resume.safetensors` holds the state from
-which a stopped run resumes to the same bytes.
+`population.json` is written last and contains the hash of every file. During training, `resume.safetensors` holds the
+state from which a stopped run resumes with identical results.
 """
 
 from __future__ import annotations
@@ -59,32 +59,32 @@ from icrl4aht_generation.policy import stacked
 from icrl4aht_generation.populations.cross_play import EPISODES_PER_PAIR, cross_play_returns
 
 POPULATION_SAVE_SECONDS = 60.0
-"""Interval of saves: the work that a kill can cost."""
+"""Seconds between two saves; a killed run loses at most the work of this time."""
 
-_SELECTIONS = 10  # how often in a member's training CoMeDi selects the member that it resembles most
+_SELECTIONS = 10  # number of times in a member's training that CoMeDi selects the nearest former member
 RESPONSES = "responses"
-"""Folder of a population's final best responses, if its algorithm trains any."""
+"""Folder name of a population's final best responses, if its algorithm trains best responses."""
 
 POPULATION = "population.json"
-"""The record of a finished population."""
+"""File name of the record of a finished population."""
 
 _RESUME = "resume.safetensors"
 
 
 @dataclass(frozen=True)
 class PopulationRun:
-    """The training of one population on one layout.
+    """Settings of the training of one population on one layout.
 
     Attributes:
-        layout: the layout.
-        algorithm: one of `ALGORITHMS`.
-        members: policies for the suite. CoMeDi trains one more, the first, by self-play alone: the others are compared
-            with it, and it is no teammate itself.
+        layout: layout on which the policies train.
+        algorithm: name of the algorithm, one of `ALGORITHMS`.
+        members: number of policies for the suite. CoMeDi also trains a first policy by self-play, which is only a
+            reference for the other policies and not a teammate.
         config: hyper-parameters of each policy.
-        seed: seed of everything.
+        seed: seed of the training.
 
     Raises:
-        OptionError: for an unknown algorithm, and for sizes that do not fit it.
+        OptionError: if the algorithm does not exist, or the sizes are invalid for the algorithm.
     """
 
     layout: Layout
@@ -108,7 +108,7 @@ class PopulationRun:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The settings that the population depends on."""
+        """All settings that the population depends on."""
         return {
             "layout": self.layout.name,
             "algorithm": self.algorithm,
@@ -121,7 +121,7 @@ class PopulationRun:
 
     @cached_property
     def stages(self) -> list[Population]:
-        """The stages of training, one after the other; CoMeDi trains one policy in each, the first by self-play."""
+        """Successive stages of training; in each stage CoMeDi trains one policy, the first policy by self-play."""
         env = Environment(self.layout)
         if self.algorithm == "comedi":
             first = Population(env, FCP(1), self.config, partners=2)
@@ -131,22 +131,22 @@ class PopulationRun:
 
     @property
     def has_best_responses(self) -> bool:
-        """Whether the members' partners in training are best responses."""
+        """Whether the algorithm trains a best response to each member."""
         return self.algorithm in ("brdiv", "lbrdiv")
 
     @property
     def updates(self) -> int:
-        """Updates of all stages."""
+        """Number of updates of all stages."""
         return len(self.stages) * self.config.updates
 
     @property
     def steps(self) -> int:
-        """Environment steps of all environments and stages."""
+        """Number of environment steps of all environments and stages."""
         return self.config.updates * sum(stage.steps_per_update for stage in self.stages)
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return the record of a finished population; empty if there is none, or it cannot be read."""
+    """Return the record of a finished population; an empty record if the file is missing or invalid."""
     try:
         record = parse_json(read_text(folder / POPULATION))
     except IndexFormatError:
@@ -156,12 +156,12 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class PopulationJob:
-    """The training of a population as a job of a queue, see `jobs.job.Job`.
+    """Training of a population as a job of a queue, see `jobs.job.Job`.
 
     Attributes:
-        population: the population.
+        population: settings of the population.
         suite: folder of the suite.
-        xla_threads: threads of XLA on a CPU; None for all cores.
+        xla_threads: number of CPU threads of XLA; None for all cores.
     """
 
     population: PopulationRun
@@ -171,17 +171,17 @@ class PopulationJob:
 
     @property
     def name(self) -> str:
-        """Layout and algorithm, the population's folder in the suite."""
+        """Name of the job: layout and algorithm, which is also the population's folder in the suite."""
         return f"{self.population.layout.name}/{self.population.algorithm}"
 
     @property
     def label(self) -> str:
-        """Algorithm and layout."""
+        """Text that names the algorithm and the layout."""
         return f"{self.population.algorithm} on {self.population.layout.name}"
 
     @property
     def updates(self) -> int:
-        """Updates of all stages."""
+        """Number of updates of all stages."""
         return self.population.updates
 
     @property
@@ -190,7 +190,7 @@ class PopulationJob:
         return self.suite / self.name
 
     def is_finished(self) -> bool:
-        """Return whether its folder has the population under these settings, with all files unchanged."""
+        """Return whether the folder contains the population of these settings with unchanged files."""
         record = read_record(self.folder)
         try:
             same = record["settings_hash"] == json_hash(self.population.settings)
@@ -199,7 +199,7 @@ class PopulationJob:
             return False
 
     def progress(self) -> tuple[int, float] | None:
-        """Return what the population's timing states."""
+        """Return finished updates and steps per second from the timing file; None before the first update."""
         timing = last_line(self.folder / TIMING)
         if timing is None:
             return None
@@ -211,16 +211,16 @@ class PopulationJob:
         wait: bool = False,
         save_seconds: float = POPULATION_SAVE_SECONDS,
     ) -> None:
-        """Train the population, or resume a stopped run of the same settings; keep a finished one.
+        """Train the population, or resume a stopped run with the same settings; do nothing if it is finished.
 
         Args:
             on_update: called after each update with the number of updates and steps per second.
-            wait: whether to wait for another process that trains it.
-            save_seconds: least time between two saves.
+            wait: whether to wait while another process trains the population.
+            save_seconds: minimum time between two saves.
 
         Raises:
-            BusyError: if another process trains into its folder.
-            OptionError: if the folder holds a run of other settings.
+            BusyError: if another process trains the population and `wait` is false.
+            OptionError: if the folder contains a run with other settings.
         """
         with run_lock(self.folder, wait=wait):
             self.folder.mkdir(exist_ok=True)
@@ -228,7 +228,7 @@ class PopulationJob:
                 _PopulationTraining(self.population, self.folder, on_update, save_seconds).train()
 
     def finished_text(self) -> str:
-        """Return the text on the finished population: steps, speed and the last return in self-play."""
+        """Return a message on the finished population: steps, speed and the last self-play return."""
         metrics, progress = last_line(self.folder / METRICS) or {}, self.progress()
         speed = f" at {progress[1]:,.0f} steps/s (all environments)" if progress else ""
         return (
@@ -238,7 +238,7 @@ class PopulationJob:
 
 
 class _PopulationTraining:
-    """A run in its folder, whose lock is held."""
+    """Training of a population in its folder, while the caller holds the folder's lock."""
 
     def __init__(self, run: PopulationRun, folder: Path, on_update: OnUpdate, save_seconds: float) -> None:
         self.run, self.folder, self.on_update = run, folder, on_update
@@ -249,9 +249,9 @@ class _PopulationTraining:
         if (self.folder / POPULATION).exists():
             found = read_record(self.folder).get("settings") or self.run.settings
             other = {name: was for name, (was, _) in differing_settings(found, self.run.settings).items()}
-            difference = f"of other settings: {other}" if other else "with changed files"
+            difference = f"with other settings: {other}" if other else "with changed files"
             raise OptionError(
-                f"{self.folder}: holds a finished population {difference}; remove it, or give another --suite"
+                f"{self.folder}: contains a finished population {difference}; remove it, or give another --suite"
             )
         done, state = self._resume()
         updates = self.run.config.updates
@@ -262,7 +262,7 @@ class _PopulationTraining:
         self._finish()
 
     def _resume(self) -> tuple[int, PopulationState | None]:
-        """Return the number of updates done over all stages, and the state after them; None at the start."""
+        """Return the number of finished updates of all stages, and the state to resume from; None at the start."""
         done = self.saved.progress
         if done is None:  # remove the checkpoints of a run that was killed before its first save
             for folder in (*self.folder.glob("m[0-9]*"), self.folder / RESPONSES):
@@ -285,20 +285,20 @@ class _PopulationTraining:
                 state = state._replace(params=self._with_nearest_member(state.params, stage, number))
             state, metrics = update(state)
             seconds = time.perf_counter() - started
-            line = self._line(stage, number, metrics)
+            line = self._metrics_line(stage, number, metrics)
             speed = round((number + 1 - first) * population.steps_per_update / seconds, 1)
             log.write(line, timing={"stage": stage, "update": number, "steps_per_second": speed})
             done = stage * updates + number + 1
             self.on_update(done, speed)
-            # Before the state is saved, so that a resumed run has all checkpoints up to its start.
+            # Checkpoints are written before the state, so a resumed run has all earlier checkpoints.
             if number + 1 in moments:
                 self._save_checkpoints(stage, moments.index(number + 1), number + 1, state.params)
             if self.interval.due(done):
                 log.sync()
                 self.saved.save(state, done)
 
-    def _line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
-        """Return a line of the log; means over no episodes are left out."""
+    def _metrics_line(self, stage: int, number: int, metrics: dict[str, Any]) -> dict[str, float]:
+        """Return a line of the metrics log, without mean returns if no episode ended."""
         values = {name: float(value) for name, value in metrics.items()}
         if not values["episodes"]:
             del values["self_play"], values["cross_play"]
@@ -312,13 +312,15 @@ class _PopulationTraining:
         }
 
     def _with_nearest_member(self, params: Any, stage: int, number: int) -> Any:
-        """The parameters with the former member that plays best with the new one as the frozen policy (paper, App.
-        B.1, "Partner Selection")."""
+        """Return the parameters with a new frozen policy: the former member that plays best with the new member.
+
+        Source: paper, App. B.1, "Partner Selection".
+        """
         network, layout = self.run.stages[stage].network, self.run.layout
         last = POLICY_CHECKPOINTS - 1
         former = stacked([load_policy(self.folder / f"m{m}" / f"c{last}")[1] for m in range(stage)])
         new = jax.tree.map(lambda leaf: leaf[:1], params)
-        # As either agent, since layouts are not symmetric.
+        # Add the returns of both orders of the agents, because layouts are not symmetric.
         returns = cross_play_returns(layout, network, new, former, seed=number)[0]
         returns = returns + cross_play_returns(layout, network, former, new, seed=number)[:, 0]
         nearest = int(np.argmax(returns))
@@ -350,14 +352,14 @@ class _PopulationTraining:
             }
             own = jax.tree.map(lambda leaf, k=k: leaf[k], members)
             save_policy(self.folder / f"m{stage + k}" / f"c{checkpoint}", population.network, own, card)
-            # The suite needs only the final best responses: they show what a teammate allows.
+            # Save only final best responses, which show the return that is possible with a teammate.
             if run.has_best_responses and checkpoint == POLICY_CHECKPOINTS - 1:
                 response = jax.tree.map(lambda leaf, k=k: leaf[k], partners)
                 path = self.folder / RESPONSES / f"m{k}"
                 save_policy(path, population.network, response, card | {"role": "best response", "agents": [0]})
 
     def _finish(self) -> None:
-        # The record comes last and names every file: a folder without it is unfinished.
+        # The record is written last and lists every file: a folder without a record is unfinished.
         files = {
             str(path.relative_to(self.folder)): file_hash(path)
             for name in (POLICY_WEIGHTS, POLICY_CARD)
@@ -376,11 +378,11 @@ class _PopulationTraining:
 
 @dataclass(frozen=True)
 class SuiteCheckpoint:
-    """A checkpoint of a suite.
+    """A checkpoint of a learned teammate in a suite.
 
     Attributes:
-        path: relative to the suite's folder.
-        card: its card.
+        path: path relative to the suite's folder.
+        card: description of the checkpoint, see `load_card`.
     """
 
     path: str
@@ -388,19 +390,19 @@ class SuiteCheckpoint:
 
 
 def is_trained(suite: Path, layout: str, algorithm: str) -> bool:
-    """Return whether a suite has this population and it is finished."""
+    """Return whether a suite has a finished population for a layout and an algorithm."""
     return (suite / layout / algorithm / POPULATION).is_file()
 
 
 def population_threads(suite: Path, layout: str, algorithm: str) -> int | None:
-    """Return the number of XLA threads that trained a suite's population; None if the suite does not say."""
+    """Return the number of XLA threads that trained a population; None if the suite does not record the number."""
     return (read_record(suite / layout / algorithm).get("software") or {}).get("xla_threads")
 
 
 def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[SuiteCheckpoint]:
-    """Yield the checkpoints of a population's members, by member and checkpoint.
+    """Yield the checkpoints of a population's members, in the order of members and checkpoints.
 
-    CoMeDi's first policy is excluded, since it is trained by plain self-play.
+    CoMeDi's first policy is excluded, because it was trained only by self-play.
 
     Raises:
         OptionError: if the population is not finished.
@@ -416,17 +418,17 @@ def suite_checkpoints(suite: Path, layout: str, algorithm: str) -> Iterator[Suit
 
 
 def play_matrix(suite: Path, layout: Layout, algorithm: str, greedy: bool = False) -> np.ndarray:
-    """Return mean returns float64 (K, K) of a population's final policies with each other.
+    """Return the mean returns, float64 (K, K), of a population's final policies with each other.
 
     Args:
         suite: the suite's folder.
-        layout: the layout.
+        layout: layout of the population.
         algorithm: the population's algorithm.
         greedy: whether teammates take their most probable actions.
 
     Returns:
-        Rows are egos (best responses, if the algorithm trains them), columns members as teammates; the diagonal is
-        self-play.
+        Matrix with egos as rows (best responses, if the algorithm trains them) and members as teammates as columns;
+        the diagonal is self-play.
 
     Raises:
         OptionError: if the population is not finished.

@@ -1,4 +1,4 @@
-"""Profiles: everything that sizes a rebuild, in TOML. Unknown keys are errors."""
+"""Profiles: TOML files with all settings for generating a release; unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _Return = Annotated[float, Meta(ge=-1e6, le=1e6)]  # a finite number
 
 
 class _Release(Struct, forbid_unknown_fields=True):
-    """Section [release]."""
+    """Fields of the section [release] of a profile."""
 
     data_version: str
     keep: int = 0
@@ -41,7 +41,7 @@ class _Release(Struct, forbid_unknown_fields=True):
 
 
 class _Spread(Struct, forbid_unknown_fields=True, kw_only=True):
-    """Section [tasks.spread], where every value holds for all layouts or is a table of them."""
+    """Fields of the section [tasks.spread], each with one value for all layouts or a table with a value per layout."""
 
     per_layout: Natural | dict[str, Natural]
     ppo: Natural | dict[str, Natural] | None = None
@@ -49,13 +49,13 @@ class _Spread(Struct, forbid_unknown_fields=True, kw_only=True):
 
 
 class _Sampled(_Spread, kw_only=True):
-    """Section [tasks.sampled]."""
+    """Fields of the section [tasks.sampled] of a profile."""
 
     families: _Names | dict[str, _Names]
 
 
 class _Generated(Struct, forbid_unknown_fields=True):
-    """One table of [[tasks.generated]]: generated layouts of a family."""
+    """Fields of a table of [[tasks.generated]], which adds generated layouts of one family."""
 
     family: str
     count: Count
@@ -65,7 +65,7 @@ class _Generated(Struct, forbid_unknown_fields=True):
 
 
 class _Tasks(Struct, forbid_unknown_fields=True):
-    """Section [tasks]."""
+    """Fields of the section [tasks] of a profile."""
 
     layouts: _Names = ()
     generated: tuple[_Generated, ...] = ()
@@ -79,7 +79,7 @@ class _Tasks(Struct, forbid_unknown_fields=True):
 
 
 class _ProfileFile(Struct, forbid_unknown_fields=True):
-    """A profile as TOML has it; the values of hyper-parameters are checked by the classes that they belong to."""
+    """Fields of a profile's TOML file; the classes of hyper-parameters validate their own values."""
 
     release: _Release
     tasks: _Tasks
@@ -99,21 +99,21 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     """Return a profile by name, or by the path of a TOML file.
 
     Args:
-        name: the name or the path.
-        prepare: called with the profile before its teammates are drawn, which starts JAX.
+        name: name of a shipped profile, or path of a TOML file.
+        prepare: called with the profile before its teammates are drawn, which initializes JAX.
 
     Raises:
-        UnknownNameError: for a name that is neither.
-        OptionError: for unknown or missing keys and for values that do not fit; names the file and the key.
+        UnknownNameError: if neither a shipped profile nor a TOML file has the name.
+        OptionError: if keys are unknown or missing, or values are invalid; the message names the file and the key.
     """
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not path.is_file():
         raise unknown("profile", name, profile_names())
-    with _named_errors(path):
-        profile = _profile(path.stem, msgspec.convert(_content(path), _ProfileFile))
+    with _errors_with_path(path):
+        profile = _build_profile(path.stem, msgspec.convert(_read_content(path), _ProfileFile))
     prepare(profile)
-    with _named_errors(path):
-        units = profile.units()  # raises for unknown presets, and for more sampled teammates than there are
+    with _errors_with_path(path):
+        units = profile.units()  # raises for unknown presets and for too many sampled teammates
         if not units and not profile.algorithms:
             raise OptionError(
                 "no tasks: expected teammates in tasks.presets, tasks.sampled, tasks.spread or tasks.algorithms"
@@ -122,59 +122,59 @@ def load_profile(name: str, prepare: Callable[[Profile], None] = lambda profile:
     return profile
 
 
-def _content(path: Path) -> dict[str, Any]:
-    """Return the content of a profile's file; one with a `base` has what it says over the shipped profile's content."""
+def _read_content(path: Path) -> dict[str, Any]:
+    """Return the content of a profile's file; a file with a `base` overrides values of a shipped profile."""
     content = msgspec.toml.decode(path.read_bytes())
     base = content.pop("base", None)
     if base is None:
         return content
     check_choice("base", base, profile_names())
-    return _merged(_content(FOLDER / f"{base}.toml"), content)
+    return _merge_tables(_read_content(FOLDER / f"{base}.toml"), content)
 
 
-def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested tables with the values of `own` over those of `base`."""
-    both = {key: _merged(base[key], own[key]) for key in base.keys() & own.keys() if isinstance(own[key], dict)}
+def _merge_tables(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge nested tables; values of `own` replace values of `base`."""
+    both = {key: _merge_tables(base[key], own[key]) for key in base.keys() & own.keys() if isinstance(own[key], dict)}
     return {**base, **own, **both}
 
 
 @contextmanager
-def _named_errors(path: Path) -> Iterator[None]:
-    """Name the file in errors about its content."""
+def _errors_with_path(path: Path) -> Iterator[None]:
+    """Context manager that adds the file's path to errors about its content."""
     try:
         yield
-    except ValueError as error:  # also of msgspec, and of the parser of TOML
+    except ValueError as error:  # includes errors of msgspec and of the TOML parser
         raise OptionError(f"{path}: {error}") from error
 
 
-def _profile(name: str, content: _ProfileFile) -> Profile:
+def _build_profile(name: str, content: _ProfileFile) -> Profile:
     release, tasks = content.release, content.tasks
     check_version(release.data_version)
-    layouts, sources = _layouts("tasks.layouts", tasks.layouts), _distinct("tasks.sources", tasks.sources)
+    layouts, sources = _layout_names("tasks.layouts", tasks.layouts), _check_distinct("tasks.sources", tasks.sources)
     generated: dict[str, int] = {}
     for one in tasks.generated:
         found = add_layouts(generate_layouts(one.family, one.seed, one.count, split=one.split))
-        names = _distinct("tasks.generated", [*generated, *(layout.name for layout in found)])
+        names = _check_distinct("tasks.generated", [*generated, *(layout.name for layout in found)])
         generated |= dict.fromkeys(names[len(generated) :], one.teammates)
     layouts += tuple(generated)
-    _known("source", "tasks.sources", sources, REBUILT_SOURCES)
+    _check_known("source", "tasks.sources", sources, REBUILT_SOURCES)
     if not layouts and sources != ("search",):
-        raise OptionError("tasks.layouts: none, expected layouts there or in tasks.generated")
+        raise OptionError("tasks.layouts: no layouts; name layouts in tasks.layouts or add tasks.generated")
     preference = PREFERENCE_LAYOUTS["train"] if tasks.preference == ("all",) else tasks.preference
-    _known("layout of the track preference", "tasks.preference", preference, PREFERENCE_LAYOUTS["train"])
+    _check_known("layout of the track preference", "tasks.preference", preference, PREFERENCE_LAYOUTS["train"])
     if bool(preference) != ("search" in sources):
         raise OptionError(
             f"tasks.preference = {list(tasks.preference)}, tasks.sources = {list(sources)}: expected layouts of the "
-            f"track preference with the source search, and none without it"
+            f"track preference with the source search, and no such layouts without this source"
         )
     if "ppo" not in sources:
         release.keep = 0
-    ego, ego_layouts = _section("ego", content.ego, PPOConfig(), layouts)
-    noise, noise_layouts = _section("noise", content.noise, NoiseConfig(), layouts)
-    search, search_layouts = _section("search", content.search, SEARCH, preference)
+    ego, ego_layouts = _read_section("ego", content.ego, PPOConfig(), layouts)
+    noise, noise_layouts = _read_section("noise", content.noise, NoiseConfig(), layouts)
+    search, search_layouts = _read_section("search", content.search, SEARCH, preference)
     algorithms = _by_layout("tasks.algorithms", tasks.algorithms, layouts)
     for key, names in algorithms.items():
-        _known("algorithm", "tasks.algorithms", _distinct(f"tasks.algorithms.{key}", names), ALGORITHMS)
+        _check_known("algorithm", "tasks.algorithms", _check_distinct(f"tasks.algorithms.{key}", names), ALGORITHMS)
     return Profile(
         name=name,
         ego=ego,
@@ -184,43 +184,43 @@ def _profile(name: str, content: _ProfileFile) -> Profile:
         search=search,
         scripted_layouts={"noise": noise_layouts, "search": search_layouts},
         generated=generated,
-        preference=_distinct("tasks.preference", preference),
+        preference=_check_distinct("tasks.preference", preference),
         layouts=layouts,
         sources=sources,
         learners=tasks.learners,
-        presets=_distinct("tasks.presets", tasks.presets),
-        sampled=_sampled(tasks.sampled, layouts, sources) if tasks.sampled else None,
-        spread=SpreadConfig(**_counts("tasks.spread", tasks.spread, layouts, sources)) if tasks.spread else None,
+        presets=_check_distinct("tasks.presets", tasks.presets),
+        sampled=_sampled_config(tasks.sampled, layouts, sources) if tasks.sampled else None,
+        spread=SpreadConfig(**_numbers("tasks.spread", tasks.spread, layouts, sources)) if tasks.spread else None,
         algorithms={each: tuple(algorithms[each]) for each in layouts if algorithms.get(each)},
         xla_threads=content.xla_threads,
         **msgspec.structs.asdict(release),
     )
 
 
-def _section(
+def _read_section(
     name: str, values: dict[str, Any], default: Config, layouts: tuple[str, ...]
 ) -> tuple[Config, dict[str, Config]]:
-    """Return the settings of a section, and those of the layouts with values of their own in its table `layouts`."""
+    """Return the settings of a section, and the settings by layout for layouts in the section's table `layouts`."""
     common = replace_options(default, {key: value for key, value in values.items() if key != "layouts"}, f"{name}.")
     own = _by_layout(f"{name}.layouts", values.get("layouts", {}), layouts)
     return common, {each: replace_options(common, of, f"{name}.layouts.{each}.") for each, of in own.items()}
 
 
-def _sampled(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
-    counts = _counts("tasks.sampled", values, layouts, sources)
+def _sampled_config(values: _Sampled, layouts: tuple[str, ...], sources: tuple[str, ...]) -> SampledConfig:
+    counts = _numbers("tasks.sampled", values, layouts, sources)
     chosen: dict[str, Any] = _by_layout("tasks.sampled.families", values.families, layouts)
-    families = {name: _distinct("tasks.sampled.families", chosen.get(name, ())) for name in layouts}
+    families = {name: _check_distinct("tasks.sampled.families", chosen.get(name, ())) for name in layouts}
     for name in layouts:
-        _known("family", "tasks.sampled.families", families[name], HEURISTIC_KINDS)
+        _check_known("family", "tasks.sampled.families", families[name], HEURISTIC_KINDS)
         if (counts["per_layout"][name] or counts["validation"][name]) and not families[name]:
-            raise OptionError(f"tasks.sampled.families: none for {name}, which has teammates in tasks.sampled")
+            raise OptionError(f"tasks.sampled.families: expected families for {name}, which has sampled teammates")
     return SampledConfig(**counts, families=families)
 
 
-def _counts(
+def _numbers(
     section: str, values: _Spread, layouts: tuple[str, ...], sources: tuple[str, ...]
 ) -> dict[str, dict[str, int]]:
-    """Return the numbers of drawn teammates: field of `SpreadConfig` -> layout -> number."""
+    """Return the numbers of sampled teammates by field of `SpreadConfig` and by layout."""
     given = {"per_layout": values.per_layout, "validation": values.validation}
     given["ppo"] = values.per_layout if values.ppo is None else values.ppo
     tables: dict[str, Any] = {key: _by_layout(f"{section}.{key}", value, layouts) for key, value in given.items()}
@@ -237,34 +237,34 @@ def _counts(
 
 
 def _check_splits(units: Sequence[Work], sampled: SampledConfig | None, spread: SpreadConfig | None) -> None:
-    """Check that no teammate of a layout is in the splits of training and of validation.
+    """Check that no teammate of a layout is both in the training and in the validation split.
 
     Raises:
-        OptionError: if one is, or if a layout has teammates of both tables, which were not compared.
+        OptionError: if a teammate is in both splits, or a layout has both sampled and spread teammates.
     """
     for name in spread.per_layout if spread and sampled else ():
         both = [config.per_layout[name] + config.validation[name] for config in (sampled, spread) if config]
         if all(both):
             raise OptionError(
-                f"{name}: {both[0]} teammates of tasks.sampled and {both[1]} of tasks.spread, whose validation "
-                f"behaviours may train in the other; expected one of them for a layout"
+                f"{name}: {both[0]} teammates of tasks.sampled and {both[1]} of tasks.spread: validation teammates of "
+                f"one section may resemble training teammates of the other; use only one section for a layout"
             )
-    trained = {_behaviour(work) for work in units if work.task.split == "train"}
-    shared = {work.task.task_id for work in units if work.task.split == "validation" and _behaviour(work) in trained}
+    trained = {_teammate_key(work) for work in units if work.task.split == "train"}
+    shared = {work.task.task_id for work in units if work.task.split == "validation" and _teammate_key(work) in trained}
     if shared:
         raise OptionError(
-            f"{len(shared)} of the validation tasks have a teammate that also trains, such as {min(shared)}: leave it "
-            f"out of tasks.presets, or request fewer validation teammates"
+            f"{len(shared)} of the validation tasks have a teammate of a training task, such as {min(shared)}: remove "
+            f"it from tasks.presets, or request fewer validation teammates"
         )
 
 
-def _behaviour(work: Work) -> tuple[Any, ...]:
-    """Return what is equal for units with one teammate on one layout with one dish."""
+def _teammate_key(work: Work) -> tuple[Any, ...]:
+    """Return a key that is equal for units with the same teammate, layout and recipes."""
     return work.task.layout.name, work.task.recipes, teammate_id(work.task.teammate)
 
 
 def _teammates(values: dict[str, Any]) -> TeammateConfig:
-    """Split section [teammates] into the sizes of the suite and the hyper-parameters of its policies."""
+    """Split the section [teammates] into sizes of the suite and hyper-parameters of the policies."""
     sizes = {name: values[name] for name in ("members", "train", "heldout") if name in values}
     rest = {name: value for name, value in values.items() if name not in sizes}
     ppo = replace_options(TeammateConfig().ppo, rest, "teammates.")
@@ -272,27 +272,27 @@ def _teammates(values: dict[str, Any]) -> TeammateConfig:
 
 
 def _by_layout(key: str, value: Mapping[str, Value] | Value, layouts: tuple[str, ...]) -> dict[str, Value]:
-    """Return layout -> value, which is one for all layouts, or a table of some of them."""
+    """Return a value for each layout, from one value for all layouts or from a table of some layouts."""
     if not isinstance(value, Mapping):
         return dict.fromkeys(layouts, value)
-    found = dict(zip(_layouts(key, list(value)), value.values(), strict=True))
+    found = dict(zip(_layout_names(key, list(value)), value.values(), strict=True))
     for name in found:
         if name not in layouts:
             raise OptionError(f"{key}.{name}: expected one of the profile's layouts, {', '.join(layouts)}")
     return found
 
 
-def _distinct(key: str, names: Sequence[str]) -> tuple[str, ...]:
+def _check_distinct(key: str, names: Sequence[str]) -> tuple[str, ...]:
     if len(set(names)) < len(names):
-        raise OptionError(f"{key} = {names!r}: expected names, none twice")
+        raise OptionError(f"{key} = {names!r}: expected different names")
     return tuple(names)
 
 
-def _known(what: str, key: str, names: Sequence[str], valid: Sequence[str] | Mapping[str, Any]) -> None:
+def _check_known(what: str, key: str, names: Sequence[str], valid: Sequence[str] | Mapping[str, Any]) -> None:
     for name in names:
         if name not in valid:
             raise OptionError(f"{key}: {unknown(what, name, valid)}")
 
 
-def _layouts(key: str, names: Sequence[str]) -> tuple[str, ...]:
-    return _distinct(key, [get_layout(name).name for name in names])
+def _layout_names(key: str, names: Sequence[str]) -> tuple[str, ...]:
+    return _check_distinct(key, [get_layout(name).name for name in names])

@@ -1,4 +1,4 @@
-"""Sizes and schedules of histories of the source `noise`."""
+"""Options of histories of the sources `noise` and `search`: their number, length and noise schedules."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.utils.options import Count, Share, check_options
 
 Range = tuple[Share, Share]
-"""Smallest and largest value; every history draws its own, uniformly."""
+"""Minimum and maximum of a uniform distribution, from which a value is drawn for every history."""
 
 _Power = Annotated[float, Meta(gt=0, le=10)]
 
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Learning histories by noise distillation: the chance of a random action falls over a history's episodes.
+    """Options of histories by noise distillation: the chance of a random action falls over a history's episodes.
 
-    A history's chance is `start` until the share `begin` of its episodes, `end` from the share `finish` on, and between
-    them, at the share x of that way, `end + (start - end) * (1 - x) ** power`.
+    The chance is `start` until the share `begin` of the episodes, and `end` from the share `finish` on. In between, x
+    grows from 0 to 1, and the chance is `end + (start - end) * (1 - x) ** power`.
 
     Attributes:
-        histories: histories of each task.
-        episodes: episodes of each history, of 100 steps.
+        histories: number of histories of each task.
+        episodes: number of episodes of each history, of 100 steps each.
         start: chance of a random action before the fall.
         end: chance of a random action after the fall.
         begin: share of the history at which the fall begins.
         finish: share of the history at which the fall ends.
-        power: exponent of the fall; 1 is linear, larger ones fall sooner.
+        power: exponent of the fall; 1 is linear, larger exponents fall sooner.
 
     Raises:
-        OptionError: for a value out of bounds.
+        OptionError: if a value is out of bounds.
     """
 
     histories: Count = 8
@@ -56,11 +56,11 @@ class NoiseConfig:
             if low > high:
                 raise OptionError(f"{name} = {[low, high]}: expected a range [low, high]")
         if self.begin[1] > self.finish[0]:
-            raise OptionError(f"begin = {list(self.begin)}: expected it to end before finish = {list(self.finish)}")
+            raise OptionError(f"begin = {list(self.begin)}: expected values up to finish = {list(self.finish)}")
         if self.start[0] < self.end[1]:
-            raise OptionError(f"start = {list(self.start)}: expected no value below those of end = {list(self.end)}")
+            raise OptionError(f"start = {list(self.start)}: expected no value below the range end = {list(self.end)}")
 
 
 SEARCH = NoiseConfig(start=(0.0, 0.2), begin=(1.0, 1.0))
-"""Default of the source `search`: each history has one chance of a random action until its last episode, so that the
-number of an episode does not tell how well it is played."""
+"""Default of the source `search`: each history has a constant chance of a random action, except in its last episode;
+so the number of an episode does not reveal how well the ego plays."""

@@ -1,4 +1,4 @@
-"""Profile: the sizes of a rebuild, and the artefacts to be made."""
+"""Profile: settings for generating a release, and the units of work that follow from the settings."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ from icrl4aht_generation.teammates.registry import heuristic_teammate, sample_te
 from icrl4aht_generation.teammates.spread import SPREAD_SEED, spread_teammates
 
 LEAST_EPISODES = 5
-"""Episodes of a stream: its start and its end are means over five."""
+"""Minimum number of episodes of a stream, because its initial and final returns are means over five episodes."""
 
 VALIDATION_DRAWS = 1
-"""The base seed of validation teammates; training teammates are drawn with 0, so that no draw is in both splits."""
+"""Base seed of sampled validation teammates; training teammates have base seed 0, so the splits share no teammate."""
 
 _SOURCE_SEEDS, _LAYOUT_SEEDS, _FAMILY_SEEDS, _DRAW_SEEDS = 1_000_000, 10_000, 1_000, 500
 _SPREAD_SEEDS = 250_000
-_UNSAMPLED_SEEDS = 500_000  # tasks with presets and learned teammates come behind those with drawn ones
+_UNSAMPLED_SEEDS = 500_000  # first seed of tasks with presets and learned teammates
 _GENERATED_SEEDS, _LAYOUT_TEAMMATES = 700_000, 16
 
 _GENERATED_DRAWS = {"train": 4, "validation": 5, "test": 6}
-"""Split of a generated layout -> the base seed of its teammates, of the wide ranges `Heuristic.diverse`."""
+"""Base seed of teammates on generated layouts by split; their parameters are sampled from `Heuristic.diverse`."""
 
 
 class Work(NamedTuple):
-    """One artefact to make.
+    """A unit of work: the histories of one task, by one learner or script, which become one artefact.
 
     Attributes:
-        task: the task.
-        source: how its histories are made: "ppo", by an ego that learns, "noise" or "search", by a script.
-        learner: number of the learner among the independent ones of the task.
+        task: task of the histories.
+        source: how the histories are made: "ppo" by an ego that learns, "noise" or "search" by a script.
+        learner: number of the learner among the independent learners of the task.
     """
 
     task: Task
@@ -65,12 +65,12 @@ class Work(NamedTuple):
 
 @dataclass(frozen=True)
 class TeammateConfig:
-    """The suite of learned teammates of each layout; the defaults are the paper's tables (App. B.1).
+    """Sizes of the suite of learned teammates for each layout; the defaults are the paper's tables (App. B.1).
 
     Attributes:
-        members: policies of each algorithm's population.
-        train: teammates of each algorithm for the training tasks.
-        heldout: further ones, for the in-distribution check.
+        members: number of policies in each algorithm's population.
+        train: number of teammates of each algorithm for training tasks.
+        heldout: number of additional teammates of each algorithm, for the in-distribution check.
         ppo: hyper-parameters of every policy.
     """
 
@@ -92,9 +92,9 @@ class SpreadConfig:
     """Numbers of heuristic teammates that differ widely, see `teammates.spread`.
 
     Attributes:
-        per_layout: layout -> number of training teammates, which the source "noise" has all of.
-        ppo: layout -> how many of these, the first ones, learners of the source "ppo" play with.
-        validation: layout -> number of validation teammates, which only the source "noise" has.
+        per_layout: number of training teammates by layout; the source "noise" uses all of them.
+        ppo: number of training teammates by layout that the source "ppo" uses, the first of the list.
+        validation: number of validation teammates by layout, which only the source "noise" uses.
     """
 
     per_layout: dict[str, int]
@@ -105,7 +105,7 @@ class SpreadConfig:
         """Return the teammates of a source on a layout, and the splits of their tasks.
 
         Raises:
-            OptionError: if fewer were measured that differ from the test instances.
+            OptionError: if fewer measured teammates differ from the test teammates.
         """
         count = self.ppo[layout] if source == "ppo" else None
         found = [("train", entry) for entry in self._entries(layout, "train", self.per_layout[layout])[:count]]
@@ -118,10 +118,10 @@ class SpreadConfig:
 
 @dataclass(frozen=True)
 class SampledConfig(SpreadConfig):
-    """Numbers of heuristic teammates drawn from the published train ranges, see `teammates.draws`.
+    """Numbers of heuristic teammates sampled from the published training ranges, see `teammates.draws`.
 
     Attributes:
-        families: layout -> families, which take turns.
+        families: heuristic families by layout, which take turns.
     """
 
     families: dict[str, tuple[str, ...]]
@@ -133,37 +133,38 @@ class SampledConfig(SpreadConfig):
 
 @dataclass(frozen=True)
 class Profile:
-    """The size of a rebuild.
+    """All settings for generating a release.
 
     Attributes:
         name: name of the profile's file.
         ego: hyper-parameters of the egos.
-        teammates: the learned teammates.
+        teammates: sizes and hyper-parameters of the learned teammates.
         data_version: version of the release, SemVer.
-        keep: streams of each task that the release keeps, best first.
+        keep: number of streams of each task that the release contains, best first.
         layouts: names of the layouts.
         sources: how histories are made: "ppo", "noise" and "search", one or more.
-        learners: independent learners of each task of the source "ppo".
-        presets: teammates by the heuristic H4 `utility_greedy`, on every layout and of every source.
-        sampled: teammates by heuristics with sampled parameters.
-        spread: teammates by heuristics that differ widely, on layouts without sampled ones.
-        algorithms: layout -> algorithms of its learned teammates.
-        ego_layouts: layout -> hyper-parameters of its egos, where they differ from `ego`.
-        noise: histories of the source "noise".
-        search: histories of the source "search".
-        scripted_layouts: source -> layout -> its histories, where they differ from `noise` or `search`.
-        generated: generated layout -> number of its drawn teammates.
-        preference: layouts of the source "search": it has their training and validation tasks of the track
-            `preference`, and the other sources have none of these.
-        policies: whether the release has the policies that label its histories.
-        oracle_actions: whether the release has the scripted oracle's action at every step.
-        least_improvement: how much a stream's end must exceed its start to be kept; None keeps the best in any case.
-        least_rise: how much the end of a task's kept histories must exceed their start, on average, for the release to
-            have the task; None has it in any case. Neither holds on layouts where the ego matters with no teammate.
-        xla_threads: threads of XLA on a CPU, so that every machine computes the same bits; None for all cores.
+        learners: number of independent learners of each task of the source "ppo".
+        presets: presets of the heuristic H4 `utility_greedy`, which are teammates on all `layouts`.
+        sampled: numbers of heuristic teammates with sampled parameters.
+        spread: numbers of heuristic teammates that differ widely, on layouts without sampled teammates.
+        algorithms: algorithms of the learned teammates by layout.
+        ego_layouts: hyper-parameters of the egos by layout, for layouts with other values than `ego`.
+        noise: options of histories of the source "noise".
+        search: options of histories of the source "search".
+        scripted_layouts: options by source and layout, for layouts with other values than `noise` or `search`.
+        generated: number of sampled teammates by generated layout.
+        preference: layouts of the source "search", which has the training and validation tasks of the track
+            `preference` on these layouts.
+        policies: whether the release contains the policies that label the histories.
+        oracle_actions: whether the release contains the scripted oracle's action at every step.
+        least_improvement: minimum improvement from the initial to the final return of a stream in the release; None for
+            no minimum.
+        least_rise: minimum mean improvement of a task's histories for a task in the release; None for no minimum.
+            Neither minimum applies to layouts where the ego matters with no teammate.
+        xla_threads: number of CPU threads of XLA, which gives equal bits on every machine; None for all cores.
 
     Raises:
-        OptionError: if the ego's sizes do not fit.
+        OptionError: if sizes of the ego's training are invalid.
     """
 
     name: str
@@ -198,14 +199,14 @@ class Profile:
                 raise OptionError(f"release.keep = {self.keep}: expected 1..{ego.environments * self.learners}")
             if ego.episodes < LEAST_EPISODES:
                 raise OptionError(
-                    f"ego.total_steps gives {ego.episodes} episodes a stream, expected at least {LEAST_EPISODES}"
+                    f"ego.total_steps gives {ego.episodes} episodes in a stream, expected at least {LEAST_EPISODES}"
                 )
 
     def with_ego(self, given: Mapping[str, Any]) -> Profile:
         """Return the profile with some of the ego's hyper-parameters replaced on every layout, nested as in TOML.
 
         Raises:
-            OptionError: if they do not fit.
+            OptionError: if a value is invalid.
         """
         try:
             egos = {layout: replace_options(ego, given) for layout, ego in self.ego_layouts.items()}
@@ -218,7 +219,7 @@ class Profile:
         return self.ego_layouts.get(layout, self.ego)
 
     def scripted_on(self, layout: str, source: str) -> NoiseConfig:
-        """Return the histories that a script plays on a layout (short name), for the source "noise" or "search"."""
+        """Return the options of a layout (short name) for the source "noise" or "search"."""
         common = self.search if source == "search" else self.noise
         return self.scripted_layouts.get(source, {}).get(layout, common)
 
@@ -227,49 +228,49 @@ class Profile:
         return self.preference if source == "search" else self.layouts
 
     def units(self, learned: Sequence[Task] = ()) -> list[Work]:
-        """Return the units of work, by source and layout.
+        """Return all units of work of the profile, by source and layout.
 
         Args:
             learned: training tasks with learned teammates, see `populations.select.make_tasks`.
 
         Raises:
-            OptionError: if a layout has too few draws of sampled teammates.
+            OptionError: if a layout has too few usable sampled teammates.
         """
         units = []
         for source in self.sources:
             for layout in self.layouts_of(source):
                 own = [task for task in learned if task.layout.name == layout and source != "search"]
-                tasks = [*self._heuristic_tasks(layout, source), *(_of_source(task, source) for task in own)]
-                units += self._works(tasks, source)
+                tasks = [*self._heuristic_tasks(layout, source), *(_task_of_source(task, source) for task in own)]
+                units += self._work_units(tasks, source)
         return units
 
     def units_of(self, tasks: Sequence[Task], sources: Mapping[str, str]) -> list[Work]:
         """Return the units of work of given tasks.
 
         Args:
-            tasks: the tasks.
-            sources: task id -> source; other tasks have the profile's first source.
+            tasks: tasks to generate.
+            sources: source by task id; other tasks have the profile's first source.
 
         Raises:
-            OptionError: if a task's source is none of the profile's.
+            OptionError: if the profile does not have a task's source.
         """
         units = []
         for task in tasks:
             source = sources.get(task.task_id, self.sources[0])
             if source not in self.sources:
                 raise OptionError(
-                    f"task {task.task_id}: its source is {source}, those of profile {self.name} are "
-                    f"{', '.join(self.sources)}: choose a profile with both, or leave the task out"
+                    f"task {task.task_id}: the source is {source}, but profile {self.name} has "
+                    f"{', '.join(self.sources)}: choose a profile with this source, or remove the task"
                 )
-            units += self._works([task], source)
+            units += self._work_units([task], source)
         return units
 
-    def _works(self, tasks: Sequence[Task], source: str) -> list[Work]:
+    def _work_units(self, tasks: Sequence[Task], source: str) -> list[Work]:
         learners = self.learners if source == "ppo" else 1
         return [Work(task, source, learner) for task in tasks for learner in range(learners)]
 
     def tasks_on(self, layout: str, source: str) -> int:
-        """Return the number of tasks of a source on a layout, if every population has enough good teammates."""
+        """Return the number of tasks of a source on a layout, assuming enough good teammates in every population."""
         learned = len(self.algorithms.get(layout, ())) * self.teammates.train * (source != "search")
         return len(self._heuristic_tasks(layout, source)) + learned
 
@@ -288,12 +289,12 @@ class Profile:
             make_task(track, split, layout, heuristic_teammate("utility_greedy", preset, number), first + number)
             for number, preset in enumerate(self.presets)
         ]
-        tasks = [_of_source(task, source) for task in tasks]
+        tasks = [_task_of_source(task, source) for task in tasks]
         if layout in self.generated:
             first = _first_seed(source) + _GENERATED_SEEDS + list(self.generated).index(layout) * _LAYOUT_TEAMMATES
             return tasks + [
                 make_task(track, split, layout, entry, first + number)
-                for number, entry in enumerate(_drawn_for(layout, split, self.generated))
+                for number, entry in enumerate(_generated_teammates(layout, split, self.generated))
             ]
         entries = [drawn for config in (self.sampled, self.spread) if config for drawn in config.drawn(layout, source)]
         return tasks + [
@@ -302,12 +303,12 @@ class Profile:
 
     @property
     def hash(self) -> str:
-        """Hash of the profile."""
+        """Hash of all settings of the profile."""
         return json_hash(asdict(self))
 
 
-def _drawn_for(layout: str, split: str, generated: Mapping[str, int]) -> list[dict[str, Any]]:
-    """Return the drawn teammates of a generated layout, which take turns with those of the layouts before it."""
+def _generated_teammates(layout: str, split: str, generated: Mapping[str, int]) -> list[dict[str, Any]]:
+    """Return the sampled teammates of a generated layout; all generated layouts together cycle through the families."""
     first, kinds = sum(generated[name] for name in takewhile(layout.__ne__, generated)), list(HEURISTIC_KINDS)
     return [
         sample_teammate(kinds[number % len(kinds)], number // len(kinds), "diverse", _GENERATED_DRAWS[split])
@@ -316,15 +317,15 @@ def _drawn_for(layout: str, split: str, generated: Mapping[str, int]) -> list[di
 
 
 def _sampled_seed(layout: str, source: str, entry: Mapping[str, Any]) -> int:
-    """Return a seed that no other task has, and that does not depend on the rest of the profile."""
+    """Return a unique seed for a task, which does not depend on the rest of the profile."""
     family = list(HEURISTIC_KINDS).index(entry["family"])
     first = LAYOUT_NAMES.index(layout) * _LAYOUT_SEEDS + family * _FAMILY_SEEDS
     first += _SPREAD_SEEDS if entry["base_seed"] == SPREAD_SEED else entry["base_seed"] * _DRAW_SEEDS
     return _first_seed(source) + first + entry["theta_id"]
 
 
-def _of_source(task: Task, source: str) -> Task:
-    """Return a task with a preset or a learned teammate as one of a source: those of "ppo" keep their seed."""
+def _task_of_source(task: Task, source: str) -> Task:
+    """Return a task, with a preset or a learned teammate, with the seed of its source; "ppo" keeps the task's seed."""
     if source == "ppo":
         return task
     seed = _first_seed(source) + _UNSAMPLED_SEEDS + task.seed

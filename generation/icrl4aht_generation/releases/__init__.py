@@ -1,1 +1,1 @@
-"""Releases made of collected histories."""
+"""Releases that are packed from generated histories."""

@@ -1,4 +1,4 @@
-"""Rebuild a release: train the teammates of a profile, collect its tasks, and pack them."""
+"""Generate a release: train the teammates of a profile, generate histories of its tasks, and pack the release."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from icrl4aht_generation.releases.measures import learned_headroom, teammate_fac
 from icrl4aht_generation.releases.package import check_release_folder, package_release
 
 SUITE = "suite"
-"""Name of the suite's folder in a rebuild."""
+"""Name of the suite's folder in the output folder of `generate`."""
 
 _PACKING_LOCK = ".packing.lock"
 
@@ -44,29 +44,29 @@ def build_releases(
     tasks: Sequence[Task] | None = None,
     sources: Mapping[str, str] | None = None,
 ) -> list[Path]:
-    """Train the teammates and collect the tasks that are unfinished, then write out/<kind> for each kind.
+    """Train unfinished teammates, generate unfinished tasks, then write a release out/<kind> for each kind.
 
     Args:
-        profile: the profile.
-        out: folder of the rebuild; tasks are collected under out/artefacts.
+        profile: settings for the release.
+        out: output folder; histories are generated under out/artefacts.
         kinds: kinds of releases.
         console: where progress is printed.
-        options: how populations are trained and tasks collected.
+        options: options of the queues of populations and tasks.
         suite: folder of the learned teammates: a suite, by default out/suite, or with `tasks` also the folder
             TEAMMATES of a release.
         seed: seed of the suite.
-        tasks: tasks to collect instead of the profile's, which trains no teammates.
-        sources: task id -> source of these tasks, where it is not the profile's first one.
+        tasks: tasks to generate instead of the profile's tasks; no teammates are trained then.
+        sources: source of each given task by task id; by default the profile's first source.
 
     Returns:
         The release folders.
 
     Raises:
-        FailedJobsError: if a task could not be collected; nothing is packed then.
-        OptionError: if `out` has files that no rebuild makes, if something but a release of this profile is at
-            out/<kind>, or if matplotlib is not installed.
+        FailedJobsError: if a task failed; nothing is packed then.
+        OptionError: if `out` has files that this function does not write, if out/<kind> is not a release of this
+            profile, or if matplotlib is not installed.
     """
-    check_can_draw()  # fail before the long training, not after it
+    check_can_draw()  # fail before the long training and not at its end
     for kind in kinds:
         check_release_folder(out / kind, profile)
     options = options or QueueOptions()
@@ -82,7 +82,7 @@ def build_releases(
     run_jobs(jobs, out, console, options)
     tasks = list({work.task.task_id: work.task for work in units}.values())
     artefacts, releases = out / "artefacts", [out / kind for kind in kinds]
-    with process_lock(out / _PACKING_LOCK):  # another collector on this folder packs the same releases
+    with process_lock(out / _PACKING_LOCK):  # another process with this folder packs the same releases
         facts = teammate_facts(tasks, artefacts, suite, headroom)
         for kind, release in zip(kinds, releases, strict=True):
             with progress_bars(unit="tasks") as show:
@@ -96,14 +96,14 @@ def build_releases(
 def train_teammates(
     profile: Profile, suite: Path, seed: int, console: Console, options: QueueOptions
 ) -> tuple[list[Work], dict[str, ReferenceEgos], list[LeftOutTask]]:
-    """Return the units of work of a profile, for which its learned teammates are trained first.
+    """Train the learned teammates of a profile, then return the profile's units of work.
 
     Returns:
-        The units; task id -> how much an ego matters with learned teammates; the tasks that are not collected, because
-        it does not.
+        The units, the returns of reference egos with learned teammates by task id, and the tasks that are left out
+        because the ego's actions do not matter.
 
     Raises:
-        FailedJobsError: if there is no task, because no teammate is good enough.
+        FailedJobsError: if no task remains, because no teammate is good enough.
     """
     if not profile.algorithms:
         return profile.units(), {}, []
@@ -123,8 +123,8 @@ def train_teammates(
             left_out.append(LeftOutTask(task.task_id, task.layout.name, name, work.source, 0, 0, None, None, reason))
     if not units and left_out:
         raise FailedJobsError(
-            f"{suite}: the ego matters with none of the learned teammates: train others, or add drawn heuristics "
-            f"([tasks.sampled]) to profile {profile.name}"
+            f"{suite}: no reference ego earns more than another with any learned teammate: train other teammates, or "
+            f"add sampled heuristics ([tasks.sampled]) to profile {profile.name}"
         )
     if not units:
         names = dict.fromkeys(chain(*profile.algorithms.values()))

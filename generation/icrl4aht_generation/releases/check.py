@@ -1,4 +1,4 @@
-"""Compares two rebuilds bit for bit."""
+"""Compare two generated releases bit for bit."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from icrl4aht_generation.learners.resume import TIMING
 from icrl4aht_generation.populations.train import POPULATION
 
 _IGNORED = {TIMING, FAILED, LABELLER_RETURNS}
-"""Files about the course of a rebuild, and those that packing adds to artefacts."""
+"""Names of files that are not compared: speeds, failures, and measurements that packing adds to artefacts."""
 
 _TEXT = {".json", ".jsonl", ".md", ".sha256"}
 
 
 @dataclass
 class Comparison:
-    """Result of a comparison.
+    """Result of a comparison of two folders.
 
     Attributes:
         files: number of files in either folder.
-        differences: file -> how it differs.
-        xla_threads: the numbers of XLA threads that made each folder, as far as they were recorded; results of
-            different numbers differ in their bits.
+        differences: description of the difference by file.
+        xla_threads: recorded numbers of XLA threads that generated each folder; the last bits of results depend on the
+            number.
     """
 
     files: int = 0
@@ -42,10 +42,10 @@ class Comparison:
 def compare_rebuilds(a: Path, b: Path) -> Comparison:
     """Compare two folders by the hashes of their files.
 
-    Wall-clock figures, failures, hidden files and what packing adds to artefacts are left out.
+    Speeds, failures, hidden files, and files that packing adds to artefacts are not compared.
 
     Raises:
-        OptionError: if one is not a folder, or there is nothing to compare.
+        OptionError: if a path is not a folder, or neither folder has files to compare.
     """
     for folder in (a, b):
         if not folder.is_dir():
@@ -70,7 +70,7 @@ def _files(root: Path) -> set[str]:
 
 
 def _xla_threads(root: Path, names: set[str]) -> list[int]:
-    """Return the numbers of XLA threads in records of tasks, populations and releases."""
+    """Return the numbers of XLA threads in the records of tasks, populations and releases in a folder."""
     records = [root / name for name in names if name.endswith((METADATA, POPULATION, PROVENANCE))]
     found = {number for path in records for number in re.findall(rb'"xla_threads":\s*(\d+)', path.read_bytes())}
     return sorted(map(int, found))

@@ -1,9 +1,9 @@
-"""Choice of the ego checkpoint that labels a task's histories, by returns with the task's teammate.
+"""Choose the ego checkpoint that labels a task's histories, by returns with the task's teammate.
 
-The labeller is the last checkpoint, the paper's, unless an earlier one earns clearly more when it acts greedily, as
-labellers do. A policy that was trained to draw its actions can repeat the action "stay" when it always takes the most
-probable one, and a model that is trained on its labels would learn to do so, too. Of several independent learners the
-one whose labeller earns most labels the histories of all.
+The labeller is the last checkpoint, as in the paper, unless an earlier checkpoint earns clearly more with greedy
+actions, which labels are. A policy that was trained with random actions can get stuck in "stay" when it acts greedily,
+and a model would learn this from the labels. If a task has several independent learners, the learner with the best
+labeller labels the histories of all learners.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.learners.resume import software_versions
 from icrl4aht_generation.learners.rollout import init_rollout, network_player, policy_player, roll_out
 from icrl4aht_generation.policy import Policy
-from icrl4aht_generation.releases.measures import measured_once
+from icrl4aht_generation.releases.measures import cached_measurement
 from icrl4aht_generation.teammates.registry import build_teammate
 
 _LEAST_GAIN = 2.0  # minimum gain of an earlier checkpoint: a tenth of a delivery per episode
@@ -46,11 +46,11 @@ _Returns = Annotated[list[float], msgspec.Meta(min_length=LABEL_EPISODES, max_le
 
 
 class CheckpointReturns(msgspec.Struct):
-    """Return of an ego's checkpoints with the task's teammate, one row for each.
+    """Returns of an ego's checkpoints with the task's teammate, one row for each checkpoint.
 
     Attributes:
-        greedy: with most probable actions.
-        sampled: with drawn actions, in the same episodes.
+        greedy: returns with the most probable actions.
+        sampled: returns with randomly sampled actions in the same episodes.
     """
 
     greedy: list[_Returns]
@@ -58,28 +58,28 @@ class CheckpointReturns(msgspec.Struct):
 
 
 def choose_labeller(folders: Sequence[Path], task: Task, suite: Path) -> tuple[Path, ExpertLabels]:
-    """Choose the checkpoint that labels the histories of a task: the best of the learners' choices.
+    """Choose the checkpoint that labels the histories of a task: the best labeller of all learners.
 
     Args:
-        folders: the finished artefacts of the task's learners.
-        task: the task.
+        folders: finished artefacts of the task's learners.
+        task: task of the histories.
         suite: folder of the learned teammates.
 
     Returns:
-        The checkpoint's folder, and its record in the provenance of the task.
+        Folder of the checkpoint, and its record in the provenance of the task.
     """
     found = [learner_labeller(folder, task, suite) for folder in folders]
     return max(found, key=lambda one: one[1].return_greedy or 0.0)
 
 
 def learner_labeller(folder: Path, task: Task, suite: Path) -> tuple[Path, ExpertLabels]:
-    """Measure the checkpoints of a finished artefact, and choose the one to label its histories.
+    """Measure the checkpoints of a finished artefact, and choose the checkpoint that labels the histories.
 
-    The measurements are stored in the artefact, in `LABELLER_RETURNS`, and reused.
+    The measurements are stored in the artefact's file `LABELLER_RETURNS`, and reused.
 
     Args:
-        folder: the artefact.
-        task: its task.
+        folder: folder of the artefact.
+        task: task of the artefact.
         suite: folder of the learned teammates.
     """
     metadata = json.loads(read_text(folder / METADATA))
@@ -92,7 +92,7 @@ def learner_labeller(folder: Path, task: Task, suite: Path) -> tuple[Path, Exper
         "noise": TEAMMATE_NOISE,
     }
     path = folder / LABELLER_RETURNS
-    measured = measured_once(path, settings, CheckpointReturns, lambda: _measure(checkpoints, task, suite))
+    measured = cached_measurement(path, settings, CheckpointReturns, lambda: _measure(checkpoints, task, suite))
     greedy, sampled = (np.mean(returns, axis=1) for returns in (measured.greedy, measured.sampled))
     chosen = choose_checkpoint(np.array(measured.greedy))
     step = metadata["checkpoint_updates"][chosen] * metadata["ego"]["environments"] * metadata["ego"]["rollout"]
@@ -109,22 +109,22 @@ def learner_labeller(folder: Path, task: Task, suite: Path) -> tuple[Path, Exper
 
 
 def choose_checkpoint(returns: np.ndarray) -> int:
-    """Return the number of the checkpoint that labels: the last one, or the best of those that earn clearly more.
+    """Return the number of the labelling checkpoint: the last checkpoint, or the best that earns clearly more.
 
-    An earlier checkpoint earns clearly more if the mean of its differences to the last one, episode by episode, is at
-    least 2 (a delivery is worth 20) and above two standard errors of that mean.
+    An earlier checkpoint earns clearly more if its mean difference to the last checkpoint in equal episodes is at least
+    2 (a delivery is worth 20) and above two standard errors of this mean.
 
     Args:
         returns: (C, E), greedy returns of C checkpoints in the same E episodes.
     """
-    differences = returns - returns[-1]  # paired: all checkpoints play the same episodes
+    differences = returns - returns[-1]  # paired differences, because all checkpoints play the same episodes
     means = differences.mean(axis=1)
     errors = differences.std(axis=1, ddof=1) / np.sqrt(returns.shape[1])
     clearly = (means >= _LEAST_GAIN) & (means > _STANDARD_ERRORS * errors)
     if not clearly.any():
         return len(returns) - 1
     best = np.where(clearly, means, -np.inf)
-    return len(best) - 1 - int(np.argmax(best[::-1]))  # the latest among equals
+    return len(best) - 1 - int(np.argmax(best[::-1]))  # the latest of equally good checkpoints
 
 
 def _measure(checkpoints: list[Path], task: Task, suite: Path) -> CheckpointReturns:
@@ -133,18 +133,19 @@ def _measure(checkpoints: list[Path], task: Task, suite: Path) -> CheckpointRetu
     measured = CheckpointReturns([], [])
     for path in checkpoints:
         network, params, _ = load_policy(path)
-        play = _compiled(task.layout, network.widths, teammate._replace(params=()))
+        play = _compiled_returns(task.layout, network.widths, teammate._replace(params=()))
         for greedy, returns in ((True, measured.greedy), (False, measured.sampled)):
             returns.append(np.asarray(play(params, greedy, teammate.params, key), np.float64).tolist())
     return measured
 
 
 @lru_cache(maxsize=8)
-def _compiled(layout: Layout, widths: Widths, teammate: Policy) -> Callable[..., jax.Array]:
-    """Return a function of the ego's parameters, whether it acts greedily, the teammate's parameters and a key.
+def _compiled_returns(layout: Layout, widths: Widths, teammate: Policy) -> Callable[..., jax.Array]:
+    """Return a compiled function that measures the returns, float32 (LABEL_EPISODES,), of an ego with a teammate.
 
-    It returns the returns, float32 (LABEL_EPISODES,), of the first `KEPT_STEPS` steps of episodes, which are the same
-    ones for all egos. One compilation serves all teammates of one family on one layout.
+    Its arguments are the ego's parameters, whether the ego acts greedily, the teammate's parameters and a key. Returns
+    are over the first `KEPT_STEPS` steps of episodes that are equal for all egos. All teammates of one family on one
+    layout share a compilation.
     """
     env, network, n = Environment(layout, KEPT_STEPS), ActorCritic(widths), LABEL_EPISODES
 

@@ -1,7 +1,8 @@
-"""Facts about the teammates of a release: returns of the reference egos with them, and the nearest test teammate.
+"""Facts about the teammates of a release: returns of reference egos with each teammate, and the nearest test teammate.
 
-Facts about drawn teammates are in `teammates/draws.jsonl`, those about a release's teammates in its provenance.
-Others are measured once; the measurements are kept next to the artefacts, in hidden files `.<layout>.teammates.json`.
+Facts about sampled teammates are in `teammates/draws.jsonl`; facts about teammates of an existing release are in its
+provenance. Other teammates are measured once, and the measurements are stored next to the artefacts, in hidden files
+`.<layout>.teammates.json`.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from icrl4aht_generation.learners.rollout import init_rollout, policy_player, ro
 from icrl4aht_generation.policy import Policy
 from icrl4aht_generation.populations.train import RESPONSES
 from icrl4aht_generation.teammates.distances import nearest_test
-from icrl4aht_generation.teammates.draws import hosted_families, unhosted_reason
+from icrl4aht_generation.teammates.draws import unusable_reason, usable_families
 from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.references import REFERENCE_EPISODES, reference_egos, reference_returns
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, build_teammate
@@ -45,40 +46,40 @@ _DIGITS = 4
 T = TypeVar("T")
 
 
-_SEED = 12  # of episodes of a learned teammate with its training partner
+_SEED = 12  # seed of episodes of a learned teammate with its training partner
 
 
 def learned_headroom(tasks: Sequence[Task], suite: Path) -> dict[str, ReferenceEgos]:
-    """Measure how much an ego matters with learned teammates.
+    """Measure the returns of reference egos with learned teammates.
 
     Args:
         tasks: tasks with learned teammates.
-        suite: folder of their checkpoints.
+        suite: folder of the teammates' checkpoints.
 
     Returns:
-        task id -> returns.
+        Returns of the reference egos by task id.
     """
     found = {}
     for layout, own in grouped(tasks, lambda task: task.layout).items():
         folders = [checkpoint_folder(suite, task.teammate) for task in own]
         mates = [build_learned(layout, folder) for folder in folders]
-        partners = [build_learned(layout, _partner(folder), "sampled") for folder in folders]
+        partners = [build_learned(layout, _training_partner(folder), "sampled") for folder in folders]
         for task, ego, mate, returns in zip(own, partners, mates, reference_returns(layout, mates), strict=True):
-            play = _self_play_program(layout, ego._replace(params=()), mate._replace(params=()))
+            play = _compiled_self_play(layout, ego._replace(params=()), mate._replace(params=()))
             self_play = float(np.asarray(play(ego.params, mate.params)).mean())
             found[task.task_id] = reference_egos(returns, self_play)
     return found
 
 
-def _partner(folder: Path) -> Path:
-    """Return the folder of the policy that a checkpoint, m<k>/c<n>, was trained with."""
+def _training_partner(folder: Path) -> Path:
+    """Return the folder of the training partner of a checkpoint m<k>/c<n>: its best response, or the policy itself."""
     response = folder.parent.parent / RESPONSES / folder.parent.name
     return response if response.is_dir() else folder
 
 
 @lru_cache(maxsize=8)
-def _self_play_program(layout: Layout, ego: Policy, mate: Policy) -> Callable[[Any, Any], jax.Array]:
-    """Return a function of both policies' parameters that returns the returns, float32 (REFERENCE_EPISODES,)."""
+def _compiled_self_play(layout: Layout, ego: Policy, mate: Policy) -> Callable[[Any, Any], jax.Array]:
+    """Return a compiled function of both policies' parameters that plays episodes and gives returns (episodes,)."""
     env = Environment(layout, KEPT_STEPS)
 
     @jax.jit
@@ -98,8 +99,8 @@ class TeammateFacts(NamedTuple):
     """Facts about the teammate of a task.
 
     Attributes:
-        references: returns of the reference egos with it.
-        nearest: the test teammate, of any family, that acts most like it; None where it is unknown.
+        references: returns of the reference egos with the teammate.
+        nearest: test teammate of any family with the most similar behaviour; None if unknown.
     """
 
     references: ReferenceEgos
@@ -114,17 +115,17 @@ class TeammateFacts(NamedTuple):
 def teammate_facts(
     tasks: Iterable[Task], artefacts: Path, suite: Path, headroom: Mapping[str, ReferenceEgos] | None = None
 ) -> dict[str, TeammateFacts]:
-    """Look up or measure the teammates of tasks, each once.
+    """Return recorded or measured facts about the teammates of tasks; each teammate is measured only once.
 
     Args:
-        tasks: the tasks.
-        artefacts: folder of their artefacts, where measurements are kept.
-        suite: folder of the learned teammates: a suite, or the folder `teammates` of a release, whose provenance has
-            the facts.
-        headroom: task id -> measurements of learned teammates that were made before.
+        tasks: tasks with the teammates.
+        artefacts: folder of the artefacts, where measurements are stored.
+        suite: folder of the learned teammates: a suite, or the folder `teammates` of a release with recorded facts in
+            its provenance.
+        headroom: existing measurements of learned teammates by task id.
 
     Returns:
-        task id -> facts.
+        Facts about each task's teammate by task id.
     """
     headroom, recorded = headroom or {}, recorded_provenance(suite)
     groups = grouped(tasks, lambda task: task.teammate_key)
@@ -147,26 +148,26 @@ def teammate_facts(
             "teammates": [[task.teammate, task.recipes] for task in chosen],
             "episodes": REFERENCE_EPISODES,
         }
-        measured = measured_once(kept, settings, list[TeammateFacts], partial(_measure, chosen, suite, headroom))
+        measured = cached_measurement(kept, settings, list[TeammateFacts], partial(_measure, chosen, suite, headroom))
         found |= dict(zip(keys, measured, strict=True))
     return {task.task_id: found[key] for key, members in groups.items() for task in members}
 
 
-def measured_once(path: Path, settings: dict[str, Any], kind: type[T], measure: Callable[[], T]) -> T:
-    """Return the measurements cached in a JSON file; measure and write them if its settings differ.
+def cached_measurement(path: Path, settings: dict[str, Any], kind: type[T], measure: Callable[[], T]) -> T:
+    """Return measurements from a JSON file; measure and write the file if its settings differ.
 
     Args:
-        path: the file.
-        settings: what the measurements depend on.
-        kind: their type, which msgspec checks.
-        measure: function that measures them.
+        path: path of the file.
+        settings: settings that the measurements depend on.
+        kind: type of the measurements, which msgspec validates.
+        measure: function that measures.
     """
     try:
-        content = msgspec.json.decode(read_text(path))  # unlike `json`, it refuses NaN
+        content = msgspec.json.decode(read_text(path))  # unlike `json`, msgspec refuses NaN
         if content["settings"] == json.loads(json.dumps(settings)):
             return msgspec.convert(content["measured"], kind)
     except (IndexFormatError, KeyError, TypeError, msgspec.MsgspecError):
-        pass  # damaged, or written by another version
+        pass  # a file that is missing, damaged or from another version
     measured = measure()
     with atomic_write(path) as partial:
         partial.write_bytes(msgspec.json.encode({"settings": settings, "measured": measured}))
@@ -180,39 +181,39 @@ def release_provenance(root: Path) -> dict[str, Provenance]:
 
 
 def recorded_provenance(suite: Path) -> dict[str, Provenance]:
-    """Return the provenance of the release whose teammates a suite is, by task id; empty for a profile's suite."""
+    """Return the provenance, by task id, of a release that contains a folder of teammates; empty for a suite."""
     return release_provenance(suite.parent) if suite.name == TEAMMATES else {}
 
 
 def _measure(tasks: Sequence[Task], suite: Path, headroom: Mapping[str, ReferenceEgos]) -> list[TeammateFacts]:
-    """Measure the returns with teammates of one layout, and the distances of learned ones to the test teammates.
+    """Measure the returns with teammates of one layout, and the distances of learned teammates to the test teammates.
 
-    For heuristics outside the table, such as presets, the card says that the test has their family. Measuring their
-    distances would take longer than a small rebuild.
+    Distances of heuristics such as presets are not measured, because this would take longer than generating a small
+    release. The card states that the test has teammates of their family.
     """
     learned = [task for task in tasks if task.teammate_family == "rl"]
     heuristics = [task for task in tasks if task.teammate_family != "rl"]
     missing = [task for task in learned if task.task_id not in headroom]
     returns = {task.task_id: headroom[task.task_id] for task in learned if task not in missing}
     returns |= learned_headroom(missing, suite) if missing else {}
-    for task in heuristics:  # one at a time: tasks may want dishes of their own, and all of a family share a program
+    for task in heuristics:  # one at a time, because tasks may have different recipes
         (egos,) = reference_returns(task.layout, [build_teammate(None, task.teammate)])
         returns[task.task_id] = reference_egos(egos)
     nearest: dict[str, NearestTest] = {}
     layout = tasks[0].layout
-    if learned and layout.name in TESTED_ON:  # other layouts have no test teammates
+    if learned and layout.name in TESTED_ON:  # other layouts have no test teammates to compare with
         mates = [build_teammate(layout, task.teammate, suite=suite) for task in learned]
         for task, near in zip(learned, nearest_test(layout, mates), strict=True):
             nearest[task.task_id] = NearestTest(near.teammate, round(near.distance, _DIGITS), near.behaviour)
     return [TeammateFacts(returns[task.task_id], nearest.get(task.task_id)) for task in tasks]
 
 
-def unhosted_families(layouts: Iterable[str]) -> list[LeftOutTask]:
-    """Return the heuristic families of which no draw may be a training teammate, by layout, with the reasons."""
+def unusable_families(layouts: Iterable[str]) -> list[LeftOutTask]:
+    """Return heuristic families without usable sampled training teammates, with the reasons, for each layout."""
     found = []
     for layout in (layout for layout in layouts if layout in TESTED_ON):
-        hosted = hosted_families(layout)
+        hosted = usable_families(layout)
         for family in (family for family in HEURISTIC_FAMILIES if family not in hosted):
-            reason = unhosted_reason(layout, family)
+            reason = unusable_reason(layout, family)
             found.append(LeftOutTask("", layout, HEURISTIC_KINDS[family], "", 0, 0, None, None, reason))
     return found

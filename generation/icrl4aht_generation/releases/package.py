@@ -1,4 +1,4 @@
-"""Artefacts -> a release folder: the histories of each task, with labels, and a picture of their learning curves."""
+"""Pack artefacts into a release folder: labelled histories of each task, and a figure of the learning curves."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ from icrl4aht_generation.releases.measures import (
     TeammateFacts,
     recorded_provenance,
     release_provenance,
-    unhosted_families,
+    unusable_families,
 )
 
 
 class TaskHistories(NamedTuple):
-    """Recorded histories of a task, and those that the release keeps.
+    """Recorded histories of a task, and the selection that the release contains.
 
     Attributes:
-        task: the task.
-        source: how they were made.
-        folders: artefact of each learner.
+        task: task of the histories.
+        source: how the histories were made.
+        folders: folder of the artefact of each learner.
         returns: for each learner float64 (N, E), episode returns of its streams.
-        streams: for each learner int (n,), numbers of the kept streams, best first.
-        least_improvement: what a stream had to improve by to be kept; None for any.
+        streams: for each learner int (n,), numbers of the selected streams, best first.
+        least_improvement: minimum improvement of a selected stream; None for no minimum.
     """
 
     task: Task
@@ -63,16 +63,16 @@ class TaskHistories(NamedTuple):
 
     @property
     def recorded(self) -> np.ndarray:
-        """float64 (N, E), episode returns of all streams of all learners."""
+        """Episode returns of all streams of all learners, float64 (N, E)."""
         return np.concatenate(self.returns)
 
     @property
     def kept(self) -> np.ndarray:
-        """float64 (n, E), episode returns of the kept streams."""
+        """Episode returns of the selected streams, float64 (n, E)."""
         return np.concatenate([own[streams] for own, streams in zip(self.returns, self.streams, strict=True)])
 
     def left_out(self, reason: str) -> LeftOutTask:
-        """Return the note about a task that the release leaves out."""
+        """Return a record of the task for the release's list of left-out tasks."""
         start, end = (round(float(ends.mean()), 3) for ends in curve_ends(self.recorded))
         learners = len(self.folders) if self.source == "ppo" else 0
         layout, name = self.task.layout.name, teammate_name(self.task)
@@ -84,16 +84,16 @@ class TaskHistories(NamedTuple):
 def select_histories(
     artefacts: Path, units: Sequence[Work], profile: Profile, facts: TeammateFacts, *, headroom: bool
 ) -> TaskHistories | LeftOutTask:
-    """Choose the histories of a task that a release keeps.
+    """Select the histories of a task for a release.
 
-    A scripted history is always kept; of the streams of learners, the best are kept. On layouts with headroom,
-    `profile.least_improvement` also drops the streams that improve by less, and the tasks whose teammate makes no
-    difference to the ego; `profile.least_rise` drops the tasks whose kept histories rise by less.
+    All scripted histories and the best streams of learners are selected. On layouts with headroom,
+    `profile.least_improvement` also removes streams with a smaller improvement, and tasks with a teammate that makes
+    the ego's actions irrelevant; `profile.least_rise` removes tasks with a smaller mean improvement.
 
     Args:
         artefacts: folder of the finished artefacts.
         units: the task's units of work.
-        profile: the profile.
+        profile: profile of the release.
         facts: facts about the teammate.
         headroom: whether the ego matters with any teammate of the profile on this layout.
     """
@@ -135,23 +135,23 @@ def package_release(
 ) -> Path:
     """Write a release of tasks with the checkpoints of their learned teammates; see `write_release`.
 
-    `select_histories` chooses what is kept. The histories of learners are labelled by the checkpoint of their egos that
-    `choose_labeller` returns, others by their script.
+    `select_histories` selects the histories. The checkpoint that `choose_labeller` returns labels the histories of
+    learners; a script labels its own histories.
 
     Args:
         artefacts: folder of the finished artefacts.
-        target: the release folder; a release of this profile there is replaced atomically.
-        units: the units of work, by task in the release's order.
-        profile: their profile.
+        target: the release folder; an existing release of this profile is replaced atomically.
+        units: units of work, grouped by task in the release's order.
+        profile: profile of the units.
         suite: folder of the learned teammates.
         kind: kind of the release.
-        facts: task id -> facts about its teammate, see `teammate_facts`.
-        left_out: tasks that were not collected, for the list in meta/info.json.
+        facts: facts about each task's teammate by task id, see `teammate_facts`.
+        left_out: tasks that were not generated, for the list in meta/info.json.
         chosen: called with 1 after the histories of a task are chosen.
         written: called with 1 after a task is written.
 
     Raises:
-        OptionError: if something else is at `target`, see `check_release_folder`, or no task has histories to keep.
+        OptionError: if `target` is not a release of this profile, see `check_release_folder`, or no history is left.
     """
     check_release_folder(target, profile)
     tasks = grouped(units, lambda work: work.task.task_id)
@@ -169,10 +169,10 @@ def package_release(
                 add_curve(curves, found.source, layout_title(task.layout.name), task.split, returns)
         chosen(1)
     if not new:
-        reasons = "; ".join(one.reason for one in omitted) or "there is no task"
+        reasons = "; ".join(one.reason for one in omitted) or "the profile has no task"
         raise OptionError(f"{target}: no task has histories to keep: {reasons}")
     if profile.sampled is not None:
-        omitted += unhosted_families(profile.layouts)
+        omitted += unusable_families(profile.layouts)
     with TemporaryDirectory() as folder:
         files = {CURVES_FIGURE: Path(folder) / "curves.png"}
         save_figure(plot_source_curves(curves), files[CURVES_FIGURE], dpi=80)
@@ -189,10 +189,10 @@ def package_release(
 
 
 def check_release_folder(target: Path, profile: Profile) -> None:
-    """Check that nothing is at `target` but an unchanged release that was made with this profile.
+    """Check that `target` does not exist, or is an unchanged release that was generated with this profile.
 
     Raises:
-        OptionError: if there is something else.
+        OptionError: if `target` is anything else.
     """
     if not check_target(target, overwrite=True):
         return
@@ -200,13 +200,13 @@ def check_release_folder(target: Path, profile: Profile) -> None:
     if profiles != {profile.name}:
         made = ", ".join(sorted(map(str, profiles - {None}))) or "no known profile"
         raise OptionError(
-            f"{target}: has files made with {made}, not with profile {profile.name}, and is not replaced; move it "
-            f"away, or give another --out"
+            f"{target}: this release was generated with {made}, not with profile {profile.name}, and is not replaced; "
+            f"move it away, or give another --out"
         )
 
 
 def bundle_release(release: Path) -> Path:
-    """Replace the release that the package bundles by a copy of this one."""
+    """Replace the bundled release of the package by a copy of a given release."""
     with atomic_folder(MINI, overwrite=True, sources=[release]) as copy:
         shutil.copytree(release, copy, dirs_exist_ok=True)
     return MINI
@@ -218,7 +218,7 @@ def recorded_sources(release: Path) -> dict[str, str]:
 
 
 def _populations(task: Task, profile: Profile, suite: Path, recorded: Mapping[str, Provenance]) -> TeammateSuite | None:
-    """The populations of a learned teammate: the profile's, or those named by the release that it is taken from."""
+    """Return the record of a learned teammate's populations, from the profile or from the teammate's release."""
     if task.task_id in recorded:
         return recorded[task.task_id].suite
     return TeammateSuite(
@@ -234,7 +234,7 @@ def _populations(task: Task, profile: Profile, suite: Path, recorded: Mapping[st
 def _new_task(
     found: TaskHistories, profile: Profile, suite: Path, facts: TeammateFacts, recorded: Mapping[str, Provenance]
 ) -> NewTask:
-    """Return a task with its labels: the actions of a learner's checkpoint, or a script's before random ones."""
+    """Return a task with labels: actions of a learner's checkpoint, or of the script before random actions."""
     task, metadata = found.task, json.loads((found.folders[0] / METADATA).read_text(encoding="utf-8"))
     files, labeller = checkpoint_files(suite, task), None
     if found.source in SCRIPTED_SOURCES:
@@ -276,7 +276,7 @@ def _new_task(
 
 
 def _script_labels(source: str, references: ReferenceEgos) -> ExpertLabels:
-    """Return the record of a script's labels; scripts see a `Situation`."""
+    """Return the provenance record of labels that are a script's actions."""
     if source == "noise":
         action = "scripted oracle, which sees the full state"
         return ExpertLabels(None, action, return_greedy=references.oracle, episodes=references.episodes, view="state")
@@ -284,7 +284,7 @@ def _script_labels(source: str, references: ReferenceEgos) -> ExpertLabels:
 
 
 def _labels(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.ndarray], np.ndarray]:
-    """Return a function of a stream's number and states uint8 (T, S) that returns its expert actions, int8 (T,)."""
+    """Return a function of a stream's number and states, uint8 (T, S), that returns expert actions, int8 (T,)."""
     if labeller is None:
         script = np.load(found.folders[0] / "script_actions.npy", mmap_mode="r")
         return lambda stream, states: script[stream]
@@ -293,7 +293,7 @@ def _labels(found: TaskHistories, labeller: Path | None) -> Callable[[int, np.nd
 
 
 def _recorded_histories(found: TaskHistories) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
-    """Yield learner, stream, and recorded arrays of the kept histories, which are read when they are used."""
+    """Yield learner, stream and memory-mapped arrays of each selected history."""
     for learner, (folder, streams) in enumerate(zip(found.folders, found.streams, strict=True)):
         arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in HistoryArrays._fields}
         dones = episode_ends(arrays["actions"].shape[1], KEPT_STEPS)

@@ -1,1 +1,1 @@
-"""Teammates as pure JAX functions. `registry.build_teammate` makes one from a task's teammate entry."""
+"""Teammates as pure JAX functions; `registry.build_teammate` builds a teammate from an entry of a task."""

@@ -1,12 +1,12 @@
-"""Hamming distances of policies: the share of common states on which two of them act differently (paper, App. "Teammate
-Policy Diversity Analysis").
+"""Hamming distances of policies: the share of common states on which two policies act differently (paper, App.
+"Teammate Policy Diversity Analysis").
 
-The common states of a heuristic family on a layout are those of 20 episodes of 100 steps with each of its five test
+The common states of a heuristic family on a layout are from 20 episodes of 100 steps with each of its five test
 instances, ten with a random ego and ten with the scripted ego `oracle`. A teammate's distance to a test instance is
-measured on the states of that instance's family. On asymm_both and cramped_up, which have no test tasks, the instances
-are those of the layout that their models are tested on, acting on the training layout.
+measured on the states of the instance's family. The layouts asymm_both and cramped_up have no test tasks: there the
+instances of the layout on which their models are tested act on the training layout.
 
-`fill_table` measures the teammates of `teammates.draws`, or chooses and measures those of `teammates.spread`.
+`fill_table` measures the teammates of `teammates.draws`, or chooses and measures the teammates of `teammates.spread`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ from icrl4aht_generation.teammates.spread import (
 )
 
 _EPISODES = 10
-"""Episodes of each test instance with each of the two egos."""
+"""Number of episodes of each test instance with each of the two egos."""
 
 _SEED = 5
 
@@ -77,10 +77,10 @@ INSTANCE_NAMES = tuple(f"{HEURISTIC_KINDS[family]}/t{t}" for family in TESTED_FA
 
 
 _DIGITS = 4
-"""Decimal places of stored numbers: all digits of shares of 10,000 states, and of means of 20 returns."""
+"""Decimal places of stored numbers, which are exact for shares of 10,000 states and means of 20 returns."""
 
 _SPREAD_EPISODES = 4
-"""Episodes of the states on which spread teammates are compared, of each test instance with each of the two egos."""
+"""Number of episodes of each test instance with each of the two egos, for states to compare spread teammates on."""
 
 DRAW_NUMBERS = [
     (family, base_seed, theta_id)
@@ -88,19 +88,19 @@ DRAW_NUMBERS = [
     for base_seed, count in DRAWS_PER_SEED.items()
     for theta_id in range(count)
 ]
-"""Family, base_seed and theta_id of each draw of a layout."""
+"""Family, base_seed and theta_id of each sampled teammate of a layout."""
 
 
 def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest]:
     """Return the nearest test instance of each policy that plays the teammate on a layout.
 
-    Policies that share their functions share one compilation. Behaviours are numbered in the order of the policies.
+    Policies with equal functions share one compilation. Behaviours are numbered in the order of the policies.
 
     Raises:
-        UnknownNameError: if the layout is not one of the benchmark.
+        UnknownNameError: if the benchmark does not have the layout.
     """
     records, tested = common_states(layout)
-    actions = act_along(layout, policies, records)
+    actions = act_on_records(layout, policies, records)
     distances = distances_to_tests(tested, actions)
     nearest = distances.argmin(axis=1)
     return [
@@ -111,25 +111,25 @@ def nearest_test(layout: Layout, policies: Sequence[Policy]) -> list[NearestTest
 
 @lru_cache(maxsize=2)
 def common_states(layout: Layout) -> tuple[UInt8[Array, "T N S"], np.ndarray]:
-    """Return the states of a layout on which teammates are compared, and what the test instances do there.
+    """Return the states of a layout on which teammates are compared, and the actions of the test instances.
 
     Returns:
         State records, see `common_records`, and the actions of the test instances, int8 (instances, T, N).
 
     Raises:
-        UnknownNameError: if the layout is not one of the benchmark.
+        UnknownNameError: if the benchmark does not have the layout.
     """
     records = common_records(layout)
-    return records, act_along(layout, instance_policies(layout), records)
+    return records, act_on_records(layout, instance_policies(layout), records)
 
 
 def instance_policies(layout: Layout) -> list[Policy]:
-    """Return the policies of `instance_entries`, which see a `Situation`."""
+    """Return the policies of all test instances of a layout, which see a `Situation`."""
     return [build_teammate(None, entry) for entry in instance_entries(layout)]
 
 
 def instance_entries(layout: Layout) -> list[dict[str, Any]]:
-    """Return the test instances of the layout that models of a layout are tested on, by family and number."""
+    """Return the test instances that models trained on a layout are tested with, by family and number."""
     tested = TESTED_ON.get(layout.name, layout.name)
     return [entry for family in TESTED_FAMILIES for entry in published_teammates(tested, family)]
 
@@ -138,25 +138,25 @@ def common_records(layout: Layout, episodes: int = _EPISODES) -> UInt8[Array, "T
     """Return state records of episodes of the test instances, by family and instance.
 
     Args:
-        layout: the layout.
-        episodes: episodes of each instance with each of the two egos.
+        layout: layout of the episodes.
+        episodes: number of episodes of each instance with each of the two egos.
 
     Raises:
-        UnknownNameError: if the layout is not one of the benchmark.
+        UnknownNameError: if the benchmark does not have the layout.
     """
     check_choice("layout", layout.name, LAYOUT_NAMES)
     families = [family for _, family in stacked_families(instance_policies(layout))]
     tables, expert, positions = padded_layout(layout)
-    play = _play_tests(tuple(family._replace(params=()) for family in families), episodes)
+    play = _compiled_test_play(tuple(family._replace(params=()) for family in families), episodes)
     return play(tables, expert, [family.params for family in families], jax.random.key(_SEED))[..., positions]
 
 
 @lru_cache(maxsize=2)
-def _play_tests(families: tuple[Policy, ...], episodes: int) -> Callable[..., Array]:
-    """Return a compiled function of tables, the oracle's and the test instances' parameters and a key, to records."""
+def _compiled_test_play(families: tuple[Policy, ...], episodes: int) -> Callable[..., Array]:
+    """Return a compiled function that plays the test instances and returns state records."""
     each = INSTANCES * 2 * episodes
     total = len(families) * each
-    # Random egos visit odd states, the oracle those of good play; teammates are compared on both.
+    # Teammates are compared both on unusual states with random egos and on states of good play with the oracle.
     with_oracle = np.arange(total) // episodes % 2 == 1
 
     @jax.jit
@@ -176,31 +176,31 @@ def _play_tests(families: tuple[Policy, ...], episodes: int) -> Callable[..., Ar
     return play
 
 
-def act_along(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
-    """Actions of policies, as the teammate, on recorded episodes; each one's memory follows the episode it observes.
+def act_on_records(layout: Layout, policies: Sequence[Policy], records: Array, seed: int = _SEED) -> np.ndarray:
+    """Return the actions of policies as the teammate on recorded episodes, with memories of the observed episodes.
 
     Args:
-        layout: the layout.
-        policies: the policies; those that share their functions share one compilation.
+        layout: layout of the episodes.
+        policies: policies to compare; policies with equal functions share one compilation.
         records: state records, uint8 (T, episodes, S).
-        seed: of the policies' draws, which are functions of the episode's number.
+        seed: seed of the policies' random draws, which depend on the episode's number.
 
     Returns:
-        int8 (policies, T, episodes).
+        Actions, int8 (policies, T, episodes).
     """
     actions = np.zeros((len(policies), *records.shape[:2]), np.int8)
     for numbers, family in stacked_families(policies):
-        actions[numbers] = np.asarray(_act_along(layout, family, records, jax.random.key(seed)))
+        actions[numbers] = np.asarray(_family_actions(layout, family, records, jax.random.key(seed)))
     return actions
 
 
-def _act_along(layout: Layout, family: Policy, records: Array, key: Key[Array, ""]) -> Array:
+def _family_actions(layout: Layout, family: Policy, records: Array, key: Key[Array, ""]) -> Array:
     keys = jax.random.split(key, records.shape[1])
     if family.sees == "situation":
-        # Padded tables are arguments, so that all layouts share one compilation.
+        # Padded tables are arguments, so all layouts share one compilation.
         tables, _, positions = padded_layout(layout)
         padded = jnp.zeros((*records.shape[:-1], record_size(tables)), jnp.uint8).at[..., positions].set(records)
-        return _in_situations(family._replace(params=()))(family.params, padded, keys, tables)
+        return _compiled_situation_actions(family._replace(params=()))(family.params, padded, keys, tables)
 
     def see(record: Array) -> Array:
         return record if family.sees == "state" else observe(layout, record, TEAMMATE)
@@ -209,8 +209,8 @@ def _act_along(layout: Layout, family: Policy, records: Array, key: Key[Array, "
 
 
 @lru_cache(maxsize=16)
-def _in_situations(family: Policy) -> Callable[..., Array]:
-    """Return a compiled function of parameters, padded records, keys and tables, to actions."""
+def _compiled_situation_actions(family: Policy) -> Callable[..., Array]:
+    """Return a compiled function of parameters, padded records, keys and tables that returns actions."""
 
     def act(params: Any, records: Array, keys: Array, tables: Tables) -> Array:
         return _actions(family, lambda record: Situation(tables, record), params, records, keys)
@@ -219,7 +219,7 @@ def _in_situations(family: Policy) -> Callable[..., Array]:
 
 
 def _actions(family: Policy, see: Callable[[Array], Any], params: Any, records: Array, keys: Array) -> Array:
-    """Return actions on records, int8 (policies, T, episodes). `see` makes the policies' view of one record."""
+    """Return actions on records, int8 (policies, T, episodes); `see` converts a record to the policies' view."""
 
     def one(params: Any) -> Array:
         def step(memories: Any, record: Array) -> tuple[Any, Array]:
@@ -236,14 +236,14 @@ def _actions(family: Policy, see: Callable[[Array], Any], params: Any, records: 
 
 
 def distances_to_tests(tested: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Return distances of teammates to the test instances, each on the states of the instance's family.
+    """Return distances of teammates to the test instances, measured on the states of each instance's family.
 
     Args:
         tested: actions of the test instances on the common states, int8 (instances, T, N).
         actions: actions of teammates on the same states, int8 (teammates, T, N).
 
     Returns:
-        float64 (teammates, instances).
+        Distances, float64 (teammates, instances).
     """
     families = len(tested) // INSTANCES
     tested, actions = (array.reshape(*array.shape[:2], families, -1) for array in (tested, actions))
@@ -252,16 +252,16 @@ def distances_to_tests(tested: np.ndarray, actions: np.ndarray) -> np.ndarray:
 
 
 def hamming_distances(actions: np.ndarray) -> np.ndarray:
-    """Return the share of states on which two policies act differently: int (P, N) -> float64 (P, P)."""
-    # Row by row: all pairs at once would take gigabytes.
+    """Return the share of N states on which two of P policies act differently, float64 (P, P)."""
+    # The matrix is computed row by row, because all pairs at once would take gigabytes.
     return np.array([(actions != own).mean(axis=1) for own in actions]).reshape(len(actions), len(actions))
 
 
 def group_behaviours(actions: np.ndarray) -> list[int]:
-    """Number the behaviours of policies, int8 (policies, ...).
+    """Return a number for the behaviour of each policy, given the policies' actions, int8 (policies, ...).
 
-    A policy has the behaviour of the first one before it that opened a behaviour and acts like it, that is, whose
-    distance is below `SAME_BEHAVIOUR`; else it opens the next one.
+    Policies are compared with the first policy of each behaviour so far. If the distance is below `SAME_BEHAVIOUR`, the
+    policy has this behaviour; else it starts a new behaviour.
     """
     first: list[np.ndarray] = []
     found: list[int] = []
@@ -276,14 +276,14 @@ def group_behaviours(actions: np.ndarray) -> list[int]:
 def fill_table(
     path: Path, layouts: Sequence[str], on_layout: Callable[[int, str], None], overwrite: bool, *, spread: bool
 ) -> None:
-    """Measure the layouts that a table does not have yet, and write it after each of them.
+    """Measure layouts that a table does not contain yet, and write the table after each layout.
 
     Args:
-        path: the table; a missing one is started.
+        path: path of the table; a missing table is created.
         layouts: short names of training layouts.
-        on_layout: called with the number of finished layouts and the name of the next one.
-        overwrite: also measure the layouts that the table has.
-        spread: whether it is a table of `teammates.spread`, or one of `teammates.draws`.
+        on_layout: called with the number of finished layouts and the name of the next layout.
+        overwrite: whether to also measure layouts that the table already contains.
+        spread: True for a table of `teammates.spread`, False for a table of `teammates.draws`.
     """
     rows: list[Any] = read_measured(path, LayoutSpread if spread else Draw) if path.is_file() else []
     candidates = spread_candidates() if spread else []
@@ -291,7 +291,7 @@ def fill_table(
         on_layout(number, name)
         own = [row for row in rows if row.layout == name]
         complete = len(own) == len(DRAW_NUMBERS)
-        if spread:  # a list that was chosen from other candidates is chosen again
+        if spread:  # a list from other candidates is outdated
             complete = [row.tried for row in own] == [len(candidates)]
         if overwrite or not complete:
             layout = get_layout(name)
@@ -302,18 +302,18 @@ def fill_table(
 
 
 def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW_NUMBERS) -> list[Draw]:
-    """Measure draws on a training layout. Behaviours are numbered within these draws.
+    """Measure sampled teammates on a training layout, and number their behaviours within each family.
 
     Args:
-        layout: the layout.
-        numbers: family, base_seed and theta_id of each draw.
+        layout: layout of the measurements.
+        numbers: family, base_seed and theta_id of each sampled teammate.
     """
     policies = [
         build_teammate(layout, sample_teammate(family, theta_id, ranges_of(seed), seed))
         for family, seed, theta_id in numbers
     ]
     records, tested = common_states(layout)
-    actions = act_along(layout, policies, records)
+    actions = act_on_records(layout, policies, records)
     distances, returns = distances_to_tests(tested, actions), reference_returns(layout, policies)
     families = np.array([family for family, _, _ in numbers])
     behaviours = np.zeros(len(numbers), int)
@@ -326,19 +326,19 @@ def measure_draws(layout: Layout, numbers: Sequence[tuple[str, int, int]] = DRAW
             base_seed,
             theta_id,
             behaviour=int(behaviours[k]),
-            **_measured(family, distances[k], returns[k]),
+            **_measured_fields(family, distances[k], returns[k]),
         )
         for k, (family, base_seed, theta_id) in enumerate(numbers)
     ]
 
 
-def _measured(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[str, Any]:
-    """Return the fields that lines of both tables have: the nearest test instances, and the egos' returns.
+def _measured_fields(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[str, Any]:
+    """Return the fields that both tables of teammates have: the nearest test instances, and the egos' returns.
 
     Args:
         family: kind of the teammate.
-        to_tests: float64 (instances,), its distances to the test instances.
-        returns: float64 (egos,), returns of the reference egos with it.
+        to_tests: float64 (instances,), distances of the teammate to the test instances.
+        returns: float64 (egos,), returns of the reference egos with the teammate.
     """
     own = np.repeat(TESTED_FAMILIES, INSTANCES) == family
     near, other = (int(np.where(mask, to_tests, np.inf).argmin()) for mask in (own, ~own))
@@ -352,18 +352,18 @@ def _measured(family: str, to_tests: np.ndarray, returns: np.ndarray) -> dict[st
 
 
 def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]]) -> LayoutSpread:
-    """Choose teammates of a training layout that differ widely.
+    """Choose teammates of a training layout that differ widely, and measure them.
 
     Args:
-        layout: the layout.
+        layout: the training layout.
         candidates: entries of heuristic teammates.
     """
-    # Together with the test instances, so that there is one compilation for each family.
+    # Candidates and test instances act together, so each family needs only one compilation.
     tested, records = instance_entries(layout), common_records(layout, _SPREAD_EPISODES)
     policies = [build_teammate(None, entry) for entry in with_equal_parameters([*tested, *candidates])]
-    actions, policies = act_along(layout, policies, records), policies[len(tested) :]
+    actions, policies = act_on_records(layout, policies, records), policies[len(tested) :]
     tests, actions = distances_to_tests(actions[: len(tested)], actions[len(tested) :]), actions[len(tested) :]
-    returns = reference_returns(layout, policies)  # with all of them, so that layouts share one compilation
+    returns = reference_returns(layout, policies)  # of all candidates, so layouts share one compilation
     unlike = tests.min(axis=1) >= DIVERSE_DISTANCE
     headroom = unlike & (np.ptp(returns, axis=1) >= LEAST_HEADROOM)
     usable = np.flatnonzero(headroom if headroom.any() else unlike)
@@ -376,7 +376,7 @@ def measure_spread(layout: Layout, candidates: Sequence[dict[str, Any]]) -> Layo
             theta_id=candidates[place]["theta_id"],
             theta=candidates[place]["theta"],
             separation=round(separation, _DIGITS),
-            **_measured(candidates[place]["family"], tests[place], returns[place]),
+            **_measured_fields(candidates[place]["family"], tests[place], returns[place]),
         )
         for number, (place, separation) in enumerate(zip(usable[order], separations, strict=True))
     ]

@@ -1,12 +1,12 @@
 """Sampled heuristic teammates for training and validation tasks.
 
-`draws.jsonl` has one line per draw, measured by `icrl4aht-data research draws`, so that tasks are known without any
-simulation. Most parameters that decide how a heuristic acts are in no published range, so that many draws from the
-published training ranges act alike, and on some layouts all draws of a family act like one of its test instances. Those
-are not admissible: no task has them.
+`draws.jsonl` has one line for each sampled teammate (a draw), measured by `icrl4aht-data research draws`, so tasks need
+no simulation. The published training ranges leave out most parameters that decide a heuristic's behaviour. Therefore
+many draws behave the same, and on some layouts all draws of a family behave like a test instance of the family. Such
+draws are not admissible: no task uses them.
 
-Diverse draws vary all of these parameters (`Heuristic.diverse`), for models that learn by playing. They must be
-farther from every test instance.
+Diverse draws vary all parameters that decide the behaviour (`Heuristic.diverse`), for models that learn by playing.
+Diverse draws must have a larger distance to every test instance.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
 
 DRAWS_TABLE = Path(__file__).with_name("draws.jsonl")
-"""Table of all draws."""
+"""Path of the table of all sampled teammates (draws)."""
 
 DRAWS_PER_SEED = {0: 32, 1: 8, 2: 32, 3: 8}
-"""base_seed -> number of draws in the table, for each layout and family: 0 and 1 from the published training ranges,
-for training and validation; 2 and 3 diverse ones, for training and validation."""
+"""Number of draws in the table for each layout and family by base_seed: 0 and 1 are draws from the published training
+ranges for training and validation, 2 and 3 are diverse draws for training and validation."""
 
 _OF_SEED = {0: "drawn training", 1: "drawn validation", 2: "diverse training", 3: "diverse validation"}
 
@@ -48,7 +48,7 @@ DIVERSE_DISTANCE = 0.1
 
 
 def ranges_of(base_seed: int) -> str:
-    """Return which ranges the draws of a seed come from: "train" or "diverse", see `sample_teammate`."""
+    """Return the name of the ranges for draws of a seed: "train" or "diverse", see `sample_teammate`."""
     return "diverse" if base_seed in _DIVERSE_SEEDS.values() else "train"
 
 
@@ -57,22 +57,22 @@ def _least_distance(base_seed: int) -> float:
 
 
 class Draw(Struct, frozen=True, forbid_unknown_fields=True):
-    """One draw on one layout: `sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)`.
+    """A sampled teammate on one layout: `sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)`.
 
     Attributes:
         layout: short name of a training layout.
         family: kind of the heuristic, such as "utility_greedy".
-        base_seed: see `DRAWS_PER_SEED`.
+        base_seed: seed of the ranges and the split, see `DRAWS_PER_SEED`.
         theta_id: number of the draw, from 0.
-        nearest: test instance of its family that acts most like it, such as "H3/t1".
-        distance: Hamming distance to that instance, 0..1; see `icrl4aht_generation.teammates.distances`.
-        behaviour: number that the layout's draws of one family, of all seeds, share if they act alike.
-        stay: mean return of the ego `stay` with it in 20 episodes of 100 steps.
-        random: mean return of the ego `random`.
-        oracle: mean return of the ego `oracle`.
-        other: test instance of the other families that acts most like it. It excludes no draw of the published ranges,
-            but such draws are chosen last.
-        other_distance: Hamming distance to that instance.
+        nearest: test instance of the same family with the most similar behaviour, such as "H3/t1".
+        distance: Hamming distance to `nearest`, 0..1; see `icrl4aht_generation.teammates.distances`.
+        behaviour: number of the behaviour; draws of one family and layout with equal numbers behave the same.
+        stay: mean return of the ego `stay` with the teammate in 20 episodes of 100 steps.
+        random: mean return of the ego `random` with the teammate.
+        oracle: mean return of the ego `oracle` with the teammate.
+        other: test instance of another family with the most similar behaviour. Draws of the published ranges that
+            behave like `other` stay admissible, but are chosen last.
+        other_distance: Hamming distance to `other`.
     """
 
     layout: str
@@ -95,24 +95,24 @@ class Draw(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def admissible(self) -> bool:
-        """Whether the draw acts differently from every test instance of its family (of all families if diverse)."""
+        """Whether the draw behaves differently from all test instances of its family (of all families if diverse)."""
         return self.nearest_counted[0] >= _least_distance(self.base_seed)
 
     @property
     def nearest_counted(self) -> tuple[float, str]:
-        """The test instance by which the draw is admissible or not: distance to it, and its name."""
+        """Distance to the nearest test instance that decides whether the draw is admissible, and its name."""
         own, other = (self.distance, self.nearest), (self.other_distance, self.other)
         diverse = self.base_seed in _DIVERSE_SEEDS.values()
         return other if diverse and other[0] < own[0] else own
 
     @property
     def like_another_family(self) -> bool:
-        """Whether the draw acts like a test instance of another family."""
+        """Whether the draw behaves like a test instance of another family."""
         return self.other_distance < SAME_BEHAVIOUR
 
     @property
     def spread(self) -> float:
-        """Difference of the best and the worst reference ego's return."""
+        """Difference between the best and the worst return of the reference egos."""
         returns = (self.stay, self.random, self.oracle)
         return max(returns) - min(returns)
 
@@ -126,7 +126,7 @@ def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
     """Return the draws of a family on a training layout, by theta_id.
 
     Raises:
-        UnknownNameError: for an unknown layout, family or seed, and for a layout without training tasks.
+        UnknownNameError: if the layout, family or seed does not exist, or the layout has no training tasks.
     """
     name = get_layout(layout).name
     check_choice("training layout", name, TESTED_ON)
@@ -139,36 +139,36 @@ def read_draws(layout: str, family: str, base_seed: int = 0) -> list[Draw]:
 def drawn_teammates(
     layout: str, families: Sequence[str], count: int, base_seed: int = 0
 ) -> list[tuple[dict[str, Any], Draw]]:
-    """Choose drawn teammates of a layout, without any simulation.
+    """Choose sampled teammates of a layout from the table, without simulation.
 
-    The families take turns. Only admissible draws are chosen; those without headroom only if no admissible draw of the
-    layout, of any family, has headroom. Each family first gives the draws that act unlike all test instances, of these
-    one of every behaviour, then the others, by how much the ego matters with them and by theta_id.
+    The families take turns. Only admissible draws are chosen, and draws without headroom only if no admissible draw on
+    the layout has headroom. Each family prefers draws that behave differently from all test instances, then one draw of
+    each behaviour, then draws with a large difference between the reference egos, then a small theta_id.
 
     Args:
         layout: a training layout.
         families: kinds of heuristics, in the order of their turns.
         count: number of teammates.
-        base_seed: see `DRAWS_PER_SEED`.
+        base_seed: seed of the draws, see `DRAWS_PER_SEED`.
 
     Returns:
         Teammate entries, as `sample_teammate` returns them, with their draws.
 
     Raises:
-        OptionError: for an unknown family, a family without admissible draws on the layout, and a larger count than
-            the families have draws.
-        UnknownNameError: for an unknown layout or seed, and for a layout without training tasks.
+        OptionError: if a family does not exist or has no admissible draws on the layout, or if the families have fewer
+            draws than `count`.
+        UnknownNameError: if the layout or seed does not exist, or the layout has no training tasks.
     """
     name = get_layout(layout).name
     for family in families:
         if family not in HEURISTIC_FAMILIES:
             raise OptionError(str(unknown("teammate family", family, HEURISTIC_FAMILIES)))
-    queues = [_queue(name, family, base_seed) for family in dict.fromkeys(families)]
+    queues = [_ordered_draws(name, family, base_seed) for family in dict.fromkeys(families)]
     available = sum(map(len, queues))
     if count > available:
         raise OptionError(
             f"{name}: {count} {_OF_SEED[base_seed]} teammates requested of {', '.join(families) or 'no family'}, with "
-            f"only {available} distinct draws; request fewer or name more families ({_hosted_text(name, base_seed)})"
+            f"only {available} distinct draws; request fewer or name more families ({_usable_text(name, base_seed)})"
         )
     turns = [queue[turn] for turn in range(max(map(len, queues), default=0)) for queue in queues if turn < len(queue)]
     ranges = ranges_of(base_seed)
@@ -176,13 +176,13 @@ def drawn_teammates(
 
 
 def validation_tasks(track: str) -> list[Task]:
-    """Return the tasks of split `validation`, for model selection: up to four per training layout, seed 1.
+    """Return the tasks of split `validation` for model selection: up to four for each training layout, with seed 1.
 
-    Layouts on which every draw of that seed acts like a test instance have none.
+    Layouts have no such tasks if every draw of this seed behaves like a test instance.
     """
     tasks = []
     for layout in (layout for layout in TRACKS[track]["validation"] if layout in TESTED_ON):
-        families = hosted_families(layout, _VALIDATION_SEED)
+        families = usable_families(layout, _VALIDATION_SEED)
         count = min(_VALIDATION_TEAMMATES, sum(len(_usable(layout, family, _VALIDATION_SEED)) for family in families))
         chosen = drawn_teammates(layout, families, count, _VALIDATION_SEED)
         tasks += [make_task(track, "validation", layout, teammate, seed=0) for teammate, _ in chosen]
@@ -192,16 +192,16 @@ def validation_tasks(track: str) -> list[Task]:
 def diverse_tasks(track: str, split: str) -> list[Task]:
     """Return tasks with diverse teammates on a track's training layouts, for models that learn by playing.
 
-    Up to twelve of each layout and family for training, three for validation, each of another behaviour.
+    Each layout and family has up to twelve tasks for training and three for validation, all with different behaviours.
 
     Args:
-        track: the track.
+        track: name of the track.
         split: "train" or "validation".
     """
     seed, most = _DIVERSE_SEEDS[split], _DIVERSE_TEAMMATES[split]
     tasks = []
     for layout in (layout for layout in TRACKS[track]["train"] if layout in TESTED_ON):
-        for family in hosted_families(layout, seed):
+        for family in usable_families(layout, seed):
             behaviours = {draw.behaviour for draw in _usable(layout, family, seed)}
             chosen = drawn_teammates(layout, [family], min(most, len(behaviours)), seed)
             tasks += [make_task(track, split, layout, teammate, seed=0) for teammate, _ in chosen]
@@ -209,44 +209,44 @@ def diverse_tasks(track: str, split: str) -> list[Task]:
 
 
 def find_draw(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
-    """Return the draw that a teammate entry describes, or None."""
+    """Return the draw that a teammate entry describes, or None if the table has no such draw."""
     family, seed, theta_id = (teammate.get(name) for name in ("family", "base_seed", "theta_id"))
     if teammate.get("kind") != "heuristic" or layout not in TESTED_ON or seed not in DRAWS_PER_SEED:
         return None
     draws = [draw for draw in read_draws(layout, str(family), seed) if draw.theta_id == theta_id]
-    same = draws and equal_parameters(_sampled(str(family), draws[0].theta_id, seed)["theta"], teammate["theta"])
+    same = draws and equal_parameters(_sampled_entry(str(family), draws[0].theta_id, seed)["theta"], teammate["theta"])
     return draws[0] if same else None
 
 
 def equal_parameters(theta: Mapping[str, float], other: Mapping[str, float]) -> bool:
-    """Return whether two parameter sets are equal up to the last digit, in which compilations of a draw may differ."""
+    """Return whether parameters are equal up to the last digit, which may differ between compilations."""
     return theta.keys() == other.keys() and all(math.isclose(theta[name], other[name], rel_tol=1e-6) for name in theta)
 
 
 @cache
-def _sampled(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
+def _sampled_entry(family: str, theta_id: int, base_seed: int) -> dict[str, Any]:
     return sample_teammate(family, theta_id, ranges_of(base_seed), base_seed)
 
 
-def hosted_families(layout: str, base_seed: int = 0) -> list[str]:
-    """Return the families with draws that tasks of a training layout may have, in the order of the paper."""
+def usable_families(layout: str, base_seed: int = 0) -> list[str]:
+    """Return the families with usable draws for tasks of a training layout, in the order of the paper."""
     return [family for family in HEURISTIC_FAMILIES if _usable(get_layout(layout).name, family, base_seed)]
 
 
-def _queue(layout: str, family: str, base_seed: int) -> list[Draw]:
-    """Return the draws of a family that may be chosen, in order of preference; at least one.
+def _ordered_draws(layout: str, family: str, base_seed: int) -> list[Draw]:
+    """Return the usable draws of a family in order of preference, or raise an error if the family has none.
 
-    Those that act like a test instance of another family come last.
+    Draws that behave like a test instance of another family come last.
     """
     draws = _usable(layout, family, base_seed)
     if not draws:
         farthest = max((draw.nearest_counted for draw in read_draws(layout, family, base_seed)), default=None)
         near = f", to {farthest[1]}" if farthest else ""
         raise OptionError(
-            f"{layout} cannot host {_OF_SEED[base_seed]} teammates of {family}: "
-            f"{unhosted_reason(layout, family, base_seed)}; expected a distance of {_least_distance(base_seed)} or "
+            f"{layout}: no usable {_OF_SEED[base_seed]} teammates of {family}: "
+            f"{unusable_reason(layout, family, base_seed)}; expected a distance of {_least_distance(base_seed)} or "
             f"more{near}, and returns that differ by {LEAST_HEADROOM:g} or more; name other families "
-            f"({_hosted_text(layout, base_seed)})"
+            f"({_usable_text(layout, base_seed)})"
         )
     first = {(draw.like_another_family, draw.behaviour): draw for draw in reversed(draws)}
 
@@ -268,8 +268,8 @@ def _has_headroom(layout: str, base_seed: int) -> bool:
     return any(draw.admissible and draw.headroom for draw in draws)
 
 
-def unhosted_reason(layout: str, family: str, base_seed: int = 0) -> str:
-    """Return why no draw of a family may be used on a layout."""
+def unusable_reason(layout: str, family: str, base_seed: int = 0) -> str:
+    """Return the reason why no draw of a family is usable on a layout."""
     draws = read_draws(layout, family, base_seed)
     if not draws:
         return "no draws were measured; `icrl4aht-data research draws` measures them"
@@ -285,8 +285,8 @@ def unhosted_reason(layout: str, family: str, base_seed: int = 0) -> str:
     )
 
 
-def _hosted_text(layout: str, base_seed: int) -> str:
-    counts = {family: len(_usable(layout, family, base_seed)) for family in hosted_families(layout, base_seed)}
+def _usable_text(layout: str, base_seed: int) -> str:
+    counts = {family: len(_usable(layout, family, base_seed)) for family in usable_families(layout, base_seed)}
     return "available: " + (", ".join(f"{count} of {family}" for family, count in counts.items()) or "none")
 
 
@@ -296,14 +296,14 @@ def _bundled_draws() -> dict[tuple[str, str, int], list[Draw]]:
 
 
 AnyRow = TypeVar("AnyRow", bound=Struct)
-"""A line of a table of measured teammates."""
+"""Type of the lines in a table of measured teammates."""
 
 
 def read_measured(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
-    """Return the lines of a table of measured teammates, in its order.
+    """Return the lines of a table of measured teammates, in the order of the file.
 
     Raises:
-        TaskFormatError: names the file and the line.
+        TaskFormatError: if a line is invalid; the message names the file and the line.
     """
     found = []
     for number, line in enumerate(read_lines(path), start=1):
@@ -315,7 +315,7 @@ def read_measured(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
 
 
 def write_table(path: Path, rows: Iterable[Any]) -> None:
-    """Write one JSON line per row, sorted by its `order`."""
+    """Write one JSON line for each row, sorted by the rows' `order`."""
     lines = [msgspec.json.encode(row) + b"\n" for row in sorted(rows, key=lambda row: row.order)]
     with atomic_write(path) as partial:
         partial.write_bytes(b"".join(lines))

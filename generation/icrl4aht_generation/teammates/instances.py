@@ -1,7 +1,7 @@
-"""The published test instances: the teammates of the 160 published test tasks, five of each heuristic family.
+"""Published test instances: the teammates of the 160 published test tasks, five of each heuristic family.
 
-Their parameters are in the bundled manifests, whose task ids are the published ones and hash the parameters. H1 and H2
-have parameters of their own on cramped_down; H3 and H4 have the same on every layout.
+The bundled manifests contain their parameters and the published task ids, which hash the parameters. H1 and H2 have
+different parameters on cramped_down than elsewhere; H3 and H4 have equal parameters on every layout.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from icrl4aht_data.overcooked.layouts import get_layout
 from icrl4aht_data.utils.groups import grouped
 
 TESTED_FAMILIES = tuple(HEURISTIC_KINDS)
-"""Families with test instances: those of the paper."""
+"""Families with test instances, which are the families of the paper."""
 
 INSTANCES = 5
-"""Test instances of each family, t0 to t4."""
+"""Number of test instances of each family, t0 to t4."""
 
 
 def published_tasks(track: str) -> list[Task]:
@@ -29,25 +29,25 @@ def published_tasks(track: str) -> list[Task]:
 
 @cache
 def _test_tasks() -> dict[tuple[str, str], list[Task]]:
-    """Return layout and family -> tasks with t0..t4."""
+    """Return the published test tasks with the instances t0..t4, by layout and family."""
     tasks = (task for track in TRACKS for task in published_tasks(track))
     return grouped(tasks, lambda task: (task.layout.name, task.teammate_kind))
 
 
 def published_teammates(layout: str, family: str) -> list[dict[str, Any]]:
-    """Return the teammate entries of the test instances t0..t4 of a family on a layout (short name), as in tasks.
+    """Return the teammate entries of the test instances t0..t4 of a family on a layout (short name).
 
-    Layouts without test tasks have the parameters that all layouts but cramped_down share.
+    A layout without test tasks has the parameters that all layouts except cramped_down share.
     """
     found = _test_tasks()
     return [task.teammate for task in found.get((layout, family), found["demo_wide", family])]
 
 
 def published_task(layout: str, teammate: str) -> Task:
-    """Return the test task of a layout, of the test or the training split, with a teammate such as "H3/t1".
+    """Return the task of a layout with a test instance such as "H3/t1"; the split is "test" or "train".
 
     Raises:
-        UnknownNameError: for an unknown layout, family or instance.
+        UnknownNameError: if the layout, family or instance does not exist.
     """
     name = get_layout(layout).name
     names = {

@@ -21,21 +21,21 @@ from icrl4aht_generation.learners.network import ActorCritic
 from icrl4aht_generation.policy import Policy
 
 Action = Literal["greedy", "sampled"]
-"""Ways of acting of a checkpoint: its most probable action, as in the dataset, or a draw from its distribution."""
+"""How a checkpoint acts: "greedy" for the most probable action, as in the dataset, "sampled" for a random action."""
 
 _CRITIC = ("critic", "critic_hidden")
 
 
 def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Policy:
-    """Return a checkpoint as a policy for either agent; its recurrent state is reset at each episode.
+    """Return a checkpoint as a policy for either agent, with a recurrent state that is reset at each episode.
 
     Args:
-        layout: the layout.
-        folder: the checkpoint, see `learners.checkpoint`.
-        action: how it acts.
+        layout: layout on which the policy plays.
+        folder: folder of the checkpoint, see `learners.checkpoint`.
+        action: how the policy acts, greedily or at random.
 
     Raises:
-        OptionError: if it is not a checkpoint, or its shapes do not fit the layout's observations.
+        OptionError: if the folder is not a checkpoint, or its shapes do not match the layout's observations.
     """
     network, params, _ = load_policy(folder)
     weights = {name: part for name, part in params["params"].items() if name not in _CRITIC}
@@ -50,7 +50,7 @@ def build_learned(layout: Layout, folder: Path, action: Action = "greedy") -> Po
             f"{folder}: does not fit {layout.name} (observations 5 x 5 x {layout.channels}): its weights have shapes "
             f"{dict(sorted(wrong))}, expected {dict(sorted(right))}"
         )
-    init, act = _functions(network.widths, action)
+    init, act = _acting_functions(network.widths, action)
     return Policy({"params": jax.tree.map(jnp.asarray, weights)}, init, act, "observation")
 
 
@@ -58,17 +58,17 @@ def build_learned_entry(layout: Layout, teammate: dict[str, Any], suite: Path | 
     """Return the policy of a task's teammate entry of kind "rl".
 
     Args:
-        layout: the layout.
-        teammate: the entry.
-        suite: a suite's folder, or the folder TEAMMATES of a release.
+        layout: layout of the task.
+        teammate: the task's teammate entry.
+        suite: folder of a suite, or the folder TEAMMATES of a release.
 
     Raises:
-        OptionError: without a suite, or if the checkpoint is missing or does not fit.
-        TaskFormatError: if the SHA-256 of its weights is not the entry's.
+        OptionError: without a suite, or if the checkpoint is missing or does not match the layout.
+        TaskFormatError: if the SHA-256 of the weights differs from the entry.
     """
     if suite is None:
         raise OptionError(
-            f"teammate {teammate['theta']['checkpoint']} is a checkpoint: give the folder of the suite of teammates"
+            f"teammate {teammate['theta']['checkpoint']} is a checkpoint: give the folder of its suite as `suite`"
         )
     folder = checkpoint_folder(suite, teammate)
     policy = build_learned(layout, folder)
@@ -82,8 +82,8 @@ def build_learned_entry(layout: Layout, teammate: dict[str, Any], suite: Path | 
 
 
 @lru_cache(maxsize=16)
-def _functions(widths: Widths, action: Action):
-    """Return `init` and `act`, shared by all checkpoints of one shape, which so share compilations."""
+def _acting_functions(widths: Widths, action: Action):
+    """Return the functions `init` and `act` of a policy; checkpoints of equal shape share them and compilations."""
     network = ActorCritic(widths, critic=False)
 
     def init(params, key: Key[Array, ""]) -> Array:

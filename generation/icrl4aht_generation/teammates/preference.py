@@ -1,13 +1,13 @@
-"""Tasks of the track `preference`: the teammate wants one dish throughout, and no observation shows which.
+"""Tasks of the track `preference`: a teammate wants the same dish in all episodes, but observations do not show which.
 
-The current recipe of a task is its dish in every episode, and only this dish is paid. The scripted teammates know it,
-as they know the recipe elsewhere. The layouts have no recipe indicator, so an ego learns the
-dish from what is paid, or from what its teammate cooks. Partners with hidden preferences are the field's own question:
-Yu et al. 2023 (HSP), and the biased partners of ZSC-Eval (Wang et al. 2024).
+The dish of a task is the current recipe in every episode, and only this dish is rewarded. The scripted teammates know
+the dish. The layouts have no recipe indicator, so an ego must infer the dish from rewards or from what its teammate
+cooks. Related work on partners with hidden preferences: Yu et al. 2023 (HSP), and the biased partners of ZSC-Eval (Wang
+et al. 2024).
 
-Test tasks have published test teammates, and validation and test tasks also one that only watches. Half of the test
-tasks are on layouts of training; the others are on layouts with rooms that no training layout has. Of ten dishes three
-are in test tasks only.
+Test tasks have published test teammates; validation and test tasks also have a teammate that never acts. Half of the
+test tasks are on training layouts, the other half on layouts with rooms that no training layout has. On layouts with
+ten dishes, three dishes only occur in test tasks.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ WATCHER: dict[str, Any] = {
     "base_seed": 0,
     "theta": TERRITORY.defaults | {"behavior_mode": LAZY, "action_probability": 0.0},
 }
-"""A teammate that never acts."""
+"""Entry of a teammate that never acts."""
 
 _DRAWS = {"train": 2, "validation": 3}
-"""Split -> seed of the diverse draws of its teammates, as in `teammates.draws`."""
+"""Seed of the sampled diverse teammates by split, as in `teammates.draws`."""
 
 _TEST_TASKS = {"train": 5, "test": 10}
-"""Which layouts -> test tasks on each of them."""
+"""Number of test tasks on each layout, for layouts of training and other layouts."""
 
 
 def all_dishes(layout: Layout) -> list[Dish]:
-    """Return the dishes of a layout's ingredients: 4 of two ingredients, 10 of three."""
+    """Return all dishes of a layout's ingredients: 4 dishes of two ingredients, 10 of three."""
     return list(combinations_with_replacement(layout.ingredients, 3))  # type: ignore[arg-type]
 
 
 def training_dishes(layout: Layout) -> list[Dish]:
-    """Return the dishes of training and validation tasks: all 4, or 7 of 10."""
+    """Return the dishes of training and validation tasks on a layout: all of 4 dishes, or 7 of 10 dishes."""
     dishes = all_dishes(layout)
     return [dish for number, dish in enumerate(dishes) if len(dishes) < 10 or number % 3 != 2]
 
@@ -55,27 +55,27 @@ def preference_tasks(split: str) -> list[Task]:
     tasks = []
     for part in PREFERENCE_LAYOUTS if split == "test" else ("train",):
         for number, name in enumerate(PREFERENCE_LAYOUTS[part]):
-            for dish, mate in _pairs(get_layout(name), split, number, part):
+            for dish, mate in _dishes_and_teammates(get_layout(name), split, number, part):
                 tasks.append(make_task(PREFERENCE, split, name, mate, 0, [dish]))
     return tasks
 
 
-def _pairs(layout: Layout, split: str, number: int, part: str) -> Iterator[tuple[Dish, dict[str, Any]]]:
-    """Yield dish and teammate of each task on a layout; `number` shifts them, so that layouts have other pairs."""
+def _dishes_and_teammates(layout: Layout, split: str, number: int, part: str) -> Iterator[tuple[Dish, dict[str, Any]]]:
+    """Yield dish and teammate of each task on a layout; `number` shifts the pairs, so they differ between layouts."""
     dishes = all_dishes(layout) if split == "test" else training_dishes(layout)
     mates = _teammates(layout, split)
     if split == "train":
         yield from ((dish, mates[(3 * k + number) % len(mates)]) for k, dish in enumerate(dishes * 4))
         return
     for k in range(_TEST_TASKS[part] if split == "test" else len(TESTED_FAMILIES)):
-        # Over the layouts every dish meets several families: their numbers modulo 5 run at different paces.
+        # Different factors give every dish teammates of several families over all layouts.
         yield dishes[(3 * k + 7 * number) % len(dishes)], mates[(6 * k + number) % len(mates)]
 
 
 def _teammates(layout: Layout, split: str) -> list[dict[str, Any]]:
-    """Return the teammates of a split on a layout, families in turn.
+    """Return the teammates of a split on a layout, with the families in turn.
 
-    In validation and test, the one that only watches follows after each round.
+    In validation and test, a teammate that never acts follows after each round.
     """
     found = []
     for instance in range(INSTANCES):

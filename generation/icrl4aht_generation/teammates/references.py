@@ -1,4 +1,4 @@
-"""Mean returns of reference egos with a teammate: whether the ego matters with it, and how much it can gain."""
+"""Mean returns of reference egos with a teammate, which show how much an ego can raise the return."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from icrl4aht_data.overcooked.tables import Tables
 from icrl4aht_data.utils.groups import grouped
 from icrl4aht_generation.env import Environment
 from icrl4aht_generation.experts.oracle import SITUATION_ORACLE
-from icrl4aht_generation.experts.padded import own_layout, padded_layout
+from icrl4aht_generation.experts.padded import padded_layout, unpadded_layout
 from icrl4aht_generation.learners.rollout import init_rollout, policy_player, roll_out
 from icrl4aht_generation.policy import Policy, stacked
 
 REFERENCE_EPISODES = 20
-"""Episodes over which the return of a reference ego is measured."""
+"""Number of episodes over which the mean return of a reference ego is measured."""
 
 _SEED = 11
 
 
 def reference_returns(layout: Layout, teammates: Sequence[Policy], episodes: int = REFERENCE_EPISODES) -> np.ndarray:
-    """Measure the reference egos with teammates, in episodes of 100 steps.
+    """Measure the returns of the reference egos with teammates in episodes of 100 steps.
 
-    All pairs play from the same starts, and a teammate's returns do not depend on the other teammates. There is one
-    compilation, in which policies with the same functions are one.
+    All pairs play from equal first states, and a teammate's returns do not depend on the other teammates. All pairs
+    share one compilation.
 
     Args:
-        layout: the layout.
+        layout: layout of the episodes.
         teammates: policies that play agent 1; at least one.
         episodes: number of episodes of each ego with each teammate.
 
@@ -44,10 +44,10 @@ def reference_returns(layout: Layout, teammates: Sequence[Policy], episodes: int
         Mean return of each of `REFERENCE_EGOS` with each teammate, float64 (teammates, egos).
     """
     families = list(stacked_families(teammates))
-    # Observations and the state records that a policy of one layout sees are not padded.
+    # Policies that see observations or state records of one layout need the layout without padding.
     every = all(family.sees == "situation" for _, family in families)
-    tables, expert, _ = (padded_layout if every else own_layout)(layout)
-    play = _program(
+    tables, expert, _ = (padded_layout if every else unpadded_layout)(layout)
+    play = _compile(
         tuple((tuple(numbers), family._replace(params=())) for numbers, family in families), len(teammates), episodes
     )
     earned = np.asarray(play(tables, expert, [family.params for _, family in families]), np.float64)
@@ -58,16 +58,19 @@ def reference_egos(returns: np.ndarray, self_play: float | None = None) -> Refer
     """Return the record of one teammate's measurements.
 
     Args:
-        returns: float64 (egos,), its row of `reference_returns`.
-        self_play: mean return of a learned teammate with the policy that it was trained with.
+        returns: float64 (egos,), the teammate's row of `reference_returns`.
+        self_play: mean return of a learned teammate with its training partner; None for other teammates.
     """
     stay, random, oracle = returns.tolist()  # in the order of `REFERENCE_EGOS`
     return ReferenceEgos(stay, random, oracle, REFERENCE_EPISODES, self_play)
 
 
 @lru_cache(maxsize=16)
-def _program(families: tuple[tuple[tuple[int, ...], Policy], ...], teammates: int, episodes: int) -> Callable[..., Any]:
-    """Return a compiled function of tables, parameters of the oracle and of each family, to the episodes' returns."""
+def _compile(families: tuple[tuple[tuple[int, ...], Policy], ...], teammates: int, episodes: int) -> Callable[..., Any]:
+    """Return a compiled function that plays all pairs and returns the episodes' returns.
+
+    Its arguments are the layout's tables, and the parameters of the oracle and of each family.
+    """
     each = teammates * episodes
     total = len(REFERENCE_EGOS) * each  # environments are ordered by ego, teammate and episode
     mate_of = np.arange(total) // episodes % teammates
@@ -105,11 +108,11 @@ REFERENCE_EGOS = {
     "random": Policy((), lambda params, key: key, _act_randomly, "situation"),
     "oracle": SITUATION_ORACLE,
 }
-"""The egos "stay", "random" (uniform over the six actions) and "oracle", whose draws are the episode's."""
+"""Policies of the egos "stay", "random" (uniform over the six actions) and "oracle" by name."""
 
 
 def stacked_families(policies: Sequence[Policy]) -> Iterator[tuple[list[int], Policy]]:
-    """Yield policies that share their functions: their numbers, and one policy with stacked parameters."""
+    """Yield groups of policies with equal functions: their indices, and one policy with stacked parameters."""
     groups = grouped(range(len(policies)), lambda number: policies[number]._replace(params=()))
     for numbers in groups.values():
         yield numbers, policies[numbers[0]]._replace(params=stacked(policies[n].params for n in numbers))

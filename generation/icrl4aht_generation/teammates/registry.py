@@ -1,4 +1,4 @@
-"""Conversion of a task's teammate entry to a policy, and back."""
+"""Conversion of a task's teammate entry to a policy, and creation of entries."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from icrl4aht_generation.teammates.heuristics.utility_greedy import UTILITY_GREE
 HEURISTIC_FAMILIES = {
     heuristic.kind: heuristic for heuristic in (RECIPE_AWARE_BUTTON, TERRITORY, ASSEMBLY_LINE, UTILITY_GREEDY)
 }
-"""The heuristics of the benchmark by kind; other installed packages register further ones."""
+"""Heuristic families of the benchmark by kind; other installed packages can register more families."""
 
 _JITTER = 0.2
-"""Largest distance of a sampled parameter from its preset, as a share of its full range."""
+"""Maximum distance of a sampled parameter from its preset, as a share of the parameter's full range."""
 
 
 def heuristic_teammate(family: str, preset: str, theta_id: int) -> dict[str, Any]:
-    """Return the teammate entry of a heuristic's preset, every parameter explicit.
+    """Return the teammate entry of a heuristic's preset, with explicit values of all parameters.
 
     Raises:
-        UnknownNameError: for a family or preset that does not exist.
+        UnknownNameError: if the family or the preset does not exist.
     """
     heuristic = _family(family)
     check_choice(f"preset of {family}", preset, heuristic.presets)
@@ -47,34 +47,34 @@ def heuristic_teammate(family: str, preset: str, theta_id: int) -> dict[str, Any
 
 
 def sample_teammate(family: str, theta_id: int, split: str, base_seed: int = 0) -> dict[str, Any]:
-    """Return a teammate entry with preset and parameters drawn by the string `family:theta_id:split:base_seed`.
+    """Return a teammate entry with random parameters, seeded by the string `family:theta_id:split:base_seed`.
 
-    Published tasks do not come from here: their manifests state every parameter (paper, App. B.2, train and test
-    ranges).
+    Published tasks are not sampled by this function: their manifests contain every parameter (paper, App. B.2, train
+    and test ranges).
 
     Args:
-        family: a heuristic's name.
-        theta_id: any number that distinguishes the draws.
-        split: "train" or "test", which have ranges of their own, or "diverse", see `Heuristic.diverse`.
-        base_seed: shared by the draws of one run.
+        family: name of a heuristic.
+        theta_id: number of the sampled teammate.
+        split: ranges of the parameters: "train", "test", or "diverse", see `Heuristic.diverse`.
+        base_seed: seed that a set of sampled teammates shares.
 
     Returns:
-        The entry, every parameter explicit: float32 values as floats, integers as ints.
+        The entry with all parameters: float32 values as floats, integers as ints.
 
     Raises:
-        UnknownNameError: for a family or split that does not exist.
+        UnknownNameError: if the family or the split does not exist.
     """
     heuristic = _family(family)
     samplings = {"train": heuristic.train, "test": heuristic.test}
     samplings |= {"diverse": heuristic.diverse} if heuristic.diverse else {}
     check_choice("split", split, samplings)
     presets, ranges = samplings[split]
-    # A hash, because a draw must depend neither on the order of draws nor on Python's own salted hashes.
+    # A SHA-256 hash as seed depends neither on the order of calls nor on Python's salted hashes.
     digest = hashlib.sha256(f"{family}:{theta_id}:{split}:{base_seed}".encode()).hexdigest()
     key, own = jax.random.split(jax.random.key(int(digest[:8], 16)))
     theta = heuristic.defaults | heuristic.presets[presets[_randint(own, len(presets))]]
     for name, value in theta.items():
-        key, own = jax.random.split(key)  # for every parameter, drawn or not: ranges can change one by one
+        key, own = jax.random.split(key)  # also for fixed parameters, so each draw is independent of other ranges
         if isinstance(ranges.get(name), list):
             theta[name] = ranges[name][_randint(own, len(ranges[name]))]
         elif name in ranges:
@@ -93,7 +93,7 @@ def _randint(key: jax.Array, n: int) -> int:
 
 
 def _uniform(key: jax.Array, low: float, high: float) -> float:
-    """Draws a float32 that is rounded once, whatever XLA does: with other options it rounds product and sum."""
+    """Return a random float32 that is rounded only once, so the value does not depend on options of XLA."""
     least, width = np.float32(low), np.float32(high) - np.float32(low)
     drawn = np.float64(jax.random.uniform(key, ())) * np.float64(width) + np.float64(least)
     return float(max(np.float32(drawn), least))
@@ -106,33 +106,33 @@ def build_teammate(
     noise: Noise = "seeded",
     suite: Path | None = None,
 ) -> Policy:
-    """Return the policy of a task's teammate entry; learned ones act greedily.
+    """Return the policy of a task's teammate entry; learned teammates act greedily.
 
     Args:
-        layout: the layout whose state records or observations it sees; None for a heuristic that sees a `Situation`,
-            and so plays every layout.
+        layout: layout of the state records or observations that the teammate sees; None for a heuristic that sees a
+            `Situation`, and can play every layout.
         teammate: a heuristic's parameters, or a checkpoint; see `icrl4aht_data.benchmark.tasks.Task`.
-        slot: 0 or 1, the agent it plays.
+        slot: 0 or 1, the agent that the teammate plays.
         noise: source of a heuristic's randomness, see `icrl4aht_generation.policy.Noise`.
         suite: folder of the checkpoints: a suite, or the folder TEAMMATES of a release.
 
     Raises:
-        UnknownNameError: for a family that does not exist.
-        TaskFormatError: for unknown or missing parameters, values out of range, and slots other than 0 and 1.
-        OptionError: for a checkpoint that is missing or does not fit the layout.
+        UnknownNameError: if the family does not exist.
+        TaskFormatError: if parameters are unknown, missing or out of range, or the slot is not 0 or 1.
+        OptionError: if a checkpoint is missing or does not match the layout.
     """
     if slot not in (EGO, TEAMMATE):
         raise TaskFormatError(f"teammate {teammate['family']}: slot {slot!r}, expected {EGO} or {TEAMMATE}")
     if teammate.get("kind") == "rl":
         if layout is None:
-            raise OptionError(f"teammate {teammate['theta']['checkpoint']}: a checkpoint plays one layout, give it")
+            raise OptionError(f"teammate {teammate['theta']['checkpoint']}: a checkpoint needs `layout`, found None")
         return learned.build_learned_entry(layout, teammate, suite)
     check_theta(teammate)
     return _family(teammate["family"]).build(layout, teammate["theta"], slot, noise)
 
 
 def with_equal_parameters(teammates: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return entries of which all of one family have `RANDOM_ACTIONS` if any has, so that they play in one program."""
+    """Add `RANDOM_ACTIONS` to all entries of a family if any entry has it, so they share a compilation."""
     mixed = {entry["family"] for entry in teammates if RANDOM_ACTIONS in entry["theta"]}
     return [
         entry | {"theta": {RANDOM_ACTIONS: 0.0} | entry["theta"]} if entry["family"] in mixed else entry
@@ -141,16 +141,16 @@ def with_equal_parameters(teammates: Sequence[dict[str, Any]]) -> list[dict[str,
 
 
 def recover_teammate(dataset: Dataset, history_id: int, episode: int = 0) -> Policy:
-    """Return the teammate of a history, as it played an episode; the number matters only where teammates change.
+    """Return the policy of a history's teammate in an episode; the episode only matters if the teammate changes.
 
     Raises:
-        OptionError: if the release does not hold the teammate's checkpoint.
+        OptionError: if the release does not contain the teammate's checkpoint.
     """
     entry = dataset.recover_teammate(history_id, episode)
     if entry["kind"] == "rl" and not dataset.origin.below(f"{TEAMMATES}/{entry['theta']['sha256']}").is_dir():
         raise OptionError(
-            f"{dataset.root / TEAMMATES}: checkpoint {entry['theta']['sha256']} is missing, the teammate of history "
-            f"{history_id}: this release was made without it; copy it from the release that it was made of"
+            f"{dataset.root / TEAMMATES}: checkpoint {entry['theta']['sha256']} is missing, which is the teammate of "
+            f"history {history_id}; copy the checkpoint from the release from which this release was made"
         )
     layout = get_layout(dataset.index.entry(history_id).layout)
     slot, noise = entry.get("slot", TEAMMATE), entry.get("noise", "seeded")
@@ -158,11 +158,11 @@ def recover_teammate(dataset: Dataset, history_id: int, episode: int = 0) -> Pol
 
 
 def check_theta(teammate: dict[str, Any]) -> None:
-    """Validate a heuristic's entry: every parameter, perhaps `RANDOM_ACTIONS`, no other, and each within its range.
+    """Validate that a heuristic's entry has all parameters within their ranges, and no unknown parameters.
 
     Raises:
-        UnknownNameError: for a family that does not exist.
-        TaskFormatError: names the parameter, what was found and what was expected.
+        UnknownNameError: if the family does not exist.
+        TaskFormatError: if a parameter is invalid; the message names the parameter and the expected values.
     """
     theta, kind = teammate["theta"], _family(teammate["family"]).theta_type
     try:

@@ -1,9 +1,10 @@
-"""Heuristic teammates that differ widely: from each other, and from all test instances.
+"""Heuristic teammates that differ widely from each other and from all test instances.
 
-`spread.jsonl` has one line per training layout, chosen and measured by `icrl4aht-data research draws --spread`, so that
-tasks are known without any simulation. The candidates are presets, specialists that do one part of the work, a teammate
-that only watches, diverse draws of all families, and mixtures of these with random actions. Of those that act unlike
-the test instances, the farthest from all chosen ones is chosen next, until none is far enough.
+`spread.jsonl` has one line for each training layout with teammates that `icrl4aht-data research draws --spread` chose
+and measured, so tasks need no simulation. The candidates are presets, specialists for one part of the work, a teammate
+that never acts, diverse sampled teammates of all families, and mixtures of these with random actions. Among candidates
+that behave differently from the test instances, the next chosen teammate is always the candidate that is farthest from
+all chosen teammates, until no candidate is far enough.
 """
 
 from __future__ import annotations
@@ -34,50 +35,50 @@ from icrl4aht_generation.teammates.heuristics.territory import (
 from icrl4aht_generation.teammates.registry import HEURISTIC_FAMILIES, sample_teammate
 
 SPREAD_TABLE = Path(__file__).with_name("spread.jsonl")
-"""Table of the chosen teammates."""
+"""Path of the table of the chosen teammates."""
 
 SPREAD_SEED = 4
-"""The base_seed of their entries; `theta_id` is the candidate's number in its family, see `spread_candidates`."""
+"""base_seed of spread teammates; their `theta_id` is the candidate's number in the family, see `spread_candidates`."""
 
 _DRAWS = 32
-"""Diverse draws of each family among the candidates."""
+"""Number of diverse sampled teammates of each family among the candidates."""
 
 _MIXED_DRAWS = 8
-"""Draws of each family that are also mixed with random actions."""
+"""Number of sampled teammates of each family that are also mixed with random actions."""
 
 _CHANCES = (0.25, 0.5, 0.75)
-"""Chances of a random action in mixtures, in turn."""
+"""Chances of a random action, which mixtures use in turn."""
 
-_FIRST_DRAW, _FIRST_MIXTURE = 100, 200  # numbers of the candidates: presets and specialists are before them
+_FIRST_DRAW, _FIRST_MIXTURE = 100, 200  # first numbers of candidates, after presets and specialists
 
 MOST_CHOSEN = 45
-"""Most teammates of a layout."""
+"""Maximum number of chosen teammates on a layout."""
 
 VALIDATES = 5
-"""Every fifth chosen teammate validates: so both splits are spread over all behaviours."""
+"""Every fifth chosen teammate is for validation, so both splits cover all behaviours."""
 
 _SPECIALISTS: dict[str, tuple[dict[str, float], ...]] = {
     "recipe_aware_button": (
         {"task_specialization": 1.0},  # only plates and delivers
-        {"wrong_ingredient_prob": 1.0},  # fetches what nobody wants
-        {"path_blocking": 1.0},  # stands at pots and goals
-        {"plate_timing": 1.0},  # fetches its plate first
+        {"wrong_ingredient_prob": 1.0},  # fetches wrong ingredients
+        {"path_blocking": 1.0},  # blocks pots and goals
+        {"plate_timing": 1.0},  # fetches a plate early
         {"idle_prob": 0.5},
     ),
     "territory": (
-        {"behavior_mode": LAZY, "action_probability": 0.0},  # only watches
+        {"behavior_mode": LAZY, "action_probability": 0.0},  # never acts
         {"behavior_mode": LAZY, "action_probability": 0.5},
         {"behavior_mode": BLOCKER},
         {"behavior_mode": HOARDER},  # carries everything to counters
         {"behavior_mode": HOARDER, "split_mode": HORIZONTAL, "strictness": 1.0, "shared_margin": 0},
-        {"behavior_mode": COUNTER},  # hands dishes over at a counter
+        {"behavior_mode": COUNTER},  # puts dishes on counters
         {"behavior_mode": COUNTER, "split_mode": HORIZONTAL, "strictness": 1.0, "shared_margin": 0},
         {"behavior_mode": INVADER, "strictness": 1.0, "shared_margin": 0},
         {"behavior_mode": INVADER, "split_mode": STATIONS, "strictness": 1.0, "shared_margin": 0},
     ),
     "assembly_line": (
         {"role_mode": RUNNER, "handoff_style": 1},  # only fetches, hands over at the middle counters
-        {"role_mode": RUNNER, "handoff_style": 2},  # or near its partner
+        {"role_mode": RUNNER, "handoff_style": 2},  # only fetches, hands over near its partner
         {"role_mode": PLATER, "task_abandon_prob": 0.5},
         {"task_abandon_prob": 1.0},  # puts down whatever it fetches
         {"wrong_action_prob": 1.0},
@@ -85,7 +86,7 @@ _SPECIALISTS: dict[str, tuple[dict[str, float], ...]] = {
         {"timing_mismatch": 1.0},
     ),
     "utility_greedy": (
-        {"w_press_L": 20.0},  # lights the recipe whenever it can
+        {"w_press_L": 20.0},  # presses the button whenever possible
         {"w_fetch_ingredient": 0.0, "w_get_plate": 20.0},
         {"w_fetch_ingredient": 20.0, "w_get_plate": 0.0},
         {"w_stage_on_counter": 20.0, "counter_preference": 1.0},
@@ -93,25 +94,25 @@ _SPECIALISTS: dict[str, tuple[dict[str, float], ...]] = {
         {RANDOM_ACTIONS: 1.0},
     ),
 }
-"""Parameters that differ from the defaults of each family."""
+"""Parameters of the specialists of each family that differ from the defaults."""
 
 
 class SpreadTeammate(Struct, forbid_unknown_fields=True):
-    """A chosen teammate of a layout.
+    """A teammate that was chosen for a layout.
 
     Attributes:
         split: "train" or "validation".
         family: kind of the heuristic.
         theta_id: number of the candidate.
-        theta: all parameters.
-        nearest: test instance of its family that acts most like it, such as "H3/t1".
-        distance: Hamming distance to that instance, see `icrl4aht_generation.teammates.distances`.
-        other: test instance of the other families that acts most like it.
-        other_distance: Hamming distance to that instance.
-        separation: Hamming distance to the nearest of the teammates chosen before it; 1 for the first.
-        stay: mean return of the ego `stay` with it in 20 episodes of 100 steps.
-        random: mean return of the ego `random`.
-        oracle: mean return of the ego `oracle`.
+        theta: all parameters of the teammate.
+        nearest: test instance of the same family with the most similar behaviour, such as "H3/t1".
+        distance: Hamming distance to `nearest`, see `icrl4aht_generation.teammates.distances`.
+        other: test instance of another family with the most similar behaviour.
+        other_distance: Hamming distance to `other`.
+        separation: Hamming distance to the nearest teammate that was chosen earlier; 1 for the first teammate.
+        stay: mean return of the ego `stay` with the teammate in 20 episodes of 100 steps.
+        random: mean return of the ego `random` with the teammate.
+        oracle: mean return of the ego `oracle` with the teammate.
     """
 
     split: str
@@ -129,20 +130,20 @@ class SpreadTeammate(Struct, forbid_unknown_fields=True):
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Its entry in a task."""
+        """Entry of the teammate in a task."""
         return _entry(self.family, self.theta_id, dict(self.theta))
 
 
 class LayoutSpread(Struct, forbid_unknown_fields=True):
-    """The teammates of a layout, in the order in which they were chosen, and what they were chosen from.
+    """The chosen teammates of a layout, in the order of their choice, and numbers of candidates.
 
     Attributes:
         layout: short name of a training layout.
         tried: number of candidates.
-        unlike_tests: those at Hamming distance `DIVERSE_DISTANCE` or more from every test instance.
-        headroom: those of these with which the returns of the reference egos differ by `LEAST_HEADROOM` or more. Others
-            are chosen only where none has headroom.
-        chosen: the chosen ones.
+        unlike_tests: number of candidates at Hamming distance `DIVERSE_DISTANCE` or more from every test instance.
+        headroom: number of candidates counted in `unlike_tests` with returns of the reference egos that differ by
+            `LEAST_HEADROOM` or more. Other candidates are only chosen if this number is 0.
+        chosen: the chosen teammates.
     """
 
     layout: str
@@ -157,16 +158,16 @@ class LayoutSpread(Struct, forbid_unknown_fields=True):
         return layout_order(self.layout)
 
     def of_split(self, split: str) -> list[SpreadTeammate]:
-        """Return the teammates of split "train" or "validation", in order."""
+        """Return the chosen teammates of split "train" or "validation", in the order of their choice."""
         return [mate for mate in self.chosen if mate.split == split]
 
 
 def read_spread(layout: str) -> LayoutSpread:
-    """Return the list of a training layout.
+    """Return the list of chosen teammates of a training layout.
 
     Raises:
-        UnknownNameError: for a layout without training tasks.
-        OptionError: for a layout that was not measured.
+        UnknownNameError: if the layout has no training tasks.
+        OptionError: if the layout was not measured.
     """
     name = get_layout(layout).name
     check_choice("training layout", name, TESTED_ON)
@@ -176,7 +177,7 @@ def read_spread(layout: str) -> LayoutSpread:
 
 
 def spread_teammates(layout: str, split: str, count: int) -> list[dict[str, Any]]:
-    """Return the entries of the first teammates of a layout's list: those that differ most.
+    """Return the entries of the first teammates in a layout's list, which differ most from each other.
 
     Args:
         layout: a training layout.
@@ -184,8 +185,8 @@ def spread_teammates(layout: str, split: str, count: int) -> list[dict[str, Any]
         count: number of teammates.
 
     Raises:
-        UnknownNameError: for a layout without training tasks.
-        OptionError: for a layout that was not measured, and for more teammates than its list has.
+        UnknownNameError: if the layout has no training tasks.
+        OptionError: if the layout was not measured, or has fewer teammates.
     """
     if count == 0:
         return []
@@ -194,15 +195,17 @@ def spread_teammates(layout: str, split: str, count: int) -> list[dict[str, Any]
     if count > len(found):
         raise OptionError(
             f"{spread.layout}: {count} {split} teammates requested of teammates/spread.jsonl, which has {len(found)}: "
-            f"of {spread.tried} candidates {spread.unlike_tests} act unlike the tests, and {spread.headroom} of "
-            f"these have headroom; request fewer"
+            f"{spread.unlike_tests} of {spread.tried} candidates differ from the test teammates, and "
+            f"{spread.headroom} of these have headroom; request fewer"
         )
     return [mate.entry for mate in found[:count]]
 
 
 def find_measured(layout: str, teammate: Mapping[str, Any]) -> Draw | None:
-    """Return what was measured with the teammate of an entry, of either table, or None. Behaviours are numbers in the
-    layout's list."""
+    """Return the measurements of a teammate entry from either table, or None if it was not measured.
+
+    The behaviour of a spread teammate is its number in the layout's list.
+    """
     if teammate.get("kind") != "heuristic" or teammate.get("base_seed") != SPREAD_SEED:
         return find_draw(layout, teammate)
     spread = _bundled_spreads().get(layout)
@@ -223,10 +226,10 @@ def _bundled_spreads() -> dict[str, LayoutSpread]:
 
 
 def spread_rows(spreads: Iterable[LayoutSpread]) -> list[dict[str, Any]]:
-    """Return the numbers of each layout: candidates, behaviours of each split, those with headroom, least distances.
+    """Return a row of measures for each layout, such as numbers of candidates and minimum distances.
 
     Returns:
-        One row per layout; distances are None where nobody was chosen.
+        One row for each layout; distances are None if no teammate was chosen.
     """
     return [
         {
@@ -247,7 +250,7 @@ def spread_rows(spreads: Iterable[LayoutSpread]) -> list[dict[str, Any]]:
 
 
 def spread_candidates() -> list[dict[str, Any]]:
-    """Return the entries of all candidates, by family: presets and specialists, diverse draws, mixtures."""
+    """Return the entries of all candidates by family: presets, specialists, diverse sampled teammates, mixtures."""
     return [entry for family in HEURISTIC_FAMILIES for entry in _family_candidates(family)]
 
 
@@ -272,16 +275,17 @@ def _entry(family: str, theta_id: int, theta: dict[str, Any]) -> dict[str, Any]:
 def choose_spread(distances: np.ndarray, least: float, most: int) -> tuple[list[int], list[float]]:
     """Choose items by farthest-point selection (greedy max-min).
 
-    The first is the one with the farthest other item; then always the one whose nearest chosen item is farthest.
-    Items at equal distance are taken by number.
+    The first item has the largest distance to any other item. Each next item has the largest distance to its nearest
+    chosen item. Ties go to the smaller index.
 
     Args:
-        distances: symmetric, float64 (N, N).
-        least: least distance of any two chosen items.
-        most: most items.
+        distances: symmetric matrix of distances, float64 (N, N).
+        least: minimum distance between any two chosen items.
+        most: maximum number of items.
 
     Returns:
-        Numbers of the chosen items in order, and the distance of each to the nearest one before it, 1 for the first.
+        Indices of the chosen items in order, and each item's distance to the nearest item chosen earlier, 1 for the
+        first item.
     """
     chosen: list[int] = []
     separations: list[float] = []

@@ -58,7 +58,7 @@ def test_wrong_use_is_an_error():
     with pytest.raises(OptionError, match="call reset"):
         env.state()
     env.reset(seed=0)
-    with pytest.raises(OptionError, match=r"expected those of ego and teammate, found \['ego'\]"):
+    with pytest.raises(OptionError, match=r"expected actions of ego and teammate, found \['ego'\]"):
         env.step({"ego": 0})
     with pytest.raises(OptionError, match=r"action of teammate: expected 0\.\.5"):
         env.step({"ego": 0, "teammate": 6})

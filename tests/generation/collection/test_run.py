@@ -119,7 +119,7 @@ def test_ray_with_two_workers(built, pair, tmp_path):
 
 def test_workers_of_a_cluster_are_its_own(tmp_path):
     jobs = [FileJob(tmp_path, "one")]
-    with pytest.raises(OptionError, match="workers = 2: the Ray at there:6379 has its own"):
+    with pytest.raises(OptionError, match="workers = 2: the Ray at there:6379 sets its own number"):
         run_jobs(jobs, tmp_path, Console(), QueueOptions(executor="ray", address="there:6379", workers=2))
 
 

@@ -21,7 +21,7 @@ from icrl4aht_generation.jobs.job import OnUpdate
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.profiles.noise_config import SEARCH, NoiseConfig
 from icrl4aht_generation.releases.check import compare_rebuilds
-from icrl4aht_generation.teammates.distances import act_along
+from icrl4aht_generation.teammates.distances import act_on_records
 from icrl4aht_generation.teammates.learned import build_learned
 from icrl4aht_generation.teammates.preference import WATCHER, all_dishes
 from icrl4aht_generation.teammates.registry import build_teammate, heuristic_teammate
@@ -242,7 +242,7 @@ def test_histories_with_a_learned_teammate(profile, tmp_path):
     job.run()
     states = np.load(job.folder / "state.npy").reshape(40, 100, -1)[[0, 25]].swapaxes(0, 1)
     policy = build_learned(LAYOUT, tmp_path / "suite/member")
-    expected = act_along(LAYOUT, [policy], jnp.asarray(states))[0].T
+    expected = act_on_records(LAYOUT, [policy], jnp.asarray(states))[0].T
     played = np.load(job.folder / "teammate_actions.npy").reshape(40, 100)[[0, 25]]
     np.testing.assert_array_equal(played, expected)
     assert len(np.unique(played)) > 1

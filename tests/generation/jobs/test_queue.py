@@ -42,7 +42,7 @@ def tries(out: Path, *names: str) -> list[int]:
 
 def test_a_failing_job_is_reported_and_others_finish(tmp_path):
     jobs = [FileJob(tmp_path, "bad", failures=1), FileJob(tmp_path, "good")]
-    with pytest.raises(FailedJobsError, match=r"1 of 2 jobs are unfinished: bad; .*failed\.jsonl has the reasons"):
+    with pytest.raises(FailedJobsError, match=r"1 of 2 jobs are unfinished: bad; .*failed\.jsonl lists the reasons"):
         run(jobs, tmp_path)
     (line,) = failures(tmp_path)
     assert (line["task_id"], line["attempts"], line["error"]) == ("bad", 1, "ValueError: attempt 1")
@@ -61,7 +61,7 @@ def test_retries(tmp_path):
 
 
 def test_fail_fast(tmp_path):
-    with pytest.raises(FailedJobsError, match=r"failed\.jsonl: the first failure: ValueError: attempt 1"):
+    with pytest.raises(FailedJobsError, match=r"failed\.jsonl: stopped after the first failure: ValueError: attempt 1"):
         run([FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "good")], tmp_path, fail_fast=True)
     assert tries(tmp_path, "bad", "good") == [1, 0]
     assert len(failures(tmp_path)) == 1
@@ -87,7 +87,7 @@ def test_local_processes(tmp_path):
     """Two workers: one job fails once and is tried again, one always fails, one is killed."""
     jobs = [FileJob(tmp_path, "killed", killed=True), FileJob(tmp_path, "busy", busy=True)]
     jobs += [FileJob(tmp_path, "bad", failures=9), FileJob(tmp_path, "later", failures=1)]
-    with pytest.raises(FailedJobsError, match=r"2 of 4 jobs are unfinished: bad, killed; .*has the reasons"):
+    with pytest.raises(FailedJobsError, match=r"2 of 4 jobs are unfinished: bad, killed; .*lists the reasons"):
         run(jobs, tmp_path, workers=2, retries=1)
     assert str(os.getpid()) not in {(tmp_path / name).read_text() for name in ("busy", "later")}
     lines = {line["task_id"]: line for line in failures(tmp_path)}

@@ -166,10 +166,10 @@ def test_a_family_says_how_many_layouts_it_has(monkeypatch):
     draws = [(one.rows, one.recipes, False) for one in few]
     monkeypatch.setattr(families, "MOST_REPEATS", 20)
     monkeypatch.setitem(LAYOUT_FAMILIES, "few", lambda seed: cycle(draws))
-    with pytest.raises(OptionError, match="family few, seed 0: it has 3 layouts, expected 4; ask for fewer"):
+    with pytest.raises(OptionError, match="family few, seed 0: found only 3 layouts, expected 4; ask for fewer"):
         generate_layouts("few", 0, 4)
     trained = sum(split_of(one) == "train" for one in few)
-    with pytest.raises(OptionError, match=f"it has {trained} layouts of split train, expected 4"):
+    with pytest.raises(OptionError, match=f"found only {trained} layouts of split train, expected 4"):
         generate_layouts("few", 0, 4, split="train")
 
 

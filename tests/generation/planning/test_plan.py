@@ -62,9 +62,8 @@ def test_stored_sizes_are_those_of_the_bundled_release():
     dataset = load_icrl4aht()
     shards = sum(path.stat().st_size for path in (dataset.root / "data").rglob("*.h5"))
     made = [entry for entry in dataset.entries if entry.source != "agent"]  # which are a thirtieth of the transitions
-    expected = sum(
-        entry.T * plan.BYTES["lite", str(entry.source)] + plan.HISTORY_BYTES.get(str(entry.source), 0) for entry in made
-    )
+    sizes = [(plan.BYTES_PER_STEP["lite", str(one.source)], plan.BYTES_PER_HISTORY.get(one.source, 0)) for one in made]
+    expected = sum(one.T * step + history for one, (step, history) in zip(made, sizes, strict=True))
     assert shards == pytest.approx(expected, rel=0.1)
 
 

@@ -202,7 +202,7 @@ def test_a_stopped_run_resumes_with_its_multipliers_and_only_under_its_settings(
     before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
     with pytest.raises(
         OptionError,
-        match=r"lbrdiv.resume\.safetensors: saved by a training of other settings: seed was 0, now it is 1",
+        match=r"lbrdiv.resume\.safetensors: saved by a training with other settings: seed was 0, now it is 1",
     ):
         PopulationJob(replace(run_of("lbrdiv"), seed=1), stopped).run()
     assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before

@@ -217,7 +217,7 @@ def test_a_second_rebuild_trains_nothing(learned, monkeypatch):
 
     monkeypatch.setattr(select, "THRESHOLD", -np.inf)
     monkeypatch.setattr(suite._PopulationTraining, "train", never)
-    monkeypatch.setitem(job._MAKERS, "ppo", never)
+    monkeypatch.setitem(job._GENERATORS, "ppo", never)
     assert rebuild(learned.parent / "learned.toml", learned).count("finished before") == 4
 
 

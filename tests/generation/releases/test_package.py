@@ -14,7 +14,7 @@ from icrl4aht_generation.collection.curate import oracle_labels
 from icrl4aht_generation.collection.task_folder import LABELLER_RETURNS, METADATA, HistoryArrays
 from icrl4aht_generation.profiles import Profile, Work, load_profile
 from icrl4aht_generation.releases import measures
-from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unhosted_families
+from icrl4aht_generation.releases.measures import TeammateFacts, teammate_facts, unusable_families
 from icrl4aht_generation.releases.package import package_release, recorded_sources
 from icrl4aht_generation.teammates import draws as draws_table
 from icrl4aht_generation.teammates.draws import Draw, find_draw
@@ -204,7 +204,7 @@ def test_noise_histories_are_labelled_by_their_script(built, profile, tmp_path):
     assert recorded_sources(root) == {task.task_id: "noise"}
     assert recorded_sources(tmp_path) == {}
     arguments = ["--profile", built / "tiny.toml", "--tasks", root / "meta/tasks.jsonl", "--out", tmp_path / "out"]
-    with pytest.raises(OptionError, match=f"task {task.task_id}: its source is noise, those of profile tiny are ppo"):
+    with pytest.raises(OptionError, match=f"task {task.task_id}: the source is noise, but profile tiny has ppo"):
         run_cli("generate", *arguments)
     without = pack(tmp_path, replace(both, oracle_actions=False), [work], {task.task_id: MATTERS})
     assert not any(entry.has_oracle_actions for entry in load_icrl4aht(without).entries)
@@ -256,9 +256,9 @@ def test_the_nearest_test_teammate_of_a_draw_may_be_of_another_family(monkeypatc
 def test_families_that_a_layout_cannot_host_are_named(monkeypatch):
     monkeypatch.setattr(draws_table, "read_draws", fake_draws)
     monkeypatch.setattr(
-        measures, "hosted_families", lambda layout: ["recipe_aware_button", "territory", "assembly_line"]
+        measures, "usable_families", lambda layout: ["recipe_aware_button", "territory", "assembly_line"]
     )
-    (found,) = unhosted_families(["demo_wide", "cramped_down"])
+    (found,) = unusable_families(["demo_wide", "cramped_down"])
     assert (found.layout, found.teammate, found.source) == ("demo_wide", "H4", "")
     assert found.reason == "all 2 draws act like a test teammate of the family (distance 0.010 at most)"
 

@@ -15,9 +15,9 @@ from icrl4aht_generation.teammates.draws import (
     Draw,
     diverse_tasks,
     drawn_teammates,
-    hosted_families,
     read_draws,
     read_measured,
+    usable_families,
     validation_tasks,
     write_table,
 )
@@ -77,7 +77,7 @@ def test_the_table_is_as_written(tmp_path):
 @pytest.mark.parametrize("layout", TESTED_ON)
 def test_no_chosen_teammate_acts_like_a_test_instance_of_its_family(layout):
     for seed in DRAWS_PER_SEED:
-        families = hosted_families(layout, seed)
+        families = usable_families(layout, seed)
         usable = [found for family in families for found in read_draws(layout, family, seed) if found.admissible]
         headroom = [found for found in usable if found.headroom]
         teammates = drawn_teammates(layout, families, len(headroom or usable), seed)
@@ -86,7 +86,7 @@ def test_no_chosen_teammate_acts_like_a_test_instance_of_its_family(layout):
         with pytest.raises(OptionError, match="distinct draws"):
             drawn_teammates(layout, families, len(teammates) + 1, seed)
         for family in {*HEURISTIC_FAMILIES} - {*families}:
-            with pytest.raises(OptionError, match=rf"{layout} cannot host (drawn|diverse) \w+ teammates of {family}: "):
+            with pytest.raises(OptionError, match=rf"{layout}: no usable (drawn|diverse) \w+ teammates of {family}: "):
                 drawn_teammates(layout, [family], 1, seed)
 
 
@@ -113,7 +113,7 @@ def test_validation_tasks_are_four_a_layout_where_draws_allow_it():
         usable = [one for one in usable if one.headroom] or usable
         assert found[layout] == min(4, len(usable))
         families = Counter(task.teammate["family"] for task in tasks if task.layout.name == layout)
-        assert {*families} == {*hosted_families(layout, 1)[:4]}
+        assert {*families} == {*usable_families(layout, 1)[:4]}
     assert len({task.task_id for task in tasks}) == len(tasks)
 
 
@@ -159,7 +159,7 @@ def test_draws_with_which_the_ego_matters_more_come_first(monkeypatch, tmp_path)
 
 def test_draws_like_a_test_instance_are_left_out(monkeypatch, tmp_path):
     with_table(monkeypatch, tmp_path, draw(H1, 0, distance=0.0199), draw(H1, 1, distance=0.02), draw(H2, 0, distance=0))
-    assert hosted_families("demo_wide") == [H1]
+    assert usable_families("demo_wide") == [H1]
     assert chosen([H1], 1) == [(H1, 1)]
     with pytest.raises(
         OptionError, match=f"1 draws act like a test teammate .*distance 0.000.*0.02 or more, to H3/t0.*1 of {H1}"

@@ -10,7 +10,7 @@ from icrl4aht_generation.policy import Noise, Situation
 from icrl4aht_generation.teammates import spread as module
 from icrl4aht_generation.teammates.distances import (
     INSTANCE_NAMES,
-    act_along,
+    act_on_records,
     common_records,
     distances_to_tests,
     instance_policies,
@@ -84,7 +84,7 @@ def test_teammates_come_in_order(three):
 
 
 def test_more_than_there_are(three):
-    numbers = "demo_wide: 2 validation teammates requested .* has 1: of 9 candidates 6 act unlike .* and 5 of these"
+    numbers = "demo_wide: 2 validation teammates requested .* has 1: 6 of 9 candidates differ .* and 5 of these"
     with pytest.raises(OptionError, match=numbers):
         spread_teammates("demo_wide", "validation", 2)
     with pytest.raises(OptionError, match="no line for demo_simple"):
@@ -153,8 +153,8 @@ def test_two_of_the_list_are_measured_again():
     family = "assembly_line"
     chosen = [mate for mate in spread.chosen if mate.family == family and RANDOM_ACTIONS not in mate.theta][:2]
     records = common_records(layout, 4)
-    tested = act_along(layout, instance_policies(layout), records)
-    actions = act_along(layout, [build_teammate(None, mate.entry) for mate in chosen], records)
+    tested = act_on_records(layout, instance_policies(layout), records)
+    actions = act_on_records(layout, [build_teammate(None, mate.entry) for mate in chosen], records)
     assert (actions[0] != actions[1]).mean() >= DIVERSE_DISTANCE
     for mate, distances in zip(chosen, distances_to_tests(tested, actions), strict=True):
         assert distances[INSTANCE_NAMES.index(mate.nearest)] == pytest.approx(mate.distance, abs=1e-4)

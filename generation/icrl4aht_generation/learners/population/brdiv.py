@@ -1,8 +1,9 @@
-"""BRDiv: confederates that only their own best response can play with (Rahman et al. 2023; paper, App. B.1).
+"""BRDiv: confederates that only play well with their own best response (Rahman et al. 2023; paper, App. B.1).
 
-K denotes members. Policies 0..K-1 are the confederates, always the teammate; K..2K-1 their best responses, always the
-ego. Confederate i plays with its own best response in three quarters of its environments, and with the others in turn
-in the rest: weights apply to mean returns, so this share only decides which of them are estimated well.
+K denotes the number of members. Policies 0..K-1 are the confederates, which always play the teammate; policies K..2K-1
+are their best responses, which always play the ego. Confederate i plays with its own best response in three quarters of
+its environments, and with the other best responses in turn in the rest. Weights apply to mean returns, so this share
+only affects how well each mean return is estimated.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from icrl4aht_generation.learners.population.population import Algorithm, Assign
 def pairs_assignment(members: int, environments: int) -> Assignment:
     """Return the assignment of confederates and best responses.
 
-    Terms: i * K + j is the return of confederate i with best response j, as the confederate's objective counts it;
-    K * K more are the same returns in the best response's objective.
+    Term i * K + j is the return of confederate i with best response j in the confederate's objective. Term
+    K * K + i * K + j is this return in the best response's objective.
 
     Raises:
         ValueError: if a confederate has fewer environments for cross-play than there are other best responses.
     """
     if environments // 4 < members - 1:
         raise ValueError(f"environments = {environments}: {members} members need at least {4 * members - 4}")
-    # By environment, not drawn: every pair then has a fixed number of samples, and shapes are static.
+    # The assignment is fixed, so every pair has a fixed number of samples, and shapes are static.
     env = np.tile(np.arange(environments), members)
     confederate = np.repeat(np.arange(members), environments)
     with_own = env < environments - environments // 4 if members > 1 else np.ones(env.size, bool)
@@ -50,8 +51,8 @@ class BRDiv(Algorithm):
     "Training Objective"); best responses maximize their return with their own confederate only.
 
     Attributes:
-        members: K.
-        cross_play_weight: w_XP.
+        members: number K of confederates.
+        cross_play_weight: weight w_XP of cross-play returns.
     """
 
     members: int
@@ -62,6 +63,6 @@ class BRDiv(Algorithm):
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
         own = np.eye(self.members)
-        # A best response learns nothing from another confederate: it has to be the best one to its own.
+        # A best response learns only with its own confederate.
         confederates = own * (1 + 2 * self.cross_play_weight) - (1 - own) * self.cross_play_weight
         return jnp.asarray(np.concatenate([confederates.ravel(), own.ravel()]), jnp.float32)

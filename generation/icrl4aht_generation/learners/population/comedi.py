@@ -1,13 +1,13 @@
-"""CoMeDi: members trained in turn, each good with itself and bad with the member it resembles most (Sarkar et al.
-2023; paper, App. B.1). The first member has nobody to differ from: it is trained by self-play, as FCP's are.
+"""CoMeDi: members trained in turn, each good with itself and bad with its most compatible member (Sarkar et al. 2023;
+paper, App. B.1). The first member is trained by self-play, like the members of FCP.
 
-Policy 0 is the new member; its best response is itself, as in the original. Policy 1 is a frozen member. A quarter of
-the environments each:
+Policy 0 is the new member, which is also its own best response, as in the original. Policy 1 is a frozen member. Each
+of four kinds of play has a quarter of the environments:
 
-* self-play (SP): the new member as both agents;
-* cross-play (XP): the new member with the frozen one, which is the ego in half of them;
-* mixed play (MP): the new member or the frozen one as its partner, assigned by environment rather than drawn per
-  episode; nothing is learned here, it only visits states;
+* self-play (SP): the new member plays both agents;
+* cross-play (XP): the new member plays with the frozen member, which is the ego in half of these environments;
+* mixed play (MP): the partner is the new member or the frozen member, fixed for each environment; no policy learns
+  here, because this play only visits states;
 * mixed play from states that the third quarter visited (SMP), which gives J_MP: the new member cannot recognize its
   partner by such states, so it cannot learn to play badly with strangers on purpose.
 """
@@ -29,11 +29,11 @@ _SP, _XP, _MP_SELF, _MP_FROZEN = range(4)
 @dataclass(frozen=True)
 class CoMeDi(Algorithm):
     """L = -J_SP + alpha J_XP - beta J_MP (paper, App. B.1, CoMeDi "Training Objective"), where the partner of J_MP is
-    the new member or the frozen one, each in half of the episodes.
+    the new member or the frozen member, each in half of the episodes.
 
     Attributes:
-        cross_play_weight: alpha.
-        mixed_play_weight: beta.
+        cross_play_weight: weight alpha of cross-play returns.
+        mixed_play_weight: weight beta of mixed-play returns.
     """
 
     cross_play_weight: float = 1.0
@@ -43,7 +43,7 @@ class CoMeDi(Algorithm):
         """Return the assignment of one member's environments.
 
         Raises:
-            ValueError: if their number is not a multiple of 8.
+            ValueError: if the number of environments is not a multiple of 8.
         """
         if environments % 8:
             raise ValueError(f"environments = {environments}: CoMeDi needs a multiple of 8")
@@ -51,7 +51,7 @@ class CoMeDi(Algorithm):
         new, frozen = np.zeros(quarter, int), np.ones(quarter, int)
         first_half = np.arange(quarter) < quarter // 2
         cross = np.stack([np.where(first_half, frozen, new), np.where(first_half, new, frozen)])
-        # Alternating, so that both halves of `cross` have as many of each kind.
+        # Partners alternate, so both halves of `cross` have equally many environments with each partner.
         with_self = np.arange(quarter) % 2 == 0
         mixed = np.where(with_self, 0, cross)
         play = np.stack([new, new])
@@ -66,6 +66,6 @@ class CoMeDi(Algorithm):
         )
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
-        # Two terms of half the weight each, though the frozen member's is sampled by half as many slots.
+        # Both mixed-play terms have half the weight, although the frozen member's term has half as many samples.
         half = self.mixed_play_weight / 2
         return jnp.array([1.0, -self.cross_play_weight, half, half])

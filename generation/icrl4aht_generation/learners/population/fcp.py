@@ -1,6 +1,6 @@
-"""FCP: independent self-play learners that differ by their seeds (Strouse et al. 2021; paper, App. B.1).
+"""FCP: independent self-play learners with different seeds (Strouse et al. 2021; paper, App. B.1).
 
-With one member this is IPPO, one policy as both agents (paper, App. B.1 "Independent PPO").
+FCP with one member is IPPO: one policy plays both agents (paper, App. B.1 "Independent PPO").
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class FCP(Algorithm):
     members: int
 
     def assignment(self, environments: int) -> Assignment:
-        """Return the assignment, with one term per member: its own return."""
+        """Return the assignment, with one term for each member: the member's self-play return."""
         member = np.repeat(np.arange(self.members), environments)
-        # The slots of both agents are samples of one return, and the policy learns from both.
+        # The slots of both agents are samples of the same return, and the policy learns from both.
         both = np.stack([member, member])
         return Assignment(both, both, np.arange(self.members), self.members, np.full(member.size, -1))
 

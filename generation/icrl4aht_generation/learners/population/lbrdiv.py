@@ -11,20 +11,20 @@ from jaxtyping import Array, Bool, Float
 from icrl4aht_generation.learners.population.brdiv import pairs_assignment
 from icrl4aht_generation.learners.population.population import Algorithm, Assignment
 
-_SELF_PLAY = 0.5  # fixed multiplier on the diagonals: a member's own self-play has the weight 1 in all
+_SELF_PLAY = 0.5  # multiplier on the diagonals, so a member's self-play has a total weight of 1
 
 
 class Multipliers(NamedTuple):
-    """Lagrange multipliers of K members and the returns that they follow.
+    """Lagrange multipliers of K members, and the returns that determine the multipliers.
 
     J(pi_i, BR_j) denotes the return of confederate i with best response j. Multiplier [i, j] belongs to the constraint
-    that J(pi_i, BR_i) exceeds the return below by the tolerance.
+    that J(pi_i, BR_i) exceeds another return by the tolerance.
 
     Attributes:
-        vertical: float32 (K, K), for J(pi_j, BR_i): another confederate with i's best response.
-        horizontal: float32 (K, K), for J(pi_i, BR_j): confederate i with another's best response.
+        vertical: float32 (K, K), multipliers for J(pi_j, BR_i), another confederate with i's best response.
+        horizontal: float32 (K, K), multipliers for J(pi_i, BR_j), confederate i with another best response.
         returns: float32 (K, K), the last known J(pi_i, BR_j).
-        known: bool (K, K), whether an episode of that pair has ended yet.
+        known: bool (K, K), whether an episode of the pair has ended yet.
     """
 
     vertical: Float[Array, "K K"]
@@ -39,11 +39,11 @@ class LBRDiv(Algorithm):
     (paper, App. B.1, LBRDiv).
 
     In the Lagrangian, the return of confederate i with its own best response has the weight
-    sum_j (vertical_ij + horizontal_ij), and with best response j the weight -(horizontal_ij + vertical_ji); both
-    policies of a pair share it. Multipliers follow the returns of the episodes that the population itself plays.
+    sum_j (vertical_ij + horizontal_ij), and with another best response j the weight -(horizontal_ij + vertical_ji).
+    Both policies of a pair have the same weight. The multipliers are updated with the returns of training episodes.
 
     Attributes:
-        members: K.
+        members: number K of confederates.
         tolerance: eps, in units of return.
         learning_rate: step size of the multipliers.
     """
@@ -67,20 +67,20 @@ class LBRDiv(Algorithm):
         return jnp.concatenate([pairs.ravel(), pairs.ravel()])
 
     def adapt(self, memory: Multipliers, returns, seen) -> Multipliers:
-        """Lambda <- max(Lambda - eta (J(pi_i, BR_i) - J(other) - eps), 0); the diagonal stays."""
+        """Update multipliers: Lambda <- max(Lambda - eta (J(pi_i, BR_i) - J(other) - eps), 0), except the diagonal."""
         k = self.members
         # `returns` is indexed [ego, teammate]; best responses, K..2K-1, are the egos.
         known = memory.known | seen[k:, :k].T
         latest = jnp.where(seen[k:, :k].T, returns[k:, :k].T, memory.returns)
         own = jnp.diag(latest)[:, None]
         own_known = jnp.diag(known)[:, None]
-        fresh = jnp.any(seen)  # without new episodes nothing was measured, so nothing moves
+        fresh = jnp.any(seen)  # without new episodes the multipliers do not change
 
-        def moved(multipliers, other, other_known):
+        def updated(multipliers, other, other_known):
             step = self.learning_rate * (own - other - self.tolerance)
             changed = jnp.maximum(multipliers - jnp.where(own_known & other_known & fresh, step, 0.0), 0.0)
             return jnp.where(jnp.eye(k) > 0, _SELF_PLAY, changed)
 
-        vertical = moved(memory.vertical, latest.T, known.T)
-        horizontal = moved(memory.horizontal, latest, known)
+        vertical = updated(memory.vertical, latest.T, known.T)
+        horizontal = updated(memory.horizontal, latest, known)
         return Multipliers(vertical, horizontal, latest, known)

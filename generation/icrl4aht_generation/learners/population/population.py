@@ -1,8 +1,8 @@
-"""Policies that learn together: a fixed assignment of policies to agents, one PPO for each policy, all at once by vmap.
+"""Populations of policies that learn together: a fixed assignment of policies to agents, and vmapped PPO updates.
 
-N denotes environments, P policies, of which the first L learn, G policies of one group, M agent slots of a policy, T
-steps. An algorithm (`fcp`, `brdiv`, `lbrdiv`, `comedi`) states which policies play together and how much each expected
-return counts. Agent slots are numbered as in `learners.rollout`: a * N + e for agent a of environment e.
+Shapes: N environments, P policies (the first L learn), G policies of one group, M agent slots of a policy, T steps. An
+algorithm (`fcp`, `brdiv`, `lbrdiv`, `comedi`) defines which policies play together, and the weight of each expected
+return. Agent slots are numbered as in `learners.rollout`: a * N + e for agent a of environment e.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from icrl4aht_generation.learners.rollout import Player, Rollout, RolloutCarry, 
 class Assignment(NamedTuple):
     """Fixed assignment of policies to both agents of N environments.
 
-    The objective is a weighted sum of expected returns, its *terms*. Each slot that a policy learns from is a sample of
-    one term: of the return that this policy raises or lowers there.
+    The objective is a weighted sum of *terms*, which are expected returns. Each slot that a policy learns from is a
+    sample of one term, the return that the policy raises or lowers in this slot.
 
     Attributes:
         policy: int (2, N), the policy that plays each agent of each environment.
-        term: int (2, N), the term that a slot is a sample of; -1 for slots that nothing is learned from.
-        group: int (P,); a pair of policies with the same number is self-play, any other pair is cross-play.
-        learning: L.
-        starts_from: int (N,), the environment whose visited states an environment's episodes start from; -1 for the
-            usual start.
+        term: int (2, N), the term that each slot is a sample of; -1 for slots from which no policy learns.
+        group: int (P,), group of each policy: a pair from one group is self-play, any other pair is cross-play.
+        learning: number L of policies that learn.
+        starts_from: int (N,), number of the environment that provides start states by its visited states; -1 for
+            episodes with the usual start.
     """
 
     policy: np.ndarray
@@ -51,41 +51,41 @@ class Assignment(NamedTuple):
     starts_from: np.ndarray
 
     def agent_slots(self, policy: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the slots of a policy, int: those that it learns from, and the others."""
+        """Return the slots from which a policy learns, and the other slots of the policy, as int arrays."""
         own = self.policy.ravel() == policy
         counts = self.term.ravel() >= 0
         return (own & counts).nonzero()[0], (own & ~counts).nonzero()[0]
 
     @property
     def envs(self) -> int:
-        """N."""
+        """Number N of environments."""
         return self.policy.shape[1]
 
     @property
     def policies(self) -> int:
-        """P."""
+        """Number P of policies."""
         return len(self.group)
 
     @property
     def partner(self) -> np.ndarray:
-        """int (2 N,): the policy of the other agent in each slot's environment."""
+        """Policy of the other agent in each slot's environment, int (2 N,)."""
         return self.policy[::-1].ravel()
 
     @property
     def self_play(self) -> np.ndarray:
-        """bool (N,): environments in which two policies of one group play."""
+        """Whether two policies of one group play in each environment, bool (N,)."""
         return self.group[self.policy[0]] == self.group[self.policy[1]]
 
 
 class Algorithm:
-    """Base class of the population algorithms. `memory` is a pytree of the algorithm, such as multipliers."""
+    """Base class of the population algorithms, with `memory` as a pytree of their state, such as multipliers."""
 
     def assignment(self, environments: int) -> Assignment:
-        """Return the pairing of policies, with this number of environments per member."""
+        """Return the assignment of policies to agents, with a given number of environments for each member."""
         raise NotImplementedError
 
     def init(self) -> Any:
-        """Return the memory before the first update."""
+        """Return the algorithm's memory before the first update."""
         return ()
 
     def weights(self, memory: Any) -> Float[Array, " terms"]:
@@ -93,24 +93,24 @@ class Algorithm:
         raise NotImplementedError
 
     def adapt(self, memory: Any, returns: Float[Array, "P P"], seen: Bool[Array, "P P"]) -> Any:
-        """Return the memory after an update.
+        """Return the algorithm's memory after an update.
 
         Args:
-            memory: the memory before it.
-            returns: [i, j] is the mean return of the episodes that ended in the update with policy i as the ego and j
-                as the teammate.
-            seen: whether there was such an episode.
+            memory: memory before the update.
+            returns: element [i, j] is the mean return of the episodes that ended in the update with ego policy i and
+                teammate policy j.
+            seen: whether any such episode ended in the update.
         """
         return memory
 
 
 class PolicyGroup(NamedTuple):
-    """Successive policies with equally many slots, so that one vmap serves them all.
+    """Successive policies with equally many slots, which one vmap can update.
 
     Attributes:
         first: number of the first policy.
-        agent_slots: int (G, M), those that the policies learn from first.
-        counting: how many of the M slots the policies learn from.
+        agent_slots: int (G, M), slots of each policy; slots from which the policy learns come first.
+        counting: number of the M slots from which each policy learns.
     """
 
     first: int
@@ -131,15 +131,15 @@ class PolicyGroup(NamedTuple):
 
 
 class PopulationState(NamedTuple):
-    """State of a `Population`: an update maps it to the next one, and a resume needs nothing else.
+    """Complete state of a `Population`; an update maps a state to the next state.
 
     Attributes:
         params: parameters of all policies, leaves (P, ...).
         optimizer: optimizer states of the learning policies, leaves (L, ...).
-        carry: environments and memories before the next roll-out.
+        carry: environments and memories before the next rollout.
         memory: the algorithm's memory.
-        visited: uint8 (N, S), for each environment one of the states of its last roll-out.
-        key: typed key, scalar, constant; every update folds its number into it.
+        visited: uint8 (N, S), a random state from the last rollout of each environment.
+        key: typed JAX key, scalar, constant; every update folds its number into this key.
         update: int32 scalar, number of updates so far.
     """
 
@@ -154,14 +154,14 @@ class PopulationState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Trains policies together on one layout; their learning, nearly all of the work, uses every device.
+    """Trains policies together on one layout; the PPO updates, nearly all of the work, use every device.
 
     Args:
-        env: the layout's environment.
-        algorithm: see `Algorithm`.
-        config: hyper-parameters of every policy; `environments` are those of one member.
-        partners: number of policies among which the critics distinguish the partner. By default all of them if some
-            policy meets different partners, else none.
+        env: environment of the layout.
+        algorithm: algorithm that defines the assignment and the weights, see `Algorithm`.
+        config: hyper-parameters of every policy; `environments` is the number for one member.
+        partners: number of partner policies that the critics distinguish. By default all policies if some policy plays
+            with different partners, else 0.
     """
 
     env: Environment
@@ -171,19 +171,19 @@ class Population:
 
     @cached_property
     def assignment(self) -> Assignment:
-        """The pairing of policies in all environments."""
+        """Assignment of policies to the agents of all environments."""
         return self.algorithm.assignment(self.config.environments)
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps of an update, over all environments."""
+        """Number of environment steps of an update, over all environments."""
         return self.assignment.envs * self.config.rollout
 
     @cached_property
     def network(self) -> ActorCritic:
         """The network of all policies."""
         policies = self.assignment.policies
-        # A policy that always meets the same partner learns nothing from its number.
+        # The partner's number is useless to a policy that always has the same partner.
         pairs = set(zip(self.assignment.policy.ravel(), self.assignment.partner, strict=True))
         partners = policies if len(pairs) > policies else 0
         partners = partners if self.partners is None else self.partners
@@ -196,13 +196,13 @@ class Population:
 
     @cached_property
     def ppo(self) -> PPO:
-        """The algorithm of each policy's updates."""
+        """PPO algorithm that updates each policy."""
         return PPO(self.network, self.config)
 
     @cached_property
     def groups(self) -> list[PolicyGroup]:
-        """All policies, in groups that one vmap can serve."""
-        # Policies of equal shapes must be neighbours, so that a group is a slice of the stacked parameters.
+        """All policies in groups, each of which one vmap can update."""
+        # Policies of a group must be adjacent, because a group is a slice of the stacked parameters.
         slots = [self.assignment.agent_slots(policy) for policy in range(self.assignment.policies)]
         shapes = [(p < self.assignment.learning, len(own), len(others)) for p, (own, others) in enumerate(slots)]
         groups = []
@@ -212,9 +212,9 @@ class Population:
         return groups
 
     def init(self, key: Key[Array, ""]) -> PopulationState:
-        """Return the state of untrained policies, each from a seed of its own, before the first step."""
+        """Return the state of untrained policies with different seeds before the first step."""
         params_key, env_key, running_key = jax.random.split(key, 3)
-        # By `map`, not by `vmap`, under which the orthogonal initializers deadlock on a CPU.
+        # `map` and not `vmap`, because the orthogonal initializers deadlock on a CPU under `vmap`.
         channels = self.env.only_layout.channels
         seeds = jax.random.split(params_key, self.assignment.policies)
         params = jax.lax.map(lambda seed: self.network.untrained(seed, channels), seeds)
@@ -231,21 +231,19 @@ class Population:
         )
 
     def update(self, state: PopulationState) -> tuple[PopulationState, dict[str, Array]]:
-        """Play one roll-out, then every policy learns from its slots and the algorithm adapts its memory.
-
-        A pure function of the state.
+        """Play a rollout, train every policy on its slots, and adapt the algorithm's memory, as a pure function.
 
         Returns:
             The next state, and scalar metrics.
         """
-        # Keys come from the number of the update, not from a chain: a resumed run needs no other state.
+        # Keys depend only on the number of the update, so a resumed run needs no other state.
         play_key, learn_key, visit_key = jax.random.split(jax.random.fold_in(state.key, state.update), 3)
         players = self._players(state.params)
         restart = self._restart(state.visited)
         carry, rollout = roll_out(self.env, players, state.carry, self.config.rollout, play_key, restart)
         params, optimizer, losses = self._learn(state, players, carry, rollout, learn_key)
         returns, seen = self._returns(rollout)
-        # One random step of each environment: all the states that a later episode may start from.
+        # Keep the state at one random step of each environment as a start of later episodes.
         steps = jax.random.randint(visit_key, (self.assignment.envs,), 0, self.config.rollout)
         after = PopulationState(
             params=params,
@@ -260,7 +258,7 @@ class Population:
         return after, losses | metrics
 
     def _players(self, params: Any) -> list[Player]:
-        """Return one player per group."""
+        """Return one player for each group of policies."""
         return [
             network_player(
                 self.env,
@@ -273,7 +271,7 @@ class Population:
         ]
 
     def _restart(self, visited: UInt8[Array, "N S"]) -> Callable[[EnvState, Array], EnvState]:
-        """The `restart` of `roll_out`: new episodes of some environments start from states that others visited."""
+        """Return the argument `restart` of `roll_out`, which starts some episodes from visited states."""
         source = self.assignment.starts_from
 
         def restart(state: EnvState, done: Bool[Array, " N"]) -> EnvState:
@@ -283,7 +281,7 @@ class Population:
         return restart if (source >= 0).any() else lambda state, done: state
 
     def _learn(self, state: PopulationState, players: list[Player], carry: RolloutCarry, rollout: Rollout, key: Array):
-        """Return all policies' parameters and optimizer states after learning from the roll-out, and mean losses."""
+        """Return all policies' parameters and optimizer states after learning from the rollout, and mean losses."""
         weight = self._slot_weights(state.memory)
         shaping = shaping_weight(self.config, state.update)
         params, optimizer, losses = state.params, state.optimizer, []
@@ -292,7 +290,7 @@ class Population:
                 continue
             slots = player.agent_slots
             last, _ = player.act(carry.memories[number], carry.env, key)
-            # A policy that lowers a return must not be paid, nor charged, for the shaped rewards on the way.
+            # Shaped rewards do not count for a policy that minimizes a return.
             own_shaping = shaping * (weight[slots] >= 0)
             memory, forgiveness = state.carry.memories[number], self.config.forgiveness
             played = sequences(self.view, rollout, number, slots, memory, last.value, own_shaping, forgiveness)
@@ -300,10 +298,10 @@ class Population:
             played = played._replace(partner=partner, weight=weight[slots][None])
 
             def by_policy(leaf, shape=group.agent_slots.shape, counting=group.counting):
-                """Reshape (T, G * M, ...) to (G, T, counting, ...)."""
+                """Reshape an array (T, G * M, ...) to (G, T, counting, ...), without slots that do not count."""
                 return jnp.moveaxis(leaf.reshape(leaf.shape[0], *shape, *leaf.shape[2:]), 1, 0)[:, :, :counting]
 
-            # From the old parameters of all: no policy sees what another has learned in this update.
+            # Every policy starts from its old parameters, so the order of the groups does not matter.
             keys = jax.random.split(jax.random.fold_in(key, number), len(group.agent_slots))
             own = (group.take(state.params), group.take(state.optimizer), jax.tree.map(by_policy, played), keys)
             new_params, new_optimizer, loss = self._learn_by_policy(group)(*own)
@@ -312,9 +310,9 @@ class Population:
         return params, optimizer, jax.tree.map(lambda *parts: jnp.concatenate(parts).mean(), *losses)
 
     def _learn_by_policy(self, group: PolicyGroup) -> Callable[..., Any]:
-        """Apply `PPO.learn` to each policy, sharded over as many devices as divide them evenly."""
+        """Return `PPO.learn` for each policy of a group, sharded over devices in equal parts."""
         learn, devices = jax.vmap(self.ppo.learn), jax.devices()
-        # `shard_map` needs equal parts, so three policies on two devices stay on one.
+        # `shard_map` needs equal parts, so three policies use only one of two devices.
         count = max(n for n in range(1, len(devices) + 1) if len(group.agent_slots) % n == 0)
         if count == 1:
             return learn
@@ -323,38 +321,38 @@ class Population:
         return jax.shard_map(learn, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)
 
     def _slot_weights(self, memory: Any) -> Float[Array, " 2N"]:
-        """Return the weight of each slot's advantage; 0 for slots that nothing is learned from."""
+        """Return the weight of each slot's advantage; 0 for slots from which no policy learns."""
         policies = self.assignment.policies
         term, policy = self.assignment.term.ravel(), self.assignment.policy.ravel()  # int (2N,) each
         learned = term >= 0  # bool (2N,)
-        # A term is an expected return and each of its slots a sample, so that the slots share the term's weight.
+        # A term is an expected return, and its slots are samples that share the term's weight.
         weights = self.algorithm.weights(memory)  # float32 (terms,)
         samples = np.bincount(term[learned], minlength=len(weights))  # int (terms,)
         shared = weights / np.maximum(samples, 1)  # float32 (terms,)
         raw = jnp.where(learned, shared[term], 0.0)  # float32 (2N,)
-        # Scaled to 1 on average for each policy: the learning rate then means the same for all algorithms.
+        # Scale the mean weight of each policy to 1, so the learning rate means the same for all algorithms.
         total = jnp.zeros(policies).at[policy].add(jnp.abs(raw))  # float32 (P,)
         slots = np.bincount(policy[learned], minlength=policies)  # int (P,)
         scale = slots / jnp.maximum(total, 1e-8)  # float32 (P,)
         return raw * scale[policy]
 
     def _returns(self, rollout: Rollout) -> tuple[Float[Array, "P P"], Bool[Array, "P P"]]:
-        """Return mean return of the episodes that ended, by ego and teammate, and whether there was one."""
+        """Return the mean return of ended episodes by ego and teammate policy, and whether any episode ended."""
         size = (self.assignment.policies,) * 2
         pairs = tuple(self.assignment.policy)
-        # Several environments play one pair: `at[].add` sums over them, where an assignment would keep the last.
+        # Several environments have the same pair of policies, so `at[].add` sums over these environments.
         ended = jnp.zeros(size).at[pairs].add(rollout.done.sum(axis=0))
         total = jnp.zeros(size).at[pairs].add(jnp.where(rollout.done, rollout.returns, 0.0).sum(axis=0))
         return total / jnp.maximum(ended, 1), ended > 0
 
     def _metrics(self, rollout: Rollout) -> dict[str, Array]:
-        """Return mean returns of the episodes that ended, in self-play and in cross-play; 0 if none did."""
+        """Return metrics by name, with mean returns of ended episodes in self-play and cross-play; 0 if none ended."""
 
         def mean_return(envs: np.ndarray) -> Array:
             done = rollout.done & envs
             return jnp.sum(jnp.where(done, rollout.returns, 0.0)) / jnp.maximum(jnp.sum(done), 1)
 
-        # Episodes that start from visited states are shorter tasks: their returns do not compare.
+        # Returns of episodes that start from visited states are not comparable.
         usual_start = self.assignment.starts_from < 0
         self_play = self.assignment.self_play
         return {

@@ -1,1 +1,1 @@
-"""The heuristic teammates H1 to H4 (paper, App. B.2)."""
+"""Heuristic teammates of the families H1 to H4 (paper, App. B.2)."""

@@ -1,4 +1,4 @@
-"""H3 `assembly_line`: runs ingredients, or plates and delivers, with slips of many kinds (paper, App. B.2, tab. H3)."""
+"""Heuristic family H3 `assembly_line`: brings ingredients, or plates and delivers, with mistakes (paper, App. B.2)."""
 
 from __future__ import annotations
 
@@ -23,53 +23,53 @@ RUNNER, PLATER, FLEX = range(3)
 AT_POTS, CENTRAL, NEAR_PARTNER = range(3)
 
 _MOVES_BY_DRAW = (RIGHT, DOWN, LEFT, UP)
-_OFF_BEATS = (np.arange(10) / 10).astype(np.float32)
+_HESITATION_FACTORS = (np.arange(10) / 10).astype(np.float32)
 
 
 def act_assembly_line(params, memory: Key[Array, ""], scene: Scene) -> tuple[Int[Array, ""], Key[Array, ""]]:
-    """Take one step of an H3 teammate. It remembers only a random key; every step replaces it by a new one."""
+    """Return the action of an H3 teammate, and the next random key, which is its only memory."""
     following, u = draw(memory)
-    idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _off_beat(scene))
-    makes_room = _makes_room(scene)
-    # Deliveries and emergency moves are exempt from slips: no published teammate loses a dish by accident.
-    final, action = _decide(scene, params, abandons=u[2] < params["task_abandon_prob"])
+    idles = (u[0] < params["hesitation_prob"]) | (u[3] < params["timing_mismatch"] * _hesitation_factor(scene))
+    makes_room = _should_step_aside(scene)
+    # Deliveries and emergency moves are never mistaken, as in the published teammates.
+    final, action = _choose_action(scene, params, abandons=u[2] < params["task_abandon_prob"])
     slips = ~(idles | makes_room | final)
-    action, following = _slip(scene, params, action, slips, u[1], following)
+    action, following = _with_mistakes(scene, params, action, slips, u[1], following)
     action = jnp.where(makes_room, _step_aside(scene), action)
     return jnp.where(idles, STAY, action), following
 
 
-def _off_beat(scene: Scene) -> Array:
-    """Return the factor of the chance to hesitate, float32 in 0..0.9: a fixed pattern over the cells."""
+def _hesitation_factor(scene: Scene) -> Array:
+    """Return a factor of the chance to hesitate, float32 in 0..0.9, which is a fixed pattern over the cells."""
     x, y = jnp.asarray(scene.tables.column)[scene.me], jnp.asarray(scene.tables.row)[scene.me]
-    return jnp.asarray(_OFF_BEATS)[(7 * x + 13 * y) % 10]
+    return jnp.asarray(_HESITATION_FACTORS)[(7 * x + 13 * y) % 10]
 
 
-def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Return whether the action is exempt from slips, and the action; rules are in order of priority."""
+def _choose_action(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    """Return whether the action is exempt from mistakes, and the action of the first rule that applies."""
     empty, plate, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_ingredient
     soup, cooking = jnp.any(scene.cooked), jnp.any(scene.cooking)
     final = scene.holds_dish | (ingredient & soup)
-    # With a soup done, an ingredient in the hand is in the way: it is put down at once.
+    # If a soup is done, an agent puts an ingredient in its hand down at once.
     ingredient &= ~soup
     plates_now = soup | (cooking & (params["plate_urgency"] > 0.5))
     plater = (params["role_mode"] == PLATER) | ((params["role_mode"] == FLEX) & plates_now)
     runner = ~plater
-    # What the partner carries counts as if in the pot: otherwise both agents would fetch the last missing piece.
+    # Count the partner's ingredient as already in the pot: else both agents would fetch the last missing piece.
     coming = scene.counts(scene.partner_hand) * is_ingredient(scene.partner_hand)
     chosen = scene.first(
         [
             Rule(scene.holds_dish, scene.goals),
             Rule(scene.holds_ingredient & soup, scene.empty_counters),
-            # Agents drop what they carry when they give up or when it belongs to the other role.
+            # Agents put their item down if they give up, or if the item belongs to the other role.
             Rule((plate | ingredient) & abandons, scene.empty_counters),
             Rule((runner & plate) | (plater & ingredient), scene.empty_counters),
-            Rule(runner & ingredient, scene.nonfull),
+            Rule(runner & ingredient, scene.fillable_pot_cells),
             Rule(runner & ingredient, _handoff_counters(scene, params)),
             Rule(runner & empty, scene.piles_of(scene.needed - coming > 0)),
             Rule(plater & plate, scene.cooked),
             Rule(plater & empty, scene.plate_piles),
-            # From here on nothing can be done: agents wait where their next task will be.
+            # By the remaining rules, agents without a possible task wait at the place of their next task.
             Rule(plater & (plate | empty), scene.pots_in_use, waits=True),
             Rule((runner & empty) | (plater & plate), scene.pots, waits=True),
             Rule(empty | (plater & plate), scene.buttons, waits=True),
@@ -81,7 +81,7 @@ def _decide(scene: Scene, params, abandons: Bool[Array, ""]) -> tuple[Bool[Array
 
 
 def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
-    """Return the step towards a target; agent 1 stays if it leads onto the partner's cell or an adjacent one."""
+    """Return the step towards a target; agent 1 stays if the step leads to the partner's cell or a cell next to it."""
     step, _ = scene.approach(target)
     if scene.slot == 0:
         return step
@@ -90,25 +90,25 @@ def _step(scene: Scene, target: Int[Array, ""]) -> Int[Array, ""]:
 
 
 def _handoff_counters(scene: Scene, params) -> Bool[Array, " cells"]:
-    """Return empty counters for an ingredient that no pot takes, by style; every empty one if the style has none."""
+    """Return empty counters for an ingredient that no pot takes, by handoff style; else all empty counters."""
     x, y, floor = (jnp.asarray(table) for table in (scene.tables.column, scene.tables.row, scene.tables.walkable))
     middle_x, middle_y = (jnp.sum(axis * floor) // jnp.sum(floor) for axis in (x, y))
     central = jnp.abs(x - middle_x) + jnp.abs(y - middle_y) <= 3
     near_partner = scene.manhattan(scene.cell, scene.partner) <= 2
     free = scene.empty_counters
-    at_pots = free & scene.near(POT)
-    near_partner = _or_else(free & near_partner, at_pots)
+    at_pots = free & scene.cells_near(POT)
+    near_partner = _first_nonempty(free & near_partner, at_pots)
     style = params["handoff_style"]
     preferred = jnp.where(style == AT_POTS, at_pots, jnp.where(style == CENTRAL, free & central, near_partner))
-    return _or_else(preferred, free)
+    return _first_nonempty(preferred, free)
 
 
-def _or_else(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
+def _first_nonempty(mask: Bool[Array, " cells"], other: Bool[Array, " cells"]) -> Bool[Array, " cells"]:
     return jnp.where(jnp.any(mask), mask, other)
 
 
-def _makes_room(scene: Scene) -> Bool[Array, ""]:
-    """Return whether agent 1 is empty-handed and adjacent to a partner who carries something."""
+def _should_step_aside(scene: Scene) -> Bool[Array, ""]:
+    """Return whether agent 1 has empty hands and is adjacent to a partner who carries an item."""
     if scene.slot == 0:
         return jnp.asarray(False)
     adjacent = scene.manhattan(scene.me, scene.partner) == 1
@@ -116,10 +116,10 @@ def _makes_room(scene: Scene) -> Bool[Array, ""]:
 
 
 def _step_aside(scene: Scene) -> Int[Array, ""]:
-    """Step straight away from the adjacent partner; else sideways, right before left, down before up; else stay."""
+    """Return a step away from the adjacent partner; else a step sideways (right or down first); else stay."""
     from_partner = scene.neighbours(scene.me) == scene.partner  # above, below, left, right
     across = from_partner[2] | from_partner[3]
-    # Scores of right, down, left, up.
+    # Each array has the scores of the moves right, down, left and up.
     sideways_in_row = jnp.array([2, 0, 1, 0])
     sideways_in_column = jnp.array([0, 2, 0, 1])
     away = 3 * from_partner[jnp.array([2, 0, 3, 1])]
@@ -127,8 +127,8 @@ def _step_aside(scene: Scene) -> Int[Array, ""]:
     return scene.best_way(scene.free & (score > 0), score)
 
 
-def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, key: Key[Array, ""]):
-    """Return the action after a wrong move or a walk home, and the key chain after their draws."""
+def _with_mistakes(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], u: Array, key: Key[Array, ""]):
+    """Return the action, perhaps replaced by a wrong move or a step to the home cell, and the next random key."""
     errs = slips & (u < params["wrong_action_prob"])
     key, own = extra_split(key, errs)
     wrong = jax.random.bits(jax.random.split(own)[1]) & 3
@@ -137,7 +137,7 @@ def _slip(scene: Scene, params, action: Int[Array, ""], slips: Bool[Array, ""], 
     may_return = slips & scene.holds_nothing & (params["stubbornness"] > 0)
     key, own = extra_split(key, may_return)
     width, height = jnp.asarray(scene.tables.size)
-    # The published formula of a teammate's home cell; on some layouts it is a wall, and nobody walks home.
+    # This is the published formula of the home cell; if the cell is a wall, the teammate never walks home.
     home = (3 * scene.slot % height) * width + 5 * scene.slot % width
     far, is_floor = scene.manhattan(scene.me, home) > 2, jnp.asarray(scene.tables.walkable)[home]
     goes = may_return & far & (jax.random.uniform(own) < params["stubbornness"]) & is_floor
@@ -154,7 +154,7 @@ ASSEMBLY_LINE = Heuristic(
             "role_mode": (None, FLEX, RUNNER, PLATER),
             "handoff_style": (None, AT_POTS, AT_POTS, AT_POTS),
             "plate_urgency": ((0.0, 1.0), 0.5, 0.0, 0.8),
-            "prestage_bias": ((0.0, 1.0), 0.3, 0.5, 0.0),  # no effect: no rule reads it
+            "prestage_bias": ((0.0, 1.0), 0.3, 0.5, 0.0),  # no effect: no rule uses this parameter
             "start_cook_bias": ((0.0, 1.0), 0.7, 0.8, 0.3),  # no effect: pots start by themselves
             "hesitation_prob": (None, 0.0, 0.0, 0.0),
             "wrong_action_prob": (None, 0.0, 0.0, 0.0),
@@ -186,4 +186,4 @@ ASSEMBLY_LINE = Heuristic(
     ),
     choices={"role_mode": 3, "handoff_style": 3},
 )
-"""The family H3; its parameters' order is that of the published manifests."""
+"""Heuristic family H3, with parameters in the order of the published manifests."""

@@ -1,4 +1,4 @@
-"""Heuristic families: the specification of their parameters, and the chain of keys that their noise is drawn from."""
+"""Heuristic families: the specification of their parameters, and the chain of random keys for their noise."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from icrl4aht_generation.paths import Scene
 from icrl4aht_generation.policy import Noise, Policy, Situation, on_layout, sometimes_random
 
 RANDOM_ACTIONS = "random_actions"
-"""Optional parameter of every family: chance that a step's action is drawn uniformly from the six instead. It is not
-the paper's (see E3T, Yan et al. 2023)."""
+"""Optional parameter of every family: chance of a uniformly random action in a step. This parameter is an addition to
+the paper (see E3T, Yan et al. 2023)."""
 
 SHARES = [0.0, 0.0, 0.25, 0.5, 0.75]
-"""Values of a chance of not doing one's part, for `Heuristic.diverse`: none for two teammates in five."""
+"""Values of chances of mistakes in `Heuristic.diverse`; two of five teammates never make the mistake."""
 
 
 class Sampling(NamedTuple):
-    """Distribution of a split's parameters, for teammates that are not published.
+    """Distribution of the parameters of sampled teammates in a split.
 
     Attributes:
-        presets: names of presets, of which one is drawn.
-        ranges: parameter -> (low, high) of a uniform draw, or a list of values of which one is drawn.
+        presets: names of presets, from which one is drawn.
+        ranges: for each parameter (low, high) of a uniform distribution, or a list of values to choose from.
     """
 
     presets: tuple[str, ...]
@@ -41,22 +41,21 @@ class Sampling(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Heuristic:
-    """A family of heuristic teammates: how it plays, and which parameters it has.
+    """A family of heuristic teammates: functions that play, and specification of the parameters.
 
     Attributes:
         kind: name of the family.
-        begin: episode key -> memory at the start of an episode.
-        act: (params, memory, scene) -> action, int32 scalar, and the memory after the step.
-        defaults: parameter -> default, in order of declaration; integer parameters have integer defaults.
-        presets: preset -> parameters that differ from the defaults.
+        begin: function of the episode's key that returns the memory at the start of an episode.
+        act: function of (params, memory, scene) that returns the action, int32 scalar, and the next memory.
+        defaults: default value of each parameter, in order of declaration; integers for integer parameters.
+        presets: for each preset the parameters that differ from the defaults.
         train: distribution of sampled parameters for training tasks (paper, App. B.2).
-        test: the one for test tasks.
-        spans: parameter -> full range; sampling moves these by up to a fifth of their range from the preset.
-        choices: parameter -> n, for parameters that are one of 0..n-1.
-        unbounded: parameters with no other limit than that of 32 bits; all others are in 0..1, or choices.
-        diverse: distribution of all parameters that decide how a teammate acts, most of which the published ranges
-            leave at their defaults. It is not the paper's; None for a family without diverse
-            teammates.
+        test: distribution of sampled parameters for test tasks.
+        spans: full range of parameters that sampling moves from the preset by up to a fifth of the range.
+        choices: number n of values for each parameter with values 0..n-1.
+        unbounded: names of parameters without a limit below that of 32 bits; all others are in 0..1, or choices.
+        diverse: distribution of all parameters that decide a teammate's behaviour; an addition to the paper, with most
+            published ranges at their defaults. None for a family without diverse teammates.
     """
 
     kind: str
@@ -74,17 +73,17 @@ class Heuristic:
     def build(
         self, layout: Layout | None, theta: Mapping[str, float], slot: int = TEAMMATE, noise: Noise = "seeded"
     ) -> Policy:
-        """Return a teammate of this family.
+        """Return a teammate of this family as a policy.
 
-        Policies of one layout, slot and noise share their functions, and so their compilations.
+        Policies with equal layout, slot and noise have equal functions, so they share compilations.
 
         Args:
-            layout: the layout whose state records it sees; None for a teammate that sees a `Situation` of any layout.
+            layout: layout of the state records that the teammate sees; None for a teammate that sees a `Situation`.
             theta: a value for every parameter, and perhaps for `RANDOM_ACTIONS`.
-            slot: 0 or 1, the agent it plays.
-            noise: source of its randomness.
+            slot: 0 or 1, the agent that the teammate plays.
+            noise: source of the teammate's randomness.
         """
-        init, act = _functions(self, slot, noise, RANDOM_ACTIONS in theta)
+        init, act = _policy_functions(self, slot, noise, RANDOM_ACTIONS in theta)
         params = {
             name: (jnp.int32 if isinstance(default, int) else jnp.float32)(theta[name])
             for name, default in (self.defaults | {RANDOM_ACTIONS: 0.0}).items()
@@ -95,7 +94,7 @@ class Heuristic:
 
     @cached_property
     def theta_type(self) -> type[msgspec.Struct]:
-        """Type of the parameters, which `msgspec.convert` checks: all of `defaults`, and perhaps `RANDOM_ACTIONS`."""
+        """Type of the parameters for validation by msgspec: all of `defaults`, and perhaps `RANDOM_ACTIONS`."""
         most = {name: number - 1 for name, number in self.choices.items()} | dict.fromkeys(self.unbounded, 2**31 - 1)
         fields = [
             (name, Annotated[type(default), Meta(ge=0, le=most.get(name, 1))])
@@ -108,9 +107,9 @@ def parameters(presets: Sequence[str], rows: Mapping[str, tuple[Any, ...]]) -> d
     """Return the fields `defaults`, `presets` and `spans` of a family as keyword arguments of `Heuristic`.
 
     Args:
-        presets: names of the presets; the values of the first one are the defaults.
-        rows: parameter -> its full range, or None for a parameter that sampling leaves alone, then its value in each
-            preset.
+        presets: names of the presets; the first preset has the default values.
+        rows: for each parameter its full range (None if sampling does not change the parameter), followed by its value
+            in each preset.
     """
     spans, *values = (dict(zip(rows, column, strict=True)) for column in zip(*rows.values(), strict=True))
     return {
@@ -121,19 +120,19 @@ def parameters(presets: Sequence[str], rows: Mapping[str, tuple[Any, ...]]) -> d
 
 
 @lru_cache(maxsize=64)
-def _functions(heuristic: Heuristic, slot: int, noise: Noise, mixed: bool):
-    """Return `init` and `act` of a policy, which `mixed` mixes with random actions."""
+def _policy_functions(heuristic: Heuristic, slot: int, noise: Noise, mixed: bool):
+    """Return the functions `init` and `act` of a policy; with `mixed`, some actions are random."""
 
-    # Cached, so that policies of one family are the same functions, and JAX compiles them once.
+    # These functions are cached, because JAX compiles only once for policies with the same functions.
     def init(params, key: Key[Array, ""]) -> Any:
         return heuristic.begin(jax.random.key(slot) if noise == "fixed" else key)
 
     def act(params, memory: Any, view: Situation, key: Key[Array, ""]):
-        # The roll-out's key is not used: the published teammates carry a chain of keys in their memory.
+        # The rollout's key is not used, because published teammates have a chain of keys in their memory.
         action, memory = heuristic.act(params, memory, Scene(view.tables, view.record, slot))
         return action.astype(jnp.int32), memory
 
-    # The chain of keys of the random actions is apart from the published one, so that the heuristic draws as without.
+    # Random actions use a separate chain of keys, so they do not change the heuristic's random draws.
     def mixed_init(params, key: Key[Array, ""]) -> Any:
         start = jax.random.key(slot) if noise == "fixed" else key
         return init(params, key), jax.random.fold_in(start, 1)
@@ -147,18 +146,18 @@ def _functions(heuristic: Heuristic, slot: int, noise: Noise, mixed: bool):
 
 
 def next_key(key: Key[Array, ""]) -> Key[Array, ""]:
-    """Return the next key of the chain."""
+    """Return the next key of a teammate's chain of random keys."""
     return jax.random.split(key)[0]
 
 
 def draw(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, " 4"]]:
-    """Return the next key of the chain and the step's uniform draws u1..u4, float32 in [0, 1)."""
-    # The published chain: a split into five keys, of which the first continues it. Golden actions depend on it.
+    """Return the next key of a teammate's chain, and four uniform random numbers u1..u4, float32 in [0, 1)."""
+    # As in the published code, the first of five keys continues the chain; golden actions depend on this.
     keys = jax.random.split(key, 5)
     return keys[0], jax.vmap(jax.random.uniform)(keys[1:])
 
 
 def extra_split(key: Key[Array, ""], where: Bool[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""]]:
-    """Split the chain once more where a branch draws more: the chain's key after it, and the key to draw from."""
+    """Return the next key of the chain, split once more if `where` is true, and a key for additional random draws."""
     following, own = jax.random.split(key)
     return jnp.where(where, following, key), own

@@ -1,5 +1,4 @@
-"""H1 `recipe_aware_button`: cooks by the recipe, and presses the button if it does not know the recipe (paper, App.
-B.2, table H1)."""
+"""Heuristic family H1 `recipe_aware_button`: cooks by the recipe, or presses a button to see it (paper, App. B.2)."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ from icrl4aht_generation.teammates.heuristics.heuristic import (
 )
 
 _CRAMPED_CELLS = 8
-"""Largest number of floor cells of a cramped layout."""
+"""Maximum number of floor cells of a cramped layout."""
 
 _NONE = -1
 _NEVER = -1000
@@ -34,10 +33,10 @@ class ButtonMemory(NamedTuple):
     """Memory of an H1 teammate.
 
     Attributes:
-        key: typed key, scalar, the next of its chain.
+        key: typed JAX key, scalar, the next key of the teammate's chain.
         clock: int32 scalar, steps taken in the episode.
-        recipe: uint8 scalar, item byte of the last recipe that it knew; 0 for none.
-        seen: int32 scalar, the step at which it knew it.
+        recipe: uint8 scalar, item byte of the last recipe that the teammate saw; 0 for none.
+        seen: int32 scalar, last step at which the teammate saw the recipe.
     """
 
     key: Key[Array, ""]
@@ -47,45 +46,45 @@ class ButtonMemory(NamedTuple):
 
 
 def act_recipe_aware_button(params, memory: ButtonMemory, scene: Scene) -> tuple[Int[Array, ""], ButtonMemory]:
-    """Take one step of an H1 teammate."""
-    # It knows the recipe while the button is lit, and on layouts with an indicator, seen or not.
+    """Return the action of an H1 teammate, and the next memory."""
+    # The teammate sees the recipe while a button is lit, and always on layouts with an indicator.
     shown = jnp.any(scene.indicators) | scene.button_lit
     recipe, seen = jnp.where(shown, scene.state.recipe, memory.recipe), jnp.where(shown, memory.clock, memory.seen)
     following, u = draw(memory.key)
     unsure = (recipe == 0) | (memory.clock - seen > params["refresh_interval"])
     idles = u[0] < params["idle_prob"]
-    action, considered, pressed, erred = _decide(scene, params, recipe, unsure, u)
-    # Published quirk: where the roll for the button fails, the key stays.
+    action, considered, pressed, erred = _choose_action(scene, params, recipe, unsure, u)
+    # As in the published code, the key does not change if the button is considered but not pressed.
     key = jnp.where(considered & ~pressed & ~idles, memory.key, following)
     key, _ = extra_split(key, erred & ~idles)
     action = jnp.where(idles, STAY, action)
     return action, ButtonMemory(key, memory.clock + 1, recipe, seen)
 
 
-def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], u: Float[Array, " 4"]):
-    """Return the action of a step without idling, and three facts that decide how the key chain proceeds.
+def _choose_action(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, ""], u: Float[Array, " 4"]):
+    """Return the action of a step without idling, and three facts that determine the next random key.
 
-    They are whether pressing the button was considered, whether it was chosen, and whether the branch of the wrong
-    ingredient was entered.
+    The facts are whether the teammate considered pressing the button, whether it chose to press the button, and whether
+    it tried to fetch a wrong ingredient.
 
     Args:
-        scene: the state.
+        scene: features of the state.
         params: the teammate's parameters.
-        recipe: item byte of the last recipe that it knew; 0 for none.
-        unsure: whether it does not know the recipe, or has not seen it for long.
-        u: the step's uniform draws.
+        recipe: item byte of the last recipe that the teammate saw; 0 for none.
+        unsure: whether the teammate has never seen the recipe, or not for a long time.
+        u: uniform random numbers of the step.
     """
-    # One parameter makes specialists of both agents: agent 0 cooks and agent 1 delivers.
+    # A specialist only cooks as agent 0, and only delivers as agent 1.
     specialist = params["task_specialization"] > 0.5
     cooks_only, delivers_only = specialist & (scene.slot == 0), specialist & (scene.slot == 1)
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
     cramped = is_cramped(scene)
-    # In a cramped layout agent 1 is the one that gives way.
+    # On a cramped layout only agent 1 gives way.
     second = cramped & (scene.slot == 1)
     ids = jnp.asarray(scene.tables.ingredients)
 
     considered = empty & unsure & ~scene.button_lit & jnp.any(scene.buttons)
-    # The roll for the button splits the step's own key once more, which draws u1 again.
+    # As in the published code, the button uses the random number u1 a second time.
     presses = u[0] < params["press_L_when_unknown"] * (1 - params["cost_sensitivity"])
     fetches_plate = empty & ((_plate_is_urgent(scene, params) & ~cooks_only) | delivers_only)
     fetches_plate &= ~(second & _leaves_plates(scene))
@@ -111,54 +110,54 @@ def _decide(scene: Scene, params, recipe: UInt8[Array, ""], unsure: Bool[Array, 
             Rule(empty, scene.pots, waits=True),
         ]
     )
-    # The rules from `errs` on fetch ingredients; only they can be replaced by blocking or by a wrong ingredient.
+    # Only rules that fetch ingredients, from `errs` on, can be replaced by blocking or a wrong ingredient.
     settled = chosen.found & (chosen.number < len(first_rules))
     action = scene.go_to(chosen.target, chosen.waits, _step(scene, chosen.target, cramped))
     gives_way, aside = _yield_pot(scene, chosen.target)
     action = jnp.where(second & chosen.found & (chosen.number == pot_rule) & gives_way, aside, action)
     action = jnp.where(chosen.found, action, scene.wander())
-    blocks, step = _block(scene)
+    blocks, step = _blocking_step(scene)
     blocks &= cooks & (u[2] < params["path_blocking"]) & ~settled
     action = jnp.where(blocks, step, action)
     clears = cramped & plate & is_dish(scene.partner_hand) & ~jnp.any(scene.reach(scene.cooked))
-    action = jnp.where(clears, _clear_the_way(scene), action)
+    action = jnp.where(clears, _step_out_of_way(scene), action)
     pressed = chosen.found & (chosen.number == press_rule)
     return action, considered, pressed, errs & ~settled & ~blocks
 
 
 def _plate_is_urgent(scene: Scene, params) -> Bool[Array, ""]:
     timers = scene.state.pot_timers
-    # A soup becomes urgent as it cooks, so that the plate arrives when it is done.
+    # The urgency of a plate grows while a soup cooks.
     cooking = jnp.max(jnp.where(timers > 0, jnp.asarray(_URGENCY)[timers.astype(jnp.int32)], 0))
     urgency = jnp.where(jnp.any(scene.cooked), 1, cooking)
     return urgency >= 1 - params["plate_timing"]
 
 
-def _decoded(scene: Scene) -> Bool[Array, " 3"]:
-    """Return the piled types that H1 recognizes in an item; not id 3 (published quirk)."""
+def _recognized_types(scene: Scene) -> Bool[Array, " 3"]:
+    """Return the ingredient types that H1 recognizes in an item; as in the published code, not id 3."""
     return jnp.asarray(scene.tables.ingredients) < 3
 
 
 def _missing(scene: Scene, recipe: UInt8[Array, ""]) -> Int[Array, "P 3"]:
-    """Return ingredients of the recipe that are missing in each pot; 0 for pots that take no more."""
+    """Return the number of missing ingredients of the recipe in each pot; 0 for pots that take no ingredient."""
     missing = jnp.maximum(scene.counts(recipe) - scene.counts(scene.state.pot_items), 0)
-    return missing * scene.takes_more[:, None] * _decoded(scene)
+    return missing * scene.fillable_pots[:, None] * _recognized_types(scene)
 
 
 def _pots_for(scene: Scene, recipe: UInt8[Array, ""]) -> Bool[Array, " cells"]:
-    """Pots in which the ingredient in the hand is missing; if there is none, every pot that takes an ingredient."""
-    # A pot with a wrong soup also takes ingredients: with no better pot, H1 fills it up.
+    """Return pots that need the ingredient in the hand; if no pot needs it, all pots that take an ingredient."""
+    # Pots with wrong ingredients also take ingredients: without a better pot, H1 fills these pots.
     held = scene.counts(scene.hand)
     wanting = scene.at(POT, _missing(scene, recipe) @ held > 0)
-    wanted_everywhere = jnp.any((held > 0) & ~_decoded(scene))
-    return jnp.where(jnp.any(wanting) & ~wanted_everywhere, wanting, scene.nonfull)
+    wanted_everywhere = jnp.any((held > 0) & ~_recognized_types(scene))
+    return jnp.where(jnp.any(wanting) & ~wanted_everywhere, wanting, scene.fillable_pot_cells)
 
 
 def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], second: Array) -> Int[Array, ""]:
-    """Return the id of the ingredient to fetch, -1 for none. In a cramped layout, the agents fetch different ones."""
+    """Return the id of the ingredient to fetch, or -1; on a cramped layout, the agents fetch different ingredients."""
     ids = jnp.asarray(scene.tables.ingredients)
     missing = _missing(scene, recipe).sum(axis=0) > 0
-    # Teammates cannot talk, so fetching different ingredients is how two of them share the work.
+    # Two teammates share the work without communication by fetching different ingredients.
     nth = jnp.cumsum(missing)
     wanted = jnp.where(second & (jnp.sum(missing) > 1), nth == 2, nth == 1)
     known = jnp.where(jnp.any(missing), ids[jnp.argmax(wanted)], _NONE)
@@ -166,15 +165,15 @@ def _right_ingredient(scene: Scene, params, recipe: UInt8[Array, ""], second: Ar
     return jnp.where(recipe > 0, known, guessed)
 
 
-def _block(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Return whether a cell adjacent to a pot or a goal can be reached, and the step to the nearest, or stay on it."""
-    critical = (scene.near(POT) | scene.near(GOAL)) & jnp.asarray(scene.tables.walkable)
+def _blocking_step(scene: Scene) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    """Return whether the agent can reach a cell next to a pot or goal, and the step to the nearest such cell."""
+    critical = (scene.cells_near(POT) | scene.cells_near(GOAL)) & jnp.asarray(scene.tables.walkable)
     distance = jnp.where(critical, scene.distances(scene.me), UNREACHABLE)
     nearest = jnp.argmin(distance)
     return distance[nearest] < UNREACHABLE, scene.first_step(nearest)
 
 
-# Cramped layouts only.
+# The functions below are for cramped layouts.
 
 
 def is_cramped(scene: Scene) -> Bool[Array, ""]:
@@ -183,10 +182,10 @@ def is_cramped(scene: Scene) -> Bool[Array, ""]:
 
 
 def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int[Array, ""]:
-    """The step towards a target. In a cramped layout, agents prefer opposite corners and walk around each other."""
+    """Return the step towards a target; on a cramped layout, agents prefer opposite corners and avoid each other."""
     x, y = jnp.asarray(scene.tables.column), jnp.asarray(scene.tables.row)
     width, height = jnp.asarray(scene.tables.size)
-    # A tenth of a step for each cell breaks ties between access cells at equal distance.
+    # A cost of a tenth of a step for each cell breaks ties between access cells at equal distance.
     corner = y + x if scene.slot == 0 else (height - y) + (width - x)
     step, _ = scene.approach(target, jnp.where(cramped, np.float32(0.1) * corner, np.float32(0)))
     if scene.slot == 1:
@@ -199,7 +198,7 @@ def _step(scene: Scene, target: Int[Array, ""], cramped: Bool[Array, ""]) -> Int
 
 
 def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Return whether the partner has an ingredient and is about as near to the pot, and the step away from it."""
+    """Return whether a partner with an ingredient is about as near to the pot, and a step away from the pot."""
     access = scene.only_access(pot)
     as_near = scene.manhattan(scene.partner, access) <= scene.manhattan(scene.me, access) + 1
     gives_way = is_ingredient(scene.partner_hand) & (access >= 0) & as_near
@@ -207,15 +206,15 @@ def _yield_pot(scene: Scene, pot: Int[Array, ""]) -> tuple[Bool[Array, ""], Int[
 
 
 def _leaves_plates(scene: Scene) -> Bool[Array, ""]:
-    """Return whether to leave the plates to a partner without one: they are accessible from a single cell."""
+    """Return whether to leave plates, with only one access cell, to a partner who carries no plate or dish."""
     first = jnp.argmax(scene.plate_piles)
     single = jnp.any(scene.plate_piles) & (scene.only_access(first) >= 0)
     carries = (scene.partner_hand == PLATE) | is_dish(scene.partner_hand)
     return ~carries & single
 
 
-def _clear_the_way(scene: Scene) -> Int[Array, ""]:
-    """Return the step off the shortest paths between the partner, who carries a dish, and the goals."""
+def _step_out_of_way(scene: Scene) -> Int[Array, ""]:
+    """Return a step that leaves the shortest paths of the partner, who carries a dish, to the goals."""
     exits, walkable = jnp.asarray(scene.tables.goal_access), jnp.asarray(scene.tables.walkable)
     if not len(exits):
         return jnp.int32(STAY)
@@ -223,13 +222,13 @@ def _clear_the_way(scene: Scene) -> Int[Array, ""]:
     exits = jnp.where(exists, exits, 0)
     from_exit = scene.manhattan(scene.cell[:, None], exits)
     from_partner = scene.manhattan(scene.cell, scene.partner)
-    # A cell is between two others if the way over it is no detour.
+    # A cell is between two other cells if the way over this cell is not longer.
     detour = from_partner[:, None] + from_exit
     between = jnp.any((detour == scene.manhattan(scene.partner, exits)) & exists, axis=1)
     in_the_way = walkable & (between | (from_partner == 1))
     from_exits = jnp.min(jnp.where(exists, from_exit, UNREACHABLE), axis=1)
     leaves = scene.free & ~in_the_way[scene.ways]
-    # Where no neighbour is out of the way, head for the cell that is farthest from the goals.
+    # If all neighbour cells are in the way, move towards the free cell that is farthest from the goals.
     refuge = jnp.argmax(jnp.where(walkable & ~in_the_way, from_exits, -1))
     to_refuge = scene.manhattan(scene.ways, refuge)
     nearer = scene.free & (to_refuge < scene.manhattan(scene.me, refuge)) & jnp.any(walkable & ~in_the_way)
@@ -248,12 +247,12 @@ RECIPE_AWARE_BUTTON = Heuristic(
             "refresh_interval": (None, 100, 50, 200, 80),
             "cost_sensitivity": ((0.0, 1.0), 0.2, 0.0, 0.8, 0.1),
             "strict_recipe": ((0.0, 1.0), 0.9, 1.0, 0.3, 1.0),
-            "exploration_bias": ((0.0, 1.0), 0.1, 0.0, 0.5, 0.0),  # no effect: no rule reads it
+            "exploration_bias": ((0.0, 1.0), 0.1, 0.0, 0.5, 0.0),  # no effect: no rule uses this parameter
             "plate_timing": ((0.0, 1.0), 0.5, 0.6, 0.4, 0.7),
-            "dist_weight": ((0.1, 1.0), 0.3, 0.3, 0.4, 0.25),  # no effect: the nearest target wins, unweighted
-            "inertia": ((0.0, 1.0), 0.4, 0.3, 0.5, 0.5),  # no effect: no rule looks at the last intent
+            "dist_weight": ((0.1, 1.0), 0.3, 0.3, 0.4, 0.25),  # no effect: distances have no weight
+            "inertia": ((0.0, 1.0), 0.4, 0.3, 0.5, 0.5),  # no effect: no rule uses the last intent
             "task_specialization": (None, 0.0, 0.0, 0.0, 0.0),
-            "stubbornness": (None, 0.0, 0.0, 0.0, 0.0),  # no effect: it is read and not used
+            "stubbornness": (None, 0.0, 0.0, 0.0, 0.0),  # no effect: the published code ignores it
             "wrong_ingredient_prob": (None, 0.0, 0.0, 0.0, 0.0),
             "idle_prob": (None, 0.0, 0.0, 0.0, 0.0),
             "path_blocking": (None, 0.0, 0.0, 0.0, 0.0),
@@ -293,8 +292,8 @@ RECIPE_AWARE_BUTTON = Heuristic(
     ),
     unbounded=frozenset({"refresh_interval"}),
 )
-"""The family H1; its parameters' order is that of the published manifests.
+"""Heuristic family H1, with parameters in the order of the published manifests.
 
-The first four parameters matter only while the recipe is unknown or stale, which cannot happen on a layout with a
-recipe indicator.
+The first four parameters only have an effect while the recipe is unknown or not seen for a long time, which cannot
+happen on a layout with a recipe indicator.
 """

@@ -1,5 +1,4 @@
-"""H2 `territory`: prefers targets in its part of the layout; five of its modes do not cooperate (paper, App. B.2,
-table H2)."""
+"""Heuristic family H2 `territory`: prefers targets in its part of the layout; some modes do not cooperate."""
 
 from __future__ import annotations
 
@@ -24,9 +23,9 @@ class TerritoryMemory(NamedTuple):
     """Memory of an H2 teammate.
 
     Attributes:
-        key: typed key, scalar, the next of its chain.
-        cell: int32 scalar, its cell at the last step; -1 before the first.
-        stuck: int32 scalar, steps since it last moved.
+        key: typed JAX key, scalar, the next key of the teammate's chain.
+        cell: int32 scalar, the teammate's cell at the last step; -1 before the first step.
+        stuck: int32 scalar, steps since the teammate last moved.
     """
 
     key: Key[Array, ""]
@@ -35,24 +34,24 @@ class TerritoryMemory(NamedTuple):
 
 
 def act_territory(params, memory: TerritoryMemory, scene: Scene) -> tuple[Int[Array, ""], TerritoryMemory]:
-    """Take one step of an H2 teammate."""
+    """Return the action of an H2 teammate, and the next memory."""
     following, u = draw(memory.key)
     mode = params["behavior_mode"]
-    action = _work(scene, params, u[0], memory.stuck >= _STUCK)
-    # One draw decides all: the published code reuses u1 for every mode.
-    blocked = jnp.where(u[0] < 0.7, STAY, _to_the_middle(scene))
+    action = _rule_action(scene, params, u[0], memory.stuck >= _STUCK)
+    # As in the published code, all modes use the same random number u1.
+    blocked = jnp.where(u[0] < 0.7, STAY, _step_to_middle(scene))
     action = jnp.where(mode == BLOCKER, blocked, action)
     action = jnp.where((mode == LAZY) & (u[0] > params["action_probability"]), STAY, action)
-    # A step without a move counts even if it was meant: agents that wait for each other have to separate.
+    # Intended waiting also counts as stuck, so agents that wait for each other separate.
     stuck = jnp.where(scene.me == memory.cell, memory.stuck + 1, 0)
     return action, TerritoryMemory(following, scene.me, stuck)
 
 
-def _to_the_middle(scene: Scene) -> Int[Array, ""]:
-    """Return the step towards the middle: across first, then along the middle column; stay in front of a wall."""
+def _step_to_middle(scene: Scene) -> Int[Array, ""]:
+    """Return the step towards the middle: first to the middle column, then along this column; stay at a wall."""
     x, y = jnp.asarray(scene.tables.column)[scene.me], jnp.asarray(scene.tables.row)[scene.me]
     middle_x, middle_y = jnp.asarray(scene.tables.size) // 2
-    # On most layouts nobody gets past a blocker in the middle column.
+    # On most layouts, no agent can pass a blocker in the middle column.
     across = jnp.where(x < middle_x, RIGHT, LEFT)
     along = jnp.where(y < middle_y, DOWN, jnp.where(y > middle_y, UP, STAY))
     action = jnp.where(x == middle_x, along, across)
@@ -60,28 +59,28 @@ def _to_the_middle(scene: Scene) -> Int[Array, ""]:
     return jnp.where(blocked, STAY, action)
 
 
-def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> Int[Array, ""]:
-    """Return the action of the modes other than BLOCKER: rules in order of priority."""
+def _rule_action(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> Int[Array, ""]:
+    """Return the action of all modes except BLOCKER, by rules in order of priority."""
     empty, plate, dish, ingredient = scene.holds_nothing, scene.holds_plate, scene.holds_dish, scene.holds_ingredient
     hoards, counters = params["behavior_mode"] == HOARDER, params["behavior_mode"] == COUNTER
-    soup, cooking, room = (jnp.any(mask) for mask in (scene.cooked, scene.cooking, scene.nonfull))
+    soup, cooking, room = (jnp.any(mask) for mask in (scene.cooked, scene.cooking, scene.fillable_pot_cells))
     keeps_dish = dish & (hoards | counters)
-    sabotage = [  # rules of the modes that withhold dishes and ingredients
+    sabotage = [  # rules of modes that withhold dishes and ingredients
         Rule(keeps_dish | (ingredient & hoards & (u < 0.8)), scene.empty_counters),
         Rule(empty & counters & soup, scene.needed_piles),
     ]
-    # Only targets without which no soup is finished have a fallback outside the territory.
-    goals, nonfull, put_down, cooked, heating, plates, staged, needed = _filter(
+    # Only targets that every soup needs have a fallback outside the territory.
+    goals, nonfull, put_down, cooked, heating, plates, staged, needed = _territory_targets(
         scene,
         params,
         [
             (scene.goals, True),
-            (scene.nonfull, True),
+            (scene.fillable_pot_cells, True),
             (scene.empty_counters, True),
             (scene.cooked, False),
             (scene.cooking, False),
             (scene.plate_piles, False),
-            (scene.staged, False),
+            (scene.counter_ingredients, False),
             (scene.needed_piles, True),
         ],
     )
@@ -100,7 +99,7 @@ def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> 
             Rule(empty, plates),
         ]
     )
-    # Only cooperative modes are interrupted: when stuck or, for hoarders, at random.
+    # A stuck agent wanders unless it sabotages; hoarders with a plate also wander at random.
     sabotages = chosen.found & (chosen.number < len(sabotage))
     wanders = ~chosen.found | (stuck & ~sabotages) | (plate & hoards & (u < 0.7))
     worked = scene.go_to(chosen.target, chosen.waits, _step(scene, params, chosen.target))
@@ -109,8 +108,8 @@ def _work(scene: Scene, params, u: Float[Array, ""], stuck: Bool[Array, ""]) -> 
 
 
 def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
-    """The step towards a target. Agent 1 waits for a partner at the target's only access; both agents walk around."""
-    # A stored 0.1 or 0.3 is the float32 just above it; in the published code it reaches the threshold.
+    """Return the step towards a target, around the partner; agent 1 waits for a partner at the target's only access."""
+    # Thresholds are float32, because a stored 0.1 or 0.3 must reach the threshold as in the published code.
     step, cost = scene.approach(target)
     goes_around = scene.destination(step) == scene.partner
     if scene.slot == 0:
@@ -124,10 +123,12 @@ def _step(scene: Scene, params, target: Int[Array, ""]) -> Int[Array, ""]:
     return jnp.where(waits, STAY, step)
 
 
-def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array, "masks cells"]:
-    """The reachable cells of each mask within the own territory; if there is none, within the shared one; if there is
-    none either, all reachable ones of the masks with a fallback."""
-    # Two finished soups are as urgent as it gets: then even strict teammates help outside their territory.
+def _territory_targets(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array, "masks cells"]:
+    """Return the reachable cells of each mask in the agent's territory, or else in the shared territory.
+
+    If both are empty, masks with a fallback return all reachable cells, and other masks none.
+    """
+    # Two finished soups give the highest urgency: then even strict teammates help outside their territory.
     urgency = jnp.minimum(jnp.sum(scene.cooked) / 2, 1)
     anywhere = (urgency > params["rescue_threshold"]) | (params["strictness"] <= 0.5)
     reach = scene.reach(jnp.stack([mask for mask, _ in masks]))
@@ -142,25 +143,25 @@ def _filter(scene: Scene, params, masks: list[tuple[Array, bool]]) -> Bool[Array
 
 
 def areas(scene: Scene, params) -> tuple[Bool[Array, " cells"], Bool[Array, " cells"]]:
-    """Return the agent's own territory, and the territory with the margin that it shares.
+    """Return the agent's territory, and the territory with the shared margin.
 
-    For the mode INVADER both are its partner's.
+    An agent in mode INVADER has the territory of its partner.
     """
-    # The split by stations can leave one agent without floor, in small rooms; such layouts are split vertically.
+    # Small layouts where the split by stations leaves one agent without floor cells are split vertically.
     tables = scene.tables
     stations, floor = jnp.asarray(tables.stations), jnp.asarray(tables.walkable)
     divides = jnp.any(floor & (stations < 0)) & jnp.any(floor & (stations >= 0))
     kind = jnp.where((params["split_mode"] == STATIONS) & ~divides, VERTICAL, params["split_mode"])
     middle_x, middle_y = jnp.asarray(tables.size) // 2
     from_middle = (jnp.asarray(tables.column) - middle_x, jnp.asarray(tables.row) - middle_y)
-    # Signed distance of each cell from the border, positive on agent 1's side, by split mode.
+    # Signed distance of each cell from the border for each split mode, positive on agent 1's side.
     beyond = jnp.stack([*(one.astype(jnp.float32) for one in from_middle), stations])[kind]
     margin = params["shared_margin"] * jnp.where(kind == STATIONS, jnp.float32(1.5), jnp.float32(1))
-    # An invader works in its partner's territory, so it takes the other side of the border.
+    # An invader works in its partner's territory, on the other side of the border.
     second = (scene.slot == 1) ^ (params["behavior_mode"] == INVADER)
     strict = jnp.where(second, beyond >= 0, beyond < 0)
     near = beyond + margin
-    # As published: cells exactly at the margin are shared, but not in the split by stations.
+    # As in the published code, cells exactly at the margin are shared, except in the split by stations.
     shared = jnp.where(kind == STATIONS, near > 0, near >= 0)
     return strict, jnp.where(second, shared, beyond < margin)
 
@@ -204,4 +205,4 @@ TERRITORY = Heuristic(
     choices={"split_mode": 3, "behavior_mode": 6},
     unbounded=frozenset({"shared_margin"}),
 )
-"""The family H2; its parameters' order is that of the published manifests."""
+"""Heuristic family H2, with parameters in the order of the published manifests."""

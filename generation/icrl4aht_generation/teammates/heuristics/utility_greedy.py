@@ -1,4 +1,4 @@
-"""H4 `utility_greedy`: scores eight intents by weight and distance, pursues the best (paper, App. B.2, table H4)."""
+"""Heuristic family H4 `utility_greedy`: scores eight intents by weight and distance, follows the best (App. B.2)."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class GreedyMemory(NamedTuple):
     """Memory of an H4 teammate.
 
     Attributes:
-        key: typed key, scalar, the next of its chain.
+        key: typed JAX key, scalar, the next key of the teammate's chain.
         intent: int32 scalar, the last intent, 0..7; -1 for none.
-        wait: int32 scalar, steps that it still waits for its partner.
+        wait: int32 scalar, remaining steps of waiting for the partner.
     """
 
     key: Key[Array, ""]
@@ -32,10 +32,10 @@ class GreedyMemory(NamedTuple):
 
 
 def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[Array, ""], GreedyMemory]:
-    """Take one step of an H4 teammate."""
-    intent, action = _decide(scene, params, memory.intent)
-    action, wait = _yield(scene, memory, action)
-    # A wait holds the intent but not the key, which moves on in every step as in the published code.
+    """Return the action of an H4 teammate, and the next memory."""
+    intent, action = _choose_action(scene, params, memory.intent)
+    action, wait = _yield_to_partner(scene, memory, action)
+    # As in the published code, the key changes in every step, but the intent does not change during a wait.
     waiting = memory.wait > 0
     after = GreedyMemory(
         next_key(memory.key),
@@ -45,27 +45,27 @@ def act_utility_greedy(params, memory: GreedyMemory, scene: Scene) -> tuple[Int[
     return jnp.where(waiting, STAY, action), after
 
 
-def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Return the best intent (-1 if none is feasible) and its action."""
-    cooked, cooking, nonfull = scene.reach(scene.cooked), scene.reach(scene.cooking), scene.reach(scene.nonfull)
-    # With a plate, a soup that still cooks is worth as much as a finished one, if no other is finished.
+def _choose_action(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Return the best intent (-1 if no intent is feasible) and the action of this intent."""
+    cooked, cooking, fillable = map(scene.reach, (scene.cooked, scene.cooking, scene.fillable_pot_cells))
+    # An agent with a plate goes to a soup that still cooks if no soup is finished.
     waits = scene.holds_plate & ~jnp.any(cooked) & jnp.any(cooking)
     needed = scene.reach(scene.needed_piles)
-    stageable = scene.empty_counters & scene.near(POT)
+    stageable = scene.empty_counters & scene.cells_near(POT)
     prefers_pots = jnp.any(stageable) & (params["counter_preference"] > 0.5)
     targets = jnp.stack(
         [
             scene.goals,
             jnp.where(waits, cooking, cooked),
             scene.plate_piles,
-            nonfull,
+            fillable,
             jnp.where(jnp.any(needed), needed, scene.recipe_piles),
             jnp.where(prefers_pots, stageable, scene.empty_counters),
             jnp.zeros_like(scene.goals),  # the intent START has no targets
             scene.buttons,
         ]
     )
-    values, allowed = _values(scene, params, waits, jnp.any(needed))
+    values, allowed = _intent_values(scene, params, waits, jnp.any(needed))
     distance = jax.vmap(scene.nearest_distance)(targets)
     feasible = allowed & (distance < UNREACHABLE)
     bonus = 2.0 * params["inertia"] * (jnp.arange(8) == last_intent)  # prevents wavering between two intents
@@ -73,15 +73,15 @@ def _decide(scene: Scene, params, last_intent: Int[Array, ""]) -> tuple[Int[Arra
     best = jnp.argmax(scores)
     target = scene.closest(targets[best])
     action = scene.go_to(target, waits=waits & (best == PICK_UP))
-    # `argmax` over nothing but -inf returns 0, so whether anything is feasible decides separately.
+    # If all scores are -inf, `argmax` returns 0, so `some` shows whether any intent is feasible.
     some = jnp.any(feasible)
     return jnp.where(some, best, -1), jnp.where(some, action, scene.wander())
 
 
-def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array, " 8"], Array]:
-    """Return weight x value of each intent, float32 (8,), and whether its conditions except reach hold, bool (8,)."""
-    cooking, cooked, nonfull = (jnp.sum(mask) for mask in (scene.cooking, scene.cooked, scene.nonfull))
-    can_add = jnp.any(scene.reach(scene.nonfull))
+def _intent_values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array, " 8"], Array]:
+    """Return weight x value of each intent, float32 (8,), and whether the intent is allowed, bool (8,)."""
+    cooking, cooked, nonfull = (jnp.sum(mask) for mask in (scene.cooking, scene.cooked, scene.fillable_pot_cells))
+    can_add = jnp.any(scene.reach(scene.fillable_pot_cells))
     can_put_down = jnp.any(scene.reach(scene.empty_counters))
     plate = jnp.where(cooking + cooked > 0, 1 + 0.3 * cooking + 0.5 * cooked, jnp.where(nonfull == 0, 0.8, 0.2))
     fetch = jnp.where(
@@ -89,7 +89,7 @@ def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array,
         jnp.where(can_add, 1 + 0.2 * nonfull, 0.8),
         jnp.where(can_add, 0.4 + 0.05 * nonfull, 0.15),
     )
-    # The bonus of adding is that of the fullest pot, whichever pot is nearest, as published.
+    # As in the published code, the bonus of adding depends on the fullest pot, not on the nearest pot.
     fullest = jnp.max(ingredient_count(scene.state.pot_items)).astype(jnp.int32)
     finished = 1 + 0.5 * cooked
     no_pot_in_use = cooking + cooked + nonfull == 0
@@ -113,10 +113,10 @@ def _values(scene: Scene, params, waits, needed_reachable) -> tuple[Float[Array,
     return jnp.stack([jnp.asarray(v, jnp.float32) for v in values]), jnp.stack(allowed)
 
 
-def _yield(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
-    """Return the action, sometimes `stay` next to the partner, and the number of steps to wait."""
+def _yield_to_partner(scene: Scene, memory: GreedyMemory, action: Int[Array, ""]):
+    """Return the action, which is sometimes `stay` next to the partner, and the number of steps to wait."""
     distance = scene.manhattan(scene.destination(action), scene.partner)
-    # As published, the roll is the key's first word itself, not a draw from the key.
+    # As in the published code, the random number is the key's first word, not a number drawn with the key.
     roll = jax.random.key_data(memory.key)[0] % 100
     yields = (action < STAY) & (distance <= 1) & (roll < 20 + 20 * scene.slot)
     return jnp.where(yields, STAY, action), jnp.where(yields, 1 + (roll % 2).astype(jnp.int32), 0)
@@ -171,4 +171,4 @@ UTILITY_GREEDY = Heuristic(
     ),
     unbounded=frozenset(_SPANS.keys() - {"inertia", "counter_preference"}),
 )
-"""The family H4; its parameters' order is that of the published manifests."""
+"""Heuristic family H4, with parameters in the order of the published manifests."""
