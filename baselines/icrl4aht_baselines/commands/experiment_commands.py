@@ -150,7 +150,7 @@ def _model_returns() -> dict[str, dict[str, float]]:
             for of in cells.values()
             for task, values in zip(of.tasks, of.mean, strict=True)
         }
-        for agent, cells in stored.with_other_ways(stored.returns()).items()
+        for agent, cells in stored.with_other_play_modes(stored.returns()).items()
     }
 
 

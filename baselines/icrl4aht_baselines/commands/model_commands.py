@@ -150,7 +150,7 @@ def reference_command(
     with its choices. ad-rising imitates histories of rl2-reference whose actions are random at first.
     """
     from icrl4aht_baselines.agents.bundled import bundle_run, check_bundle_name
-    from icrl4aht_baselines.reference import RECIPES, check_taught, make_reference, write_bundled_card
+    from icrl4aht_baselines.reference import RECIPES, check_learns_from_teacher, make_reference, write_bundled_card
 
     if bundle:
         try:
@@ -164,7 +164,7 @@ def reference_command(
     if teacher:  # raises before hours of work
         find_ego("--teacher", teacher)
         for name in names:
-            check_taught(name)
+            check_learns_from_teacher(name)
     outcomes = []
     with progress_bars() as show:
         for name, of_track in product(names, track):

@@ -222,7 +222,7 @@ class TestPlan:
         assert segment_lengths(get_protocol("seeded", 3), "swapped") == (2, 1)
 
     def test_a_task_without_partner_is_named(self):
-        message = rf"task {H1.task_id}: expected another task on coord_simple with another teammate to swap with, found none"
+        message = rf"task {H1.task_id}: expected another task on coord_simple with another teammate to swap with, found"
         with pytest.raises(OptionError, match=message):
             plan_tasks([H1, published_task("demo_wide", "H2/t0")], FOUR, "swapped")
         with pytest.raises(OptionError, match=message):
