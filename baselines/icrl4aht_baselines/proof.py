@@ -165,7 +165,7 @@ class ProofJob:
         return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks}
 
     def result(self) -> dict[str, Any]:
-        """Return the content of result.json: `settings`, `minutes` of training, and `returns` of `evaluate_sets`."""
+        """Return the content of result.json: `settings`, `minutes` of training, and `returns` of `play_sets`."""
         return parse_json(read_text(self.result_file))
 
     def progress(self) -> tuple[int, float] | None:
@@ -194,7 +194,7 @@ class ProofJob:
             content = {
                 "settings": self.settings,
                 "minutes": round(_training_seconds(run / TIMING) / 60, 1),
-                "returns": evaluate_sets(find_agent(run, greedy=False), self.options, self.folder / "results"),
+                "returns": play_sets(find_agent(run, greedy=False), self.options, self.folder / "results"),
             }
             with atomic_write(self.result_file) as partial:
                 write_json(partial, content)
@@ -207,7 +207,7 @@ def _training_seconds(timing: Path) -> float:
     return float(np.sum(steps / [line["steps_per_second"] for line in lines]))
 
 
-def evaluate_sets(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = True) -> dict[str, dict[str, float]]:
+def play_sets(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = True) -> dict[str, dict[str, float]]:
     """Evaluate an agent on each set of tasks of the proof.
 
     Args:
@@ -235,7 +235,7 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
 
     Args:
         jobs: jobs of the trainings; unfinished ones are skipped.
-        references: name of an ego -> returns from `evaluate_sets`.
+        references: name of an ego -> returns from `play_sets`.
         path: path of the file, which is replaced.
     """
     entries: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
@@ -277,6 +277,6 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
 
 
 def run_references(options: ProofOptions, out: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Return name of an ego in `COMPARED_EGOS` -> returns from `evaluate_sets`; stored results are reused."""
+    """Return name of an ego in `COMPARED_EGOS` -> returns from `play_sets`; stored results are reused."""
     names = dict.fromkeys(name for of_set in COMPARED_EGOS.values() for name in of_set)
-    return {name: evaluate_sets(find_agent(name), options, out / "references" / name, controls=False) for name in names}
+    return {name: play_sets(find_agent(name), options, out / "references" / name, controls=False) for name in names}

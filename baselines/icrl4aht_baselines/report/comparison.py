@@ -119,7 +119,7 @@ def write_stored(path: Path, stored: StoredResults) -> None:
     for file, frame, digits in zip(_table_paths(path), (stored.table, stored.curves), (3, 2), strict=True):
         with atomic_write(file) as partial:
             text = frame.round(digits).to_csv(index=False, lineterminator="\n")
-            partial.write_bytes(gzip.compress(text.encode(), mtime=0))  # without a time, so that equal results give equal bytes
+            partial.write_bytes(gzip.compress(text.encode(), mtime=0))  # no time: equal results give equal bytes
     with atomic_write(path) as partial:
         write_json(partial, msgspec.to_builtins(stored.agents))
 
@@ -310,7 +310,7 @@ def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, s
     return found
 
 
-def mean_best_response(layout: str, scales: CellScales) -> float | None:
+def mean_best(layout: str, scales: CellScales) -> float | None:
     """Return the mean return of the best responses to the families of a layout; None if no family has one.
 
     For a family without a best response, the return of `stay` is used, because the oracle earns no more with this
@@ -332,7 +332,7 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
     for ego in REFERENCES:
         means = (np.mean([egos[ego] for cell, egos in headroom.items() if cell[0] == name]) for name in TEST_LAYOUTS)
         body.append([f"`{ego}`", *(f"{mean:z.1f}" for mean in means), "", ""])
-    bests = [mean_best_response(name, scales) for name in TEST_LAYOUTS]
+    bests = [mean_best(name, scales) for name in TEST_LAYOUTS]
     body.append(["best response", *("–" if best is None else f"{best:z.1f}" for best in bests), "", ""])
     for agent, cells in results.items():
         texts = []
@@ -353,16 +353,16 @@ def describe_trainings() -> str:
     trained = [training for one in behaviours for training in one.seeds]
     if not trained:
         return ""
-    steps, width = _format_range([one.steps for one in trained], ",d"), _format_range([one.width for one in trained], "d")
+    steps, width = _span([one.steps for one in trained], ",d"), _span([one.width for one in trained], "d")
     better = sum(not one.agent.startswith("best response") for one in behaviours)
     return (
-        f"Behaviours: {len(behaviours)}. Trainings with each: {_format_range([len(one.seeds) for one in behaviours], 'd')}, of "
+        f"Behaviours: {len(behaviours)}. Trainings with each: {_span([len(one.seeds) for one in behaviours], 'd')}, of "
         f"{steps} steps and width {width}. With {better} of these behaviours a stored model earns more: B is its "
         f"return."
     )
 
 
-def _format_range(values: Sequence[int], form: str) -> str:
+def _span(values: Sequence[int], form: str) -> str:
     low, high = (format(limit, form) for limit in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
 
@@ -398,7 +398,7 @@ def plot_comparison(stored: StoredResults, path: Path) -> None:
                 axes.plot([1], [mean_of(first)], "o", color=color, markersize=4, label=f"{agent}, first episode")
         stays = [egos["stay"] for cell, egos in headroom.items() if cell[0] == layout]
         axes.axhline(np.mean(stays), color="gray", linestyle=":", label="stay")
-        if (best := mean_best_response(layout, scales)) is not None:
+        if (best := mean_best(layout, scales)) is not None:
             axes.axhline(best, color="black", label="best response")
         axes.set_ylim(*return_limits(value for line in axes.lines for value in np.ravel(line.get_ydata())))
         axes.set_xscale("log")

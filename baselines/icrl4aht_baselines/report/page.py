@@ -211,7 +211,7 @@ def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> 
 
 
 def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCell] | None = None) -> str:
-    """Return a sentence with protocol, seeds, episodes and number of instances of some runs, optionally only in `cells`.
+    """Return a sentence with protocol, seeds, episodes and number of instances of some runs, or of their `cells`.
 
     If the conditions differ between runs, the sentence names the agents of each condition.
     """
@@ -257,7 +257,7 @@ def markdown(runs: Sequence[EvaluationRun]) -> str:
 
 
 def markdown_sections(runs: Sequence[EvaluationRun], protocol: str) -> list[str]:
-    """Return a Markdown section for each kind of tasks that was played, with a table and the meaning of its marks."""
+    """Return a Markdown section for each kind of tasks that was played: a table, and what its marks mean."""
     sections = []
     for table in returns_tables(runs, protocol):
         body = [

@@ -139,7 +139,7 @@ def test_another_way_of_playing_is_added(tmp_path):
         make_submission([drawn], FACTS)
     later = comparison.add_submission(stored, make_submission([drawn], AgentFacts("x", "x", "x"), update=True))
     assert len(later.table) == 2 * len(stored.table) and later.agents == {"mine": FACTS}
-    shown = later.with_other_ways(later.returns())
+    shown = later.with_other_play_modes(later.returns())
     assert list(shown) == ["mine", "mine (sampled)"]
     table = comparison.agents_table(later, shown, {})
     assert "| `mine` | none | none | – | – | – |" in table and "| `mine (sampled)` |  |  |  | – |" in table
