@@ -2,7 +2,7 @@
 
     device     machine, software and settings
     product    TFLOP/s of one large matrix product; float32 products use TF32 on a GPU by default, see `measure_product`
-    learner    steps/s of PPO training of an ego with teammate H4: 1,024 environments, network and minibatches of the paper
+    learner    steps/s of PPO training of an ego with teammate H4, with the paper's network, in 1,024 environments
     train      seconds of an AD training step (B = 1024, L = 500 for the paper's small size), and wait for the loader
     loader     batches/s from the bundled release to the device, without training
     act        steps/s of the evaluator with cached acting, on the tasks of one layout
@@ -230,7 +230,7 @@ def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, p
         program = compile_measured(trainer.step, state, batch)
         limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", program.bytes)
         if program.bytes > limit:
-            raise MemoryError(f"the program needs {gib(program.bytes)} GiB in {parts} parts, expected at most {gib(limit)}")
+            raise MemoryError(f"needs {gib(program.bytes)} GiB in {parts} parts, expected at most {gib(limit)}")
 
         def step(take: Callable[[], Any]) -> Any:
             nonlocal state

@@ -7,8 +7,8 @@ All readers make the same windows of the same histories, which are bundled histo
     ours        caches ram, mmap and stream (with and without decoded chunks in memory); state records, uint8 and
                 float32 observations; batch buffers are reused
 
-Readers take turns in rounds. One JSON line is printed for each of our readers and each peer, with the ratio of both, and
-with our target ratio to the reader `published`.
+Readers take turns in rounds. One JSON line is printed for each of our readers and each peer, with the ratio of both and
+our target ratio to the reader `published`.
 """
 
 from __future__ import annotations

@@ -146,9 +146,9 @@ def run_isolated(
 ) -> int:
     """Run cases in a child process, and in a new one after each failure. Return the number of failures.
 
-    A crash or an out-of-memory error therefore affects only one case. A child runs its cases in order, and prints a JSON
-    object for each to stdout, with the name as "case". A child ends after a case with "error". If a child crashes or is
-    stopped, a line is also printed for the case without a result.
+    A crash or an out-of-memory error therefore affects only one case. A child runs its cases in order, and prints a
+    JSON object for each to stdout, with the name as "case". A child ends after a case with "error". If a child crashes
+    or is stopped, a line is also printed for the case without a result.
 
     Args:
         cases: names of the cases.

@@ -257,7 +257,7 @@ def markdown(runs: Sequence[EvaluationRun]) -> str:
 
 
 def markdown_sections(runs: Sequence[EvaluationRun], protocol: str) -> list[str]:
-    """Return a Markdown section for each kind of tasks that was played: a table, and what its marks mean."""
+    """Return a Markdown section for each kind of tasks that was played: a table, and what the marks mean."""
     sections = []
     for table in returns_tables(runs, protocol):
         body = [

@@ -157,7 +157,7 @@ class Trainer:
         return TrainState(params, slow, optimizer, state.step + 1), log
 
     def _gradient(self, state: TrainState, batch: Any, key: Array) -> tuple[Any, dict[str, Array]]:
-        """Return the gradient and the numbers to log, as means over the parts of a batch, which are computed in turn."""
+        """Return the gradient and the numbers to log, as means over a batch's parts, which are computed in turn."""
         parts = self.options.accumulate
         gradient_of = jax.value_and_grad(self.method.loss, has_aux=True)
 
@@ -228,8 +228,8 @@ class TrainingTask(NamedTuple):
     ) -> Any:
         """Train up to the last step, from the start or from the last checkpoint in the folder.
 
-        After SIGTERM or SIGINT, the running step is finished, the state is saved, and the training ends. A second SIGINT
-        ends it at once.
+        After SIGTERM or SIGINT, the running step is finished, the state is saved, and training ends. A second SIGINT ends
+        training at once.
 
         Args:
             folder: run folder, which receives config.json, metrics.jsonl (a function of the settings), timing.jsonl,
@@ -242,8 +242,8 @@ class TrainingTask(NamedTuple):
             The state after the last step, such as a `TrainState`.
 
         Raises:
-            OptionError: if the folder has a run with other settings or another number of XLA threads, which would change
-                the results, or if the library of a logger is not installed.
+            OptionError: if the folder has a run with other settings or another number of XLA threads (which changes the
+                results), or if the library of a logger is not installed.
             BusyError: if another process trains in the folder.
             TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training with identical results.
         """
