@@ -74,7 +74,7 @@ def prepare_play(
     # Channels are canonical, because one network plays on all layouts.
     method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
     hidden = [get_layout(one).name for one in histories.hide_recipe]
-    groups = _task_groups(teammates, _layout_shares(dataset, tasks), hidden, play, options.batch_size)
+    groups = _task_groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
     # With few tasks, some teammates are in no group, so the record of training data must not state them.
     played = {task for group in groups for task in group.ids}
     labels: Labels | None = "oracle" if play.imitation else None
@@ -247,7 +247,7 @@ def _rearranged_groups(
         yield make_group(where, kind, mates, hidden, f"{layout.name} rearranged")
 
 
-def _layout_shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
+def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     """Return the relative number of tasks on each layout: 1, or `FLAT_SHARE` if the oracle earns no more than `stay`.
 
     The value is 1 if the oracle earns more than `stay` with at least one of the layout's teammates, according to stored

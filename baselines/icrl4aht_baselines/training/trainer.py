@@ -228,8 +228,8 @@ class TrainingTask(NamedTuple):
     ) -> Any:
         """Train up to the last step, from the start or from the last checkpoint in the folder.
 
-        After SIGTERM or SIGINT, the running step is finished, the state is saved, and training ends. A second SIGINT ends
-        training at once.
+        After SIGTERM or SIGINT, the running step is finished, the state is saved, and training ends. A second SIGINT
+        ends training at once.
 
         Args:
             folder: run folder, which receives config.json, metrics.jsonl (a function of the settings), timing.jsonl,

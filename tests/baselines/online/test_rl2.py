@@ -20,7 +20,7 @@ from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
 from icrl4aht_baselines.methods.tokens import StepInput
 from icrl4aht_baselines.methods.view_change import ViewChange
-from icrl4aht_baselines.online.prepare import FLAT_SHARE, REARRANGED_SHARE, _layout_shares, prepare_play
+from icrl4aht_baselines.online.prepare import FLAT_SHARE, REARRANGED_SHARE, _shares, prepare_play
 from icrl4aht_baselines.online.rl2 import (
     PLAY_REWARD_SCALE,
     PlayTrainer,
@@ -341,14 +341,14 @@ class TestPreparing:
     def test_shares_follow_the_measured_oracle_gain(self):
         """The oracle earns more than `stay` with diverse teammates on demo_simple, not on coord_simple."""
         tasks = read_tasks(manifest_path("teammate", "train", "diverse"))
-        assert _layout_shares(None, [task for task in tasks if task.layout.name in ("demo_simple", "coord_simple")]) == {
+        assert _shares(None, [task for task in tasks if task.layout.name in ("demo_simple", "coord_simple")]) == {
             "coord_simple": FLAT_SHARE,
             "demo_simple": 1.0,
         }
         release = load_icrl4aht(split="train", layout=["demo_simple", "coord_simple"])
-        assert _layout_shares(release, tasks)["demo_simple"] == 1.0
-        assert _layout_shares(load_icrl4aht(split="train", layout="coord_simple"), ()) == {"coord_simple": FLAT_SHARE}
-        assert _layout_shares(None, read_tasks(manifest_path("layout", "test"))) == {"asymm_right": 1.0, "cramped_down": 1.0}
+        assert _shares(release, tasks)["demo_simple"] == 1.0
+        assert _shares(load_icrl4aht(split="train", layout="coord_simple"), ()) == {"coord_simple": FLAT_SHARE}
+        assert _shares(None, read_tasks(manifest_path("layout", "test"))) == {"asymm_right": 1.0, "cramped_down": 1.0}
 
     @pytest.mark.parametrize(
         ("play", "choice", "manifest", "message"),
