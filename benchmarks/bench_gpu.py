@@ -37,7 +37,7 @@ from typing import Any
 import click
 import jax
 import jax.numpy as jnp
-from icrl4aht_baselines.agents.egos import learned
+from icrl4aht_baselines.agents.egos import trained_policy
 from icrl4aht_baselines.evaluate.evaluator import play_episodes, prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.methods.attention import causal_attention
@@ -143,10 +143,10 @@ def product_tflops(size: int, dtype: str, precision: str | None, seconds: float)
     one, two = jax.random.normal(jax.random.key(0), (2, size, size), dtype)
     multiply = jax.jit(partial(jnp.matmul, precision=precision))
 
-    def several() -> Any:
+    def multiply_repeatedly() -> Any:
         return [multiply(one, two) for _ in range(5)]  # five products per call, so that overhead is negligible
 
-    return 5 * 2 * size**3 / min(seconds_of_calls(several, seconds)) / 1e12
+    return 5 * 2 * size**3 / min(seconds_of_calls(multiply_repeatedly, seconds)) / 1e12
 
 
 def describe_device(sizes: Sizes) -> dict[str, Any]:
@@ -281,7 +281,7 @@ def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) ->
     layout = get_layout(_LAYOUT)
     tasks = h4_tasks()[: sizes.tasks]
     method = ad_method(architecture(sizes, size, encoder, "float32"), [layout])
-    policy = learned(method, method.init(jax.random.key(0)), context)
+    policy = trained_policy(method, method.init(jax.random.key(0)), context)
     protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps, episodes=sys.maxsize)
     started = time.perf_counter()
     prepared = prepare_rollout(lambda layout: policy, tasks, protocol, range(seeds))

@@ -24,7 +24,7 @@ from typing import Any, get_args
 import click
 import jax
 import numpy as np
-from icrl4aht_baselines.agents.egos import Acting, PlayMode, learned
+from icrl4aht_baselines.agents.egos import Acting, PlayMode, trained_policy
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_episodes, prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, Protocol
 from icrl4aht_baselines.methods.ad import dropped_steps
@@ -182,7 +182,7 @@ def untrained_ad(layout: Layout, size: str, acting: Acting) -> Policy:
     """Return an untrained AD model as an ego."""
     model = size_options(size)
     method = get_method("ad")(model, overcooked_world([layout], model.encoder))
-    return learned(method, method.init(jax.random.key(0)), SIZES[size].context, PlayMode(acting))
+    return trained_policy(method, method.init(jax.random.key(0)), SIZES[size].context, PlayMode(acting))
 
 
 def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -> Callable[[], None]:

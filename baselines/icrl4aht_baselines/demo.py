@@ -97,55 +97,55 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     out.mkdir(parents=True, exist_ok=True)
     curves, episode, picture, page = paths
 
-    def say(number: int, text: str) -> None:
+    def print_stage(number: int, text: str) -> None:
         console.print(f"[bold]{number}/6[/bold] ({time.perf_counter() - started:.0f} s) {text}")
 
-    def write(text: str) -> None:
+    def print_text(text: str) -> None:
         console.print(text, highlight=False, markup=False)
 
-    say(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}", source="{_SOURCE}")')
+    print_stage(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}", source="{_SOURCE}")')
     dataset = load_icrl4aht(settings.root, split="train", layout=DEMO_LAYOUT, source=_SOURCE)
     plot_learning_curves(load_icrl4aht(settings.root), curves)
     _draw_best_episode(dataset, episode)
-    write(f"{dataset!r}\nlearning curves: {curves}\nbest episode: {episode}")
+    print_text(f"{dataset!r}\nlearning curves: {curves}\nbest episode: {episode}")
 
-    say(2, 'ds.ad(batch_size=8, length=500, labels="expert")[0]')
-    write(dataset.ad(batch_size=8, length=500, labels="expert")[0].describe())
+    print_stage(2, 'ds.ad(batch_size=8, length=500, labels="expert")[0]')
+    print_text(dataset.ad(batch_size=8, length=500, labels="expert")[0].describe())
 
-    say(3, "verifying every byte and every step")
+    print_stage(3, "verifying every byte and every step")
     verified = verify_release(settings.root, level="deep")
     if not verified.ok:
         raise ReleaseError(f"{settings.root}: {verified.findings[0].file}: {verified.findings[0].problem}")
-    write(
+    print_text(
         f"no problem in {verified.files} files, {verified.chunks} chunks, {verified.transitions:,} transitions replayed"
     )
 
     training = settings.training
-    say(4, f"training Hybrid-AD on windows of {training.context:,} steps: {training.steps} steps")
+    print_stage(4, f"training Hybrid-AD on windows of {training.context:,} steps: {training.steps} steps")
     run = out / "run"
     histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=(_SOURCE,), labels="expert", first=_EPISODES)
     job = prepare("hybrid_ad", settings.model, training, histories)
     with progress_bars(unit="steps") as show:
         job.train(run, done=show_steps(show, "Hybrid-AD", training.steps))
-    write(f"losses on training and held-out histories: {run / RUN_CURVES}")
+    print_text(f"losses on training and held-out histories: {run / RUN_CURVES}")
 
     tasks = settings.tasks or demo_tasks()
-    say(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
+    print_stage(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
     agent = find_agent(run, greedy=False)
 
-    def played(one: NamedEgo, folder: str, **control: Any) -> EvaluationRun:
+    def evaluate_into(one: NamedEgo, folder: str, **control: Any) -> EvaluationRun:
         rules, where = settings.protocol, out / "results" / folder
         return evaluate_agent(one, tasks, rules, where, seeds=settings.seeds, **control)
 
-    own, cleared = played(agent, agent.name), played(agent, "cleared", control="cleared")
-    runs = [own, cleared, *(played(find_agent(name), name) for name in _AGENTS)]
-    write(block_table(runs).to_string())
+    own, cleared = evaluate_into(agent, agent.name), evaluate_into(agent, "cleared", control="cleared")
+    runs = [own, cleared, *(evaluate_into(find_agent(name), name) for name in _AGENTS)]
+    print_text(block_table(runs).to_string())
 
-    say(6, "drawing")
+    print_stage(6, "drawing")
     draw_adaptation(runs, picture)
     write_page(runs, page)
-    write(f"return by episode: {picture}\nreport: {page}")
-    write(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(own, cleared)}")
+    print_text(f"return by episode: {picture}\nreport: {page}")
+    print_text(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(own, cleared)}")
     return page
 
 
@@ -157,18 +157,18 @@ def demo_tasks() -> tuple[Task, ...]:
 def block_table(runs: Sequence[EvaluationRun]) -> pd.DataFrame:
     """Return a table of mean returns, with a row for each agent and a column for each block of episodes."""
     means = {
-        run.agent: {block: mean_of(of.blocks[block] for of in run.returns.values()) for block in _blocks(run)}
+        run.agent: {block: mean_of(of.blocks[block] for of in run.returns.values()) for block in _played_blocks(run)}
         for run in runs
     }
     return pd.DataFrame(means).T.map("{:z.1f}".format).rename(columns="episodes {}".format)
 
 
-def _blocks(run: EvaluationRun) -> list[str]:
+def _played_blocks(run: EvaluationRun) -> list[str]:
     """Return the names of the blocks of episodes that were played in all tasks of a run."""
     return [block for block in EPISODE_BLOCKS if all(block in of.blocks for of in run.returns.values())]
 
 
-def find_rise(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
+def find_gain(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
     """Return a run's return in its last block of episodes minus that in its first episode, or minus another run's.
 
     Differences are paired by task and seed. Each combination of layout and teammate family has the same weight.
@@ -177,7 +177,7 @@ def find_rise(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInt
         run: results of an agent.
         other: results of another agent; if given, its return in the last block is subtracted.
     """
-    last = _blocks(run)[-1]
+    last = _played_blocks(run)[-1]
     base, block = (run, "1") if other is None else (other, last)
     return mean_interval(
         *(of.blocks[last][0] - base.returns[cell].blocks[block][0] for cell, of in run.returns.items())
@@ -186,7 +186,7 @@ def find_rise(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInt
 
 def conclusion(own: EvaluationRun, cleared: EvaluationRun) -> str:
     """Return text that says whether the model learns within its context, and how far the measurement can be trusted."""
-    rise, memory = find_rise(own), find_rise(own, cleared)
+    rise, memory = find_gain(own), find_gain(own, cleared)
     verdict = "rises by what it remembers" if rise.low > 0 and memory.low > 0 else "does not rise by what it remembers"
     return (
         f"Its return {verdict}: {rise.text(sign='+')} from the first episode to the last ones, {memory.text(sign='+')} "

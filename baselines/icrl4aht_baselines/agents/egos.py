@@ -172,7 +172,7 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
     The function raises OptionError with the name of `folder` if the layout's observations do not have the shape that
     the model was trained on. Models that take canonical channels play on every layout.
     """
-    policy = learned(run.method, run.params, run.context, mode)
+    policy = trained_policy(run.method, run.params, run.context, mode)
 
     def make(layout: Layout) -> Policy:
         if run.channels == "own" and layout.obs_shape != run.obs_shape:
@@ -186,7 +186,7 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
     return make
 
 
-def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLISHED) -> Policy:
+def trained_policy(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLISHED) -> Policy:
     """Return a trained model as a policy, with a memory that lasts for a complete task.
 
     Args:
@@ -224,14 +224,14 @@ def with_view(policy: Policy, channels: Channels, hide_recipe: bool = False) -> 
     """
     if channels == "own":
         return policy
-    return policy._replace(act=_without_recipe(policy.act) if hide_recipe else policy.act, sees="canonical_input")
+    return policy._replace(act=_act_without_recipe(policy.act) if hide_recipe else policy.act, sees="canonical_input")
 
 
 @lru_cache(maxsize=16)
-def _without_recipe(act: Callable[..., Any]) -> Callable[..., Any]:
+def _act_without_recipe(act: Callable[..., Any]) -> Callable[..., Any]:
     change = no_change()._replace(hidden=jnp.bool_(True))
 
-    def act_unseeing(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
+    def act_without_recipe(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
         return act(params, memory, ego_input._replace(obs=change.observations(ego_input.obs)), key)
 
-    return act_unseeing
+    return act_without_recipe

@@ -128,7 +128,7 @@ def chosen_tasks(
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 
     if manifest:
-        check_alone("--manifest", "split")
+        check_conflicts("--manifest", "split")
     bundled = ((name, of_split) for of_split in split for name in track)
     own = read_tasks_and_layouts(manifest) if manifest else []
     given = own if manifest else [task for each in bundled for task in bundled_tasks(*each)]
@@ -246,7 +246,7 @@ def prepare_training(
     return job, text
 
 
-def check_alone(option: str, *others: str) -> None:
+def check_conflicts(option: str, *others: str) -> None:
     """Check that no option in `others` was given on the command line together with `option`, which sets its value.
 
     Raises:

@@ -96,7 +96,7 @@ def evaluate_command(
     ego = find_ego("--agent", agent, acting=acting, greedy=greedy)
     chosen = limit_tasks(shared.chosen_tasks(**choice), tasks)
     if chosen_seeds:
-        shared.check_alone("--seed", "seeds")
+        shared.check_conflicts("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
     if note := hidden_recipe_note(chosen):
         click.echo(note, err=True)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from icrl4aht_baselines.agents.egos import PlayMode, learned
+from icrl4aht_baselines.agents.egos import PlayMode, trained_policy
 from icrl4aht_baselines.control import worlds
 from icrl4aht_baselines.methods.ad import ad
 from icrl4aht_baselines.methods.dpt import dpt
@@ -137,7 +137,7 @@ def _bandit_checks(
         return float((means.max(axis=1, keepdims=True) - got).sum(axis=1).mean())
 
     def model_regret(context: int) -> float:
-        policy = learned(method, state.params, context, PlayMode(greedy=False))
+        policy = trained_policy(method, state.params, context, PlayMode(greedy=False))
         return regret(worlds.play_world(worlds.bandit(), policy, jnp.asarray(means), 0, size.bandit_steps)[0])
 
     rival_regret = regret(worlds.play_bandits(rival[1], means, size.bandit_steps, rng)[0])
@@ -169,7 +169,7 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
 
     def share_of_best(context: int) -> np.ndarray:
         """Return the mean of return / best possible return in each episode, (episodes,)."""
-        policy = learned(method, state.params, context, PlayMode(greedy=False))
+        policy = trained_policy(method, state.params, context, PlayMode(greedy=False))
         _, rewards = worlds.play_world(small, policy, jnp.asarray(tasks, jnp.int32), 0, steps)
         returns = np.asarray(rewards).reshape(len(tasks), -1, small.episode).sum(axis=-1)
         return (returns / best[:, None]).mean(axis=0)

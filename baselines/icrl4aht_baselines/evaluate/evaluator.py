@@ -162,7 +162,7 @@ class _Evaluation:
         egos = {layout: self.make_ego(layout) for layout in layouts}
         groups: dict[Any, list[PlannedTask]] = defaultdict(list)
         for plan in planned:
-            groups[tuple(_program(task, egos[task.layout], self.make_ego) for task in plan.played)].append(plan)
+            groups[tuple(_program_key(task, egos[task.layout], self.make_ego) for task in plan.played)].append(plan)
         stopped, make = Event(), self.make_ego if self.make_ego in SCRIPTED else egos.__getitem__
 
         def run(group: list[PlannedTask]) -> list[Result]:
@@ -184,7 +184,7 @@ class _Evaluation:
     ) -> list[Result]:
         """Return the results of a group of tasks that share compiled programs; an empty list if `stopped` is set."""
         returns, count = [], len(group) * len(self.seeds)
-        for episode in self._episodes(group, make_ego):
+        for episode in self._play_segments(group, make_ego):
             if stopped.is_set():
                 return []
             ego = episode.actions[..., EGO]
@@ -200,7 +200,7 @@ class _Evaluation:
             for plan, rows in zip(group, per_task, strict=True)
         ]
 
-    def _episodes(self, group: list[PlannedTask], make_ego: MakeEgo) -> Iterator[EpisodeBatch]:
+    def _play_segments(self, group: list[PlannedTask], make_ego: MakeEgo) -> Iterator[EpisodeBatch]:
         """Play all segments of a group of tasks. The egos keep their memory from one segment to the next."""
         lengths, prepared = segment_lengths(self.protocol, self.control), None
         for number, episodes in enumerate(lengths):
@@ -212,7 +212,7 @@ class _Evaluation:
             prepared = prepared._replace(state=state)
 
 
-def _program(task: Task, ego: Policy | HostPolicy, make_ego: MakeEgo) -> tuple[Any, ...]:
+def _program_key(task: Task, ego: Policy | HostPolicy, make_ego: MakeEgo) -> tuple[Any, ...]:
     """Return the key of the compiled program that plays a task; tasks with equal keys are played together."""
     kind, heuristic = task.teammate_kind, task.teammate["kind"] == "heuristic"
     if make_ego in SCRIPTED and heuristic:
@@ -292,7 +292,7 @@ def prepare_rollout(
     else:
         before = earlier.rollout
         is_same = rollout.layout == before.layout and np.array_equal(rollout.numbers, before.numbers)  # type: ignore[arg-type]
-        state = earlier.state if is_same else jax.jit(rollout.enter)(earlier.state)
+        state = earlier.state if is_same else jax.jit(rollout.move_to_layouts)(earlier.state)
     programs = Programs() if programs is None else programs
     return PreparedRollout(rollout, state, programs.episode(rollout, state))
 
@@ -375,15 +375,15 @@ class ControlledResults(NamedTuple):
     @property
     def memory(self) -> Float[np.ndarray, "U S"]:
         """M: return minus the return with the memory cleared before each episode, as the mean over all episodes."""
-        return (_returns(self.plain) - _returns(self.cleared)).mean(axis=-1)
+        return (_return_array(self.plain) - _return_array(self.cleared)).mean(axis=-1)
 
     @property
     def partner(self) -> Float[np.ndarray, "U S"]:
         """P: return in the last episodes minus the return in the same episodes after episodes with another teammate."""
-        return (_returns(self.plain) - _returns(self.swapped))[..., -self.last :].mean(axis=-1)
+        return (_return_array(self.plain) - _return_array(self.swapped))[..., -self.last :].mean(axis=-1)
 
 
-def _returns(results: Sequence[Result]) -> Float[np.ndarray, "U S E"]:
+def _return_array(results: Sequence[Result]) -> Float[np.ndarray, "U S E"]:
     return np.array([result.returns for result in results], np.float64)
 
 

@@ -224,7 +224,7 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
     by_layout: dict[str, list[Task]] = defaultdict(list)
     for task in tasks:
         by_layout[task.layout.name].append(task)
-    partner = {task.task_id: _partner(task, by_layout[task.layout.name]) for task in tasks}
+    partner = {task.task_id: _swap_partner(task, by_layout[task.layout.name]) for task in tasks}
     planned = []
     for task in tasks:
         chain = [task]
@@ -237,17 +237,17 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
     return planned
 
 
-def _partner(task: Task, on_layout: Sequence[Task]) -> Task:
-    def other_dish(other: Task) -> bool:
+def _swap_partner(task: Task, on_layout: Sequence[Task]) -> Task:
+    def has_other_dish(other: Task) -> bool:
         # If a task fixes the dish, the ego does not see it, so the partner has to want another dish as well.
         return task.recipes is None or other.recipes != task.recipes
 
     ids = [other.task_id for other in on_layout]
     following = [*on_layout[ids.index(task.task_id) + 1 :], *on_layout[: ids.index(task.task_id)]]
-    families = [other.teammate_family for other in following if other_dish(other)]
+    families = [other.teammate_family for other in following if has_other_dish(other)]
     if other_families := [family for family in families if family != task.teammate_family]:
         # The partner has the same number in the next family, so that tasks of a family get different partners.
-        partners = [one for one in on_layout if one.teammate_family == other_families[0] and other_dish(one)]
+        partners = [one for one in on_layout if one.teammate_family == other_families[0] and has_other_dish(one)]
         own = [one.task_id for one in on_layout if one.teammate_family == task.teammate_family]
         return partners[own.index(task.task_id) % len(partners)]
     behaviour = teammate_id(task.teammate), task.recipes

@@ -85,8 +85,8 @@ class EvaluationRollout:
     def env(self) -> Environment:
         """Environment of all layouts, with the recipes and the episode length of the protocol."""
         if isinstance(self.layout, Layout):
-            return Environment(_played(self.layout, self.protocol), self.protocol.steps)
-        return Environment([_played(one, self.protocol) for one in self.layout], self.protocol.steps)
+            return Environment(_protocol_layout(self.layout, self.protocol), self.protocol.steps)
+        return Environment([_protocol_layout(one, self.protocol) for one in self.layout], self.protocol.steps)
 
     @cached_property
     def teammate_params(self) -> Any:
@@ -101,7 +101,7 @@ class EvaluationRollout:
         """Return a state between two episodes in which the egos' memories are reset to those of a new task."""
         return state._replace(ego=self._begin(state.env.key), before=no_outcome(state.env.key.shape[0]))
 
-    def enter(self, state: RolloutState) -> RolloutState:
+    def move_to_layouts(self, state: RolloutState) -> RolloutState:
         """Return another rollout's state between two episodes, moved to the layouts of this rollout.
 
         Both rollouts are of the same tasks. Random keys, the number of the episode and the egos' memories are kept.
@@ -112,7 +112,7 @@ class EvaluationRollout:
 
     def _begin(self, keys: jax.Array) -> Any:
         """Return the egos' memories before the first episode."""
-        ego_keys = _fold_all(keys, EGO)
+        ego_keys = _fold_keys(keys, EGO)
         if isinstance(self.ego, HostPolicy):
             return self.ego.init(self.ego.params, ego_keys)
         return jax.vmap(self.ego.init, in_axes=(None, 0))(self.ego.params, ego_keys)
@@ -134,15 +134,15 @@ class EvaluationRollout:
         mate = self.teammates[0]
         # In each episode teammates start with a new memory, while egos keep theirs.
         keys = self.env.episode_key(state.env)
-        memories = jax.vmap(mate.init)(mate_params, _fold_all(keys, TEAMMATE))
-        ego_keys, mate_keys = _fold_all(keys, EGO_STEPS), _fold_all(keys, TEAMMATE_STEPS)
+        memories = jax.vmap(mate.init)(mate_params, _fold_keys(keys, TEAMMATE))
+        ego_keys, mate_keys = _fold_keys(keys, EGO_STEPS), _fold_keys(keys, TEAMMATE_STEPS)
 
         def step(carry: Any, t: Array) -> tuple[Any, Any]:
             state, memories, _ = carry
             now = state.env
-            mine, egos = self.ego_actions(ego_params, state, _fold_all(ego_keys, t))
+            mine, egos = self.ego_actions(ego_params, state, _fold_keys(ego_keys, t))
             theirs, memories = self.env.act(
-                mate, mate_params, memories, now, TEAMMATE, _fold_all(mate_keys, t), own=True
+                mate, mate_params, memories, now, TEAMMATE, _fold_keys(mate_keys, t), own=True
             )
             after = self.env.step(now, jnp.stack([mine, theirs], axis=-1))
             before = state.before._replace(
@@ -158,7 +158,7 @@ class EvaluationRollout:
 
 
 @lru_cache(maxsize=64)
-def _played(layout: Layout, protocol: Protocol) -> Layout:
+def _protocol_layout(layout: Layout, protocol: Protocol) -> Layout:
     """Return a layout with the recipes of the protocol, unless the task fixes the recipes."""
     published = LAYOUTS.get(layout.name)
     four = protocol.four_recipes and any(layout.name in names for names in TRACKS["layout"].values())
@@ -173,7 +173,7 @@ def no_outcome(batch: int) -> EgoInput:
     return EgoInput(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
 
 
-def _fold_all(keys: jax.Array, data: Any) -> jax.Array:
+def _fold_keys(keys: jax.Array, data: Any) -> jax.Array:
     return jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, data)
 
 

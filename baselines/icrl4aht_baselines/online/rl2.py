@@ -288,14 +288,14 @@ def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"])
         started: whether each step has a previous step in its task; if not, previous actions are fillers and stay 0.
     """
 
-    def seen(actions: Array) -> Array:
+    def view_actions(actions: Array) -> Array:
         return jnp.where(started, change.actions(actions), actions)
 
     mate = steps.prev_teammate_action
     return steps._replace(
         obs=change.observations(steps.obs),
-        prev_action=seen(steps.prev_action),
-        prev_teammate_action=None if mate is None else seen(mate),
+        prev_action=view_actions(steps.prev_action),
+        prev_teammate_action=None if mate is None else view_actions(mate),
     )
 
 

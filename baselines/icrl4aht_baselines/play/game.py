@@ -40,7 +40,7 @@ HUMAN = "human"
 _STREAMS = (EGO_STEPS, TEAMMATE_STEPS)
 
 
-class _ExchangedLayout(Layout):
+class _SwappedLayout(Layout):
     """Layout with the start cells of its two agents exchanged, for an ego that plays agent 1."""
 
     @cached_property
@@ -125,7 +125,7 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
     if name not in agent_names() and not Path(name).is_dir():
         raise unknown("partner", name, (HUMAN, *agent_names(), *tests))
     if slot != EGO:
-        layout = _ExchangedLayout(**{one.name: getattr(layout, one.name) for one in fields(Layout)})
+        layout = _SwappedLayout(**{one.name: getattr(layout, one.name) for one in fields(Layout)})
     return Partner(name, PolicyPlayer(find_agent(name).make(layout), layout, slot, is_ego=True))
 
 

@@ -415,7 +415,7 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
     for run in runs:
         same = [other for other in merged if (other.label, other.protocol) == (run.label, run.protocol)]
         fitting = [
-            other for other in same if _rules(other) == _rules(run) and not other.cells.keys() & run.cells.keys()
+            other for other in same if _rule_key(other) == _rule_key(run) and not other.cells.keys() & run.cells.keys()
         ]
         if not fitting:
             merged.append(replace(run, note=run.sources[0].folder) if same else run)
@@ -428,7 +428,7 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
     return merged
 
 
-def _rules(run: EvaluationRun) -> tuple[Any, ...]:
+def _rule_key(run: EvaluationRun) -> tuple[Any, ...]:
     """Return the settings that must be equal in merged runs: protocol, seeds, play mode, and encoder."""
     source = run.sources[0]
     playing = [source.detail(name) or False for name in ("acting", "sampled", "forget", "encoder")]

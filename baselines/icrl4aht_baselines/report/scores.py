@@ -284,13 +284,13 @@ def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellRetur
     axes = [(of.trainings, of.tasks, of.seeds) for of in (one, other)]
     common = [tuple(key for key in first if key in second) for first, second in zip(*axes, strict=True)]
 
-    def chosen(found: CellReturns, own: tuple[tuple[Any, ...], ...]) -> CellReturns:
+    def select_common(found: CellReturns, own: tuple[tuple[Any, ...], ...]) -> CellReturns:
         places = np.ix_(*([axis.index(key) for key in keys] for axis, keys in zip(own, common, strict=True)))
         blocks = {name: values[places] for name, values in found.blocks.items()}
         trainings, tasks, seeds = common
         return CellReturns(tasks, seeds, blocks, found.overlaps, trainings)
 
-    return chosen(one, axes[0]), chosen(other, axes[1])
+    return select_common(one, axes[0]), select_common(other, axes[1])
 
 
 def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellScales) -> list[ResultCell]:

@@ -252,7 +252,7 @@ def test_the_next_segment_starts_on_its_own_layouts():
 
     one, other = rollout(first[0].layout, None), rollout([second[0].layout, first[0].layout], np.array([0, 1]))
     before, expected = jax.jit(one.start)(keys), jax.jit(other.start)(keys)
-    state = jax.jit(other.enter)(before)
+    state = jax.jit(other.move_to_layouts)(before)
     np.testing.assert_array_equal(state.env.record, expected.env.record)
     np.testing.assert_array_equal(state.env.layout, [0, 1])
     assert not np.array_equal(state.env.record[0], before.env.record[0])
