@@ -103,7 +103,7 @@ def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
         carry, number = (state, buffer), number + 1
         jax.block_until_ready(total)
 
-    play()  # compiles
+    play()  # the first call compiles
     return play
 
 

@@ -217,7 +217,7 @@ def prepare_training(
 
     if method in PLAYING:
         if unused := {"size"} if size else UNUSED_BY_RL2 & (train.keys() | model.keys()):
-            raise click.UsageError(f"{_flags(unused)}: not with {method}, which learns by playing")
+            raise click.UsageError(f"{_flags(unused)}: cannot be used with {method}, which learns by playing")
         sized = ModelOptions(**RL2_SETTINGS["model"] | model)
         options = TrainOptions(**RL2_SETTINGS["train"] | train)
         tasks = [task for manifest in manifests for task in read_tasks_and_layouts(manifest)]
@@ -231,7 +231,7 @@ def prepare_training(
         )
         return job, text
     if given := {*play, *(["manifest"] if manifests else [])}:
-        raise click.UsageError(f"{_flags(given)}: not with {method}, only with rl2, which learns by playing")
+        raise click.UsageError(f"{_flags(given)}: cannot be used with {method}, only with rl2, which plays")
     on_cpu = jax.default_backend() == "cpu"
     name = size or ("tiny" if on_cpu else "small")
     sized = ModelOptions(**SIZES[name].model | model)
@@ -254,7 +254,7 @@ def check_conflicts(option: str, *others: str) -> None:
     """
     source = click.get_current_context().get_parameter_source
     if given := [name for name in others if source(name) is ParameterSource.COMMANDLINE]:
-        raise click.UsageError(f"{option}: not with {_flags(given)}, which it sets; leave one of them out")
+        raise click.UsageError(f"{option}: cannot be used with {_flags(given)}; leave one of them out")
 
 
 def _flags(names: Iterable[str]) -> str:

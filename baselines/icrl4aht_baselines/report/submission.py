@@ -184,11 +184,11 @@ def check_submission(found: Submission, where: str) -> None:
                 f"{part}: {len(missing)} of {named} are missing, such as {missing[0]}; evaluate all of them"
             )
         if len(tasks) > len(expected):
-            raise OptionError(f"{part}: results of a task twice, expected once; give each folder once")
+            raise OptionError(f"{part}: two results of a task, expected one; give each folder only once")
     if not found.update and not any(one.control == "" for one in found.evaluations):
         raise OptionError(
-            f"{where}: only controls or another way of playing, expected results of the agent itself; give their "
-            f"folder, too, or --update if the page has these"
+            f"{where}: only results of controls or of another play mode, expected results of the agent itself; give "
+            f"their folder as well, or --update if the page has them"
         )
 
 
@@ -207,7 +207,7 @@ def _check_name(found: Submission, where: str) -> None:
         ) from error
     if found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
         raise OptionError(
-            f"{where}: the agent {found.agent} has the name of another way of playing, which its folder shows; give a "
+            f"{where}: the agent {found.agent} has the name of another play mode, which its folder shows; give a "
             f"--name without it"
         )
 
@@ -217,7 +217,7 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
     try:
         protocol, seeds, code = (one.settings[name] for name in ("protocol", "seeds", "code_version"))
     except (KeyError, TypeError) as error:
-        raise OptionError(f"{where}: settings without {error}, expected those of `evaluate`") from error
+        raise OptionError(f"{where}: the settings have no {error}, expected those of `evaluate`") from error
     if code != version("icrl4aht-data"):
         raise OptionError(
             f"{where}: results of version {code}, expected {version('icrl4aht-data')}, the installed one: evaluate "

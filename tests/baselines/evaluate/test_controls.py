@@ -273,6 +273,6 @@ def test_controls_command(programs, tmp_path, monkeypatch):
     assert "track teammate, memory M: " in printed and "track teammate, partner P: " in printed
     for folder in ("run", "run/cleared", "run/swapped"):
         assert len(list((tmp_path / folder / "tasks").glob("*.json"))) == 2
-    assert "--controls: not with --forget" in run("run", "--controls", "--forget", code=2)
+    assert "--controls: cannot be used with --forget" in run("run", "--controls", "--forget", code=2)
     run("cleared", "--episodes", "4", "--forget")
     assert read_run(tmp_path / "cleared").table.equals(read_run(tmp_path / "run/cleared").table)
