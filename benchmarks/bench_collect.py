@@ -1,13 +1,13 @@
-"""Speed, memory and size on disk of collection: `make bench-collect`.
+"""Measure speed, memory and file sizes of the collection of histories: `make bench-collect`.
 
 One JSON line for each part:
 
-    noise   recorded transitions/s of noise histories, with writing and hashing, and the seconds to compile
-    speed   recorded transitions/s of the complete path (PPO, recording, writing), and the share of time for
+    noise   recorded transitions/s of noise histories, including writing and hashing, and the seconds to compile
+    speed   recorded transitions/s of a complete collection (PPO, recording, writing), and the share of time for
             recording and writing
-    memory  highest resident memory of a collection with the paper's 1024 environments and of its learner alone, each
-            in its own process
-    bytes   bytes per transition of the bundled histories, everything included: `lite` and `full` releases compared
+    memory  peak resident memory of a collection with the paper's 1024 environments, and of its learner without
+            recording, each measured in a separate process
+    bytes   bytes per transition of the bundled histories, including all files: `lite` and `full` releases compared
             with the paper's format (App. D.1: float32 observations, gzip-6, one group per history)
 """
 
@@ -55,7 +55,7 @@ _PAPER_DTYPES = {
 
 
 _NOISE = NoiseConfig(histories=64, episodes=100, finish=(0.5, 1.0))
-"""Settings of the noise histories to measure: 640,000 transitions."""
+"""Settings of the measured noise histories, which have 640,000 transitions."""
 
 
 class _EnoughError(Exception):
@@ -63,8 +63,8 @@ class _EnoughError(Exception):
 
 
 def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[str, float]:
-    """Return the timing of a collection of the profile's last heuristic task, stopped after `updates` updates."""
-    work = _first_heuristic(profile)
+    """Collect the profile's last heuristic task, but stop after `updates` updates. Return the timing."""
+    work = _last_heuristic_work(profile)
 
     def report(done: int, speed: float) -> None:
         if done == updates:
@@ -77,13 +77,13 @@ def collect_some(profile: Profile, updates: int, save_seconds: float) -> dict[st
         return last_timing(job.folder) or {}
 
 
-def _first_heuristic(profile: Profile) -> Work:
-    """Return the work of the profile's last task with heuristic teammates."""
+def _last_heuristic_work(profile: Profile) -> Work:
+    """Return the collection of the profile's last task with heuristic teammates, as a unit of work."""
     return replace(profile, presets=("default",)).units()[-1]
 
 
 def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:
-    """Return the speed of a collection that saves its state every two seconds, 15 times the usual rate."""
+    """Return the speed of a collection that saves its state every two seconds, 15 times as often as usual."""
     profile = load_profile(profile_name)
     timing = collect_some(profile, updates, save_seconds=2)
     return {
@@ -96,7 +96,7 @@ def collection_speed(profile_name: str, updates: int) -> dict[str, Any]:
 
 
 def noise_speed(layout: str) -> dict[str, Any]:
-    """Return the speed of a task of noise histories with H4, compiled by an earlier task."""
+    """Return the speed of collecting noise histories with an H4 teammate, after a first task for compilation."""
     profile = replace(load_profile("smoke"), noise=_NOISE, sources=("noise",))
     mate = heuristic_teammate("utility_greedy", "default", 0)
     tasks = [make_task(track_of(layout), "train", layout, mate, seed) for seed in range(2)]
@@ -112,7 +112,7 @@ def noise_speed(layout: str) -> dict[str, Any]:
 
 
 def collection_memory(updates: int) -> dict[str, Any]:
-    """Return the peak memory of a collection and of its learner alone, in MiB, each in its own process."""
+    """Return the peak memory in MiB of a collection, and of its learner without recording, in separate processes."""
     peaks = []
     for recording in (False, True):
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
@@ -121,14 +121,14 @@ def collection_memory(updates: int) -> dict[str, Any]:
 
 
 def peak_of_learning(updates: int, recording: bool) -> float:
-    """Return the peak MiB of this process after learning, or after collecting and saving at every update."""
+    """Return this process's peak memory in MiB after learning, or after collecting and saving at every update."""
     profile = load_profile("paper")
-    # The paper's number of streams and rollout length, with a network that is small enough to be fast.
+    # Memory depends on the paper's number of environments and rollout length, so a small, fast network is enough.
     profile = replace(profile, ego=replace(profile.ego, widths=Widths((4,), (4,), 8, 8, 8)))
     if recording:
         collect_some(profile, updates, save_seconds=0)
         return peak_memory()
-    learner = make_learner(_first_heuristic(profile).task, profile)
+    learner = make_learner(_last_heuristic_work(profile).task, profile)
     state, update = jax.jit(learner.init)(jax.random.key(0)), jax.jit(learner.update, donate_argnums=0)
     for _ in range(updates):
         state, *_ = jax.block_until_ready(update(state))
@@ -136,7 +136,7 @@ def peak_of_learning(updates: int, recording: bool) -> float:
 
 
 def transition_bytes(streams: int) -> dict[str, Any]:
-    """Return bytes per transition in all formats, measured on the first streams of each task of the bundled release."""
+    """Return the bytes per transition in each format, for the first `streams` histories of each bundled task."""
     dataset = load_icrl4aht(obs="uint8")
     chosen = [(task, dataset.filter(task_id=task.task_id)[:streams]) for task in read_tasks(dataset.root / TASKS)]
     new = [
@@ -159,7 +159,7 @@ def transition_bytes(streams: int) -> dict[str, Any]:
 
 
 def write_paper_format(root: Path, parts: list[Dataset]) -> None:
-    """Write one HDF5 file per layout, and the index."""
+    """Write histories in the paper's format: one HDF5 file per layout, and the index."""
     (root / "meta").mkdir(parents=True)
     for part in parts:
         with h5py.File(root / f"{part[0].entry.layout}.h5", "a") as file, (root / HISTORIES).open("a") as index:
@@ -183,7 +183,10 @@ PARTS_OF_COLLECTION = ("speed", "noise", "memory", "bytes")
 @click.option("--wide-updates", type=COUNT, default=4, show_default=True, help="Updates of the memory part.")
 @click.option("--streams", type=COUNT, default=8, show_default=True, help="Histories of each task in the bytes part.")
 def main(parts: tuple[str, ...], profile: str, updates: int, layout: str, wide_updates: int, streams: int) -> None:
-    """Measure speed, memory and bytes of a collection; one JSON line each. An update of memory has 262,144 steps."""
+    """Measure speed, memory and bytes of a collection, and print a JSON line for each part.
+
+    An update of the part `memory` has 262,144 environment steps.
+    """
     measures: dict[str, Callable[[], dict[str, Any]]] = {
         "speed": lambda: collection_speed(profile, updates),
         "noise": lambda: noise_speed(layout),

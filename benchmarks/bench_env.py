@@ -1,18 +1,19 @@
-"""Steps/s of environments and of learning in them compared with JaxMARL's OvercookedV2: `make bench-env`.
+"""Compare steps/s of environments, and of learning in them, with JaxMARL's OvercookedV2: `make bench-env`.
 
-    steps    environments alone
-    layouts  as many generated layouts as environments, compared with one layout and with JaxMARL's environment of it
-    ippo     JaxMARL's IPPO on our environment and on JaxMARL's own: `PEER=file`
+    steps    environments without learning
+    layouts  a different generated layout in each environment, compared with one layout, and with JaxMARL on one layout
+    ippo     JaxMARL's IPPO on our environment and on JaxMARL's environment: `PEER=file`
 
-In `steps` both run the same jitted loop with random actions and auto-reset, which writes both agents' observations of
-every step into a donated buffer. One JSON line per layout, number of environments, and content of the buffer:
+In the part `steps`, both environments run in the same compiled loop with random actions and automatic resets, which
+writes both agents' observations in every step into a donated buffer. One JSON line is printed for each layout, number
+of environments, and content of the buffer:
 
-    uint8    observations as uint8 (the peer's int32 ones are cast as they are written)
+    uint8    observations as uint8 (JaxMARL's int32 observations are converted)
     float32  observations as float32
-    state    our state records, for observations rendered on use; the peer's observations as uint8
+    state    our state records, from which observations can be rendered later; JaxMARL's observations as uint8
 
-In `ippo` JaxMARL's learner (a copy of `ippo_rnn_overcooked_v2.py`) does 10 updates, compiled with either
-environment, see `benchmarks.peers`. Its network takes most of the time, so a faster environment gains less.
+In the part `ippo`, JaxMARL's learner (a copy of `ippo_rnn_overcooked_v2.py`) makes 10 updates with either environment,
+see `benchmarks.peers`. The learner's network takes most of the time, so a faster environment has less effect.
 """
 
 from __future__ import annotations
@@ -37,20 +38,20 @@ from icrl4aht_data.commands.options import COUNT
 from icrl4aht_data.overcooked.layouts import Layout, get_layout
 
 _LAYOUTS = ("coord_simple", "coord_ring", "demo_wide")
-_ONE = "asymm_both"  # the layout that many layouts are compared with
+_ONE = "asymm_both"  # layout for comparison in the part `layouts`
 ENVIRONMENTS = (64, 1024)
 WRITTEN = ("uint8", "state", "float32")
-STEPS = 51_200  # per call, summed over environments
-UPDATES = 10  # of the learner, per call
+STEPS = 51_200  # total steps of all environments per measured call
+UPDATES = 10  # updates of the learner per measured call
 
 StepEnvironments = Callable[[Any, Any, Any], tuple[Any, Any, Any]]
-"""(key, state, actions int32 (N, 2)) -> state, array to write (N, ...), reward float32 (N,)."""
+"""Function from (key, state, actions int32 (N, 2)) to (state, array to write (N, ...), reward float32 (N,))."""
 
 
 def our_game(
     layout: Layout | Sequence[Layout], n: int, written: str, canonical: bool = False
 ) -> tuple[Any, StepEnvironments]:
-    """Return the initial state and the step function of n of our environments, on one layout or on several."""
+    """Return the initial state and the step function of n environments of this project, on one or several layouts."""
     env = Environment(layout)
 
     def step(key, state, actions):
@@ -64,7 +65,7 @@ def our_game(
 
 
 def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironments]:
-    """Return the initial state and the step function of n of JaxMARL's environments."""
+    """Return the initial state and the step function of n JaxMARL environments on one layout."""
     env = jaxmarl_environment(layout)
     dtype = jnp.float32 if written == "float32" else jnp.uint8
 
@@ -78,7 +79,7 @@ def peer_game(layout: Layout, n: int, written: str) -> tuple[Any, StepEnvironmen
 
 
 def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
-    """Return a compiled call that plays `STEPS` steps with random actions; each call continues the previous one."""
+    """Return a compiled function that plays `STEPS` steps with random actions, continuing from its previous call."""
     state, step = game
     steps = STEPS // n
 
@@ -102,14 +103,14 @@ def rollout(game: tuple[Any, StepEnvironments], n: int) -> Callable[[], None]:
         carry, number = (state, buffer), number + 1
         jax.block_until_ready(total)
 
-    play()  # compiles
+    play()  # the first call compiles
     return play
 
 
 def print_layouts(n: int, rounds: int) -> None:
-    """Print the speed of n environments on n generated layouts, on one layout, and of JaxMARL's on that layout.
+    """Print the speed of n environments on n generated layouts, on one layout, and of JaxMARL on that layout.
 
-    Canonical observations are written, which are larger than the one layout's own.
+    Observations have the canonical channels, which are more than the channels of the one layout.
     """
     one = get_layout(_ONE)
     many = generate_layouts("templates", 0, n // 2) + generate_layouts("rooms", 0, n - n // 2)
@@ -143,7 +144,7 @@ def main(
     peer: Path | None,
     steps: int,
 ) -> None:
-    """Compare steps/s of environments, or of learning in them, with JaxMARL's; one JSON line per setting."""
+    """Compare steps/s of environments, or of learning in them, with JaxMARL; print one JSON line per setting."""
     if peer is None:
         print_layouts(max(environments), rounds)
     for layout, n in itertools.product(map(get_layout, layouts), environments):

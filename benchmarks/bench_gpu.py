@@ -1,22 +1,22 @@
-"""Speed of learning, training and evaluation on a GPU: `make bench-gpu`. On a CPU, sizes are tiny, for testing.
+"""Measure the speed of learning, training and evaluation on a GPU: `make bench-gpu`. On a CPU, sizes are tiny.
 
-    device     facts on machine, software and settings
+    device     machine, software and settings
     product    TFLOP/s of one large matrix product; float32 products use TF32 on a GPU by default, see `measure_product`
-    learner    steps/s of an ego's PPO with teammate H4: 1,024 environments, the paper's network and minibatches
-    train      training step of AD (B = 1024, L = 500 for the paper's small), and seconds waited for the loader
-    loader     batches/s alone, from the bundled release to the device
-    act        the evaluator's steps/s with cached acting, on the tasks of one layout
-    attention  forward and backward pass of attention as in training, compared with JAX's and cuDNN's
+    learner    steps/s of PPO training of an ego with teammate H4, with the paper's network, in 1,024 environments
+    train      seconds of an AD training step (B = 1024, L = 500 for the paper's small size), and wait for the loader
+    loader     batches/s from the bundled release to the device, without training
+    act        steps/s of the evaluator with cached acting, on the tasks of one layout
+    attention  time of attention in training (forward and backward), compared with attention of JAX and cuDNN
 
-One JSON line for each case. Cases run in a child process, after each failure in a new one. At the time limit the
-running case is stopped and the others are skipped, each with a line. Learners run in a separate process, with XLA's
-deterministic operations, as in `generate`. Models are untrained.
+One JSON line is printed for each case. Cases run in a child process, and in a new one after each failure. At the time
+limit, the running case is stopped and the other cases are skipped, each with a line. Learners run in a separate process
+with XLA's deterministic operations, as in `generate`. Models are untrained.
 
-`mfu` is the model FLOP utilisation: the operations of the matrix products in the traced program
-(`benchmarks.harness.product_flops`, backward pass included) per second of step time, divided by the speed of the large
-product with the same dtype. With `words` in training, equal observations are computed once, but the operations are
-counted as if all observations of a batch differed. `program_gib` is what the compiler planned for one program,
-`process_peak_gib` the highest use so far, `accumulate` the number of parts of a batch that does not fit into memory.
+`mfu` is the model FLOP utilisation: matrix-product operations per second of a step, including the backward pass, see
+`benchmarks.harness.product_flops`, divided by the speed of the large product with the same dtype. The encoder `words`
+computes equal observations of a batch once, but its operations are counted as if all observations differed.
+`program_gib` is the memory that the compiler planned for a program, `process_peak_gib` the process's peak memory, and
+`accumulate` the number of parts that a batch is divided into to fit into memory.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from typing import Any
 import click
 import jax
 import jax.numpy as jnp
-from icrl4aht_baselines.agents.egos import learned
+from icrl4aht_baselines.agents.egos import trained_policy
 from icrl4aht_baselines.evaluate.evaluator import play_episodes, prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.methods.attention import causal_attention
@@ -67,17 +67,17 @@ _OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of all measurements.
+    """Sizes and durations of all measurements.
 
     Attributes:
-        product: rows and columns of the matrices of the large product.
-        ppo: environments, roll-out and minibatches of the learner.
-        batch: B of training.
-        length: L in training and K in acting, at most.
-        shrunk: size name -> values that replace those of `SIZES`.
+        product: number of rows and columns of the matrices in the large product.
+        ppo: environments, rollout length and minibatches of the learner.
+        batch: B, batch size in training.
+        length: upper limit of L in training and of K in acting.
+        shrunk: name of a model size -> values that replace those of `SIZES`.
         episode_steps: steps of an episode in acting.
         tasks: largest number of tasks in acting.
-        seconds: minimum time of a measurement, after compiling.
+        seconds: minimum duration of a measurement, after compilation.
     """
 
     product: int
@@ -90,7 +90,7 @@ class Sizes:
     seconds: float
 
     def mfu(self, flops: float, seconds: float, dtype: str) -> float:
-        """Return the speed `flops / seconds` as a share of that of the large product."""
+        """Return the model FLOP utilisation: `flops / seconds` relative to the speed of the large product."""
         return round(flops / seconds / product_tflops(self.product, dtype, None, self.seconds / 4) / 1e12, 4)
 
 
@@ -117,19 +117,19 @@ SMALL_SIZES = Sizes(
 
 
 def device_memory() -> dict[str, float]:
-    """Return GiB of device memory: in use, peak of this process, and limit; empty on a CPU."""
+    """Return the device memory in GiB: in use, peak of this process, and limit; empty on a CPU."""
     found = jax.local_devices()[0].memory_stats() or {}
     names = {"bytes_in_use": "in_use_gib", "peak_bytes_in_use": "process_peak_gib", "bytes_limit": "limit_gib"}
     return {name: gib(found[key]) for key, name in names.items() if key in found}
 
 
 def gib(count: int) -> float:
-    """Return a number of bytes in GiB."""
+    """Convert a number of bytes to GiB."""
     return round(count / 2**30, 3)
 
 
 def seconds_of_calls(call: Callable[[], Any], seconds: float, least: int = 3) -> list[float]:
-    """Return the seconds of repeated calls until `seconds` have passed, without the first call."""
+    """Return the durations of repeated calls, after a first call for warm-up, until `seconds` have passed."""
     jax.block_until_ready(call())
     found: list[float] = []
     while len(found) < least or sum(found) < seconds:
@@ -139,18 +139,18 @@ def seconds_of_calls(call: Callable[[], Any], seconds: float, least: int = 3) ->
 
 @cache
 def product_tflops(size: int, dtype: str, precision: str | None, seconds: float) -> float:
-    """Return the TFLOP/s of the product of two normally distributed square matrices."""
+    """Return the TFLOP/s of the product of two random square matrices."""
     one, two = jax.random.normal(jax.random.key(0), (2, size, size), dtype)
     multiply = jax.jit(partial(jnp.matmul, precision=precision))
 
-    def several() -> Any:
-        return [multiply(one, two) for _ in range(5)]  # makes the overhead of a call negligible
+    def multiply_repeatedly() -> Any:
+        return [multiply(one, two) for _ in range(5)]  # five products per call, so that overhead is negligible
 
-    return 5 * 2 * size**3 / min(seconds_of_calls(several, seconds)) / 1e12
+    return 5 * 2 * size**3 / min(seconds_of_calls(multiply_repeatedly, seconds)) / 1e12
 
 
 def describe_device(sizes: Sizes) -> dict[str, Any]:
-    """Return facts on machine, software and settings."""
+    """Return facts about machine, software and settings."""
     devices = jax.devices()
     root = Path(__file__).resolve().parent
     commit = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
@@ -178,7 +178,7 @@ def measure_product(sizes: Sizes) -> dict[str, Any]:
 
 
 def measure_learner(sizes: Sizes, encoder: EncoderKind) -> dict[str, Any]:
-    """Measure environment steps/s of an ego's updates with teammate H4."""
+    """Measure environment steps/s of PPO updates of an ego with teammate H4."""
     learner = ego_learner(sizes, encoder)
     config = learner.config
     state = jax.jit(learner.init)(jax.random.key(0))
@@ -205,7 +205,7 @@ def measure_learner(sizes: Sizes, encoder: EncoderKind) -> dict[str, Any]:
 
 
 def measure_training(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> dict[str, Any]:
-    """Measure training steps of AD, in as many parts (`accumulate`) as the memory requires."""
+    """Measure training steps of AD; a batch is divided into more parts (`accumulate`) until it fits into memory."""
     parts, reason = 1, ""
     while sizes.batch % parts == 0:
         try:
@@ -214,7 +214,7 @@ def measure_training(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) 
             if not isinstance(error, MemoryError) and _OUT_OF_MEMORY not in str(error):
                 raise
             reason = str(error)
-        parts *= 2  # outside the except block, which keeps the failed attempt's arrays alive
+        parts *= 2  # not in the except block, where the arrays of the failed attempt are still in memory
     raise MemoryError(f"no number of parts fits: {reason}")
 
 
@@ -230,7 +230,7 @@ def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, p
         program = compile_measured(trainer.step, state, batch)
         limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", program.bytes)
         if program.bytes > limit:
-            raise MemoryError(f"{gib(program.bytes)} GiB in {parts} parts, of {gib(limit)}")
+            raise MemoryError(f"needs {gib(program.bytes)} GiB in {parts} parts, expected at most {gib(limit)}")
 
         def step(take: Callable[[], Any]) -> Any:
             nonlocal state
@@ -260,7 +260,7 @@ def _training_steps(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str, p
 
 
 def measure_loader(sizes: Sizes, size: str) -> dict[str, Any]:
-    """Measure seconds per batch of state records from the bundled release to the device."""
+    """Measure the seconds per batch for loading state records from the bundled release to the device."""
     device = jax.devices()[0]
     sampler = load_icrl4aht(split="train", source="ppo", layout=_LAYOUT, obs="state").ad(
         batch_size=sizes.batch, length=context_length(sizes, size), seed=0
@@ -276,19 +276,19 @@ def measure_loader(sizes: Sizes, size: str) -> dict[str, Any]:
 
 
 def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) -> dict[str, Any]:
-    """Measure the evaluator's steps/s with full windows: over all streams (tasks times seeds), and per stream."""
+    """Measure the evaluator's speed with full windows: steps/s of all tasks and seeds, and milliseconds per step."""
     context = context_length(sizes, size)
     layout = get_layout(_LAYOUT)
     tasks = h4_tasks()[: sizes.tasks]
     method = ad_method(architecture(sizes, size, encoder, "float32"), [layout])
-    policy = learned(method, method.init(jax.random.key(0)), context)
+    policy = trained_policy(method, method.init(jax.random.key(0)), context)
     protocol = replace(PROTOCOLS["seeded"], steps=sizes.episode_steps, episodes=sys.maxsize)
     started = time.perf_counter()
     prepared = prepare_rollout(lambda layout: policy, tasks, protocol, range(seeds))
     compile_seconds = time.perf_counter() - started
     episodes = play_episodes(prepared)
     filling, shortest = -(-context // sizes.episode_steps), 2 * -(-context // 5 // sizes.episode_steps)
-    for _ in islice(episodes, filling):  # from here on the oldest fifth is dropped regularly
+    for _ in islice(episodes, filling):  # fills the windows; then a fifth of a window is dropped regularly
         pass
     seconds = seconds_of_calls(partial(next, episodes), sizes.seconds, least=max(3, shortest))
     streams, episode_seconds = len(tasks) * seeds, statistics.mean(seconds)
@@ -303,7 +303,7 @@ def measure_acting(sizes: Sizes, size: str, encoder: EncoderKind, seeds: int) ->
 
 
 def measure_attention(sizes: Sizes) -> dict[str, Any]:
-    """Measure milliseconds of attention (forward and backward, bfloat16): our implementation, JAX's and cuDNN's."""
+    """Measure milliseconds of attention (forward and backward, bfloat16) with our implementation, JAX and cuDNN."""
     small = SIZES["small"]
     shape = (sizes.batch, sizes.length, small.heads, small.width // small.heads)
     q, k, v = jax.random.normal(jax.random.key(0), (3, *shape), jnp.bfloat16)
@@ -319,7 +319,7 @@ def measure_attention(sizes: Sizes) -> dict[str, Any]:
         try:
             seconds = seconds_of_calls(partial(gradient, q, k, v), sizes.seconds / 4)
             facts[f"{name}_milliseconds"] = round(1e3 * statistics.median(seconds), 4)
-        except Exception as error:  # cuDNN is missing, too old or refuses the shape
+        except Exception as error:  # cuDNN may be missing or too old, or may not support the shape
             if name == "models":
                 raise
             facts[f"{name}_error"] = short_message(error)
@@ -333,29 +333,29 @@ def h4_tasks() -> list[Task]:
 
 
 def ego_learner(sizes: Sizes, encoder: EncoderKind) -> Learner:
-    """Return the learner of an ego with teammate H4 and the paper's network, except for its encoder."""
+    """Return the learner of an ego with teammate H4, with the paper's network but the given encoder."""
     config = replace(PPOConfig(), widths=Widths(encoder=encoder), **sizes.ppo)
     return heuristic_learner(get_layout(_LAYOUT), config)
 
 
 def architecture(sizes: Sizes, size: str, encoder: EncoderKind, dtype: str) -> ModelOptions:
-    """Return AD's architecture for a size name."""
+    """Return AD's architecture for the name of a model size."""
     changes = {**sizes.shrunk.get(size, {}), "encoder": encoder, "bfloat16": dtype == "bfloat16"}
     return size_options(size, **changes)
 
 
 def ad_method(model: ModelOptions, layouts: Sequence[Layout]) -> Method:
-    """Return AD for batches of state records of these layouts."""
+    """Return the method AD for batches of state records on some layouts."""
     return get_method("ad")(model, overcooked_world(layouts, model.encoder))
 
 
 def context_length(sizes: Sizes, size: str) -> int:
-    """Return L in training and K in acting of a size of AD."""
+    """Return AD's window length, which is L in training and K in acting, for the name of a model size."""
     return min(sizes.length, SIZES[size].context)
 
 
 def short_message(error: BaseException) -> str:
-    """Return an error's class and the start of its message."""
+    """Return text with an error's class and the start of its message."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]
 
 
@@ -378,13 +378,13 @@ CASES: dict[str, Callable[[Sizes], dict[str, Any]]] = {
     "act/tiny/16": partial(measure_acting, size="tiny", encoder="mlp", seeds=16),
     "attention": measure_attention,
 }
-"""Return the cases by name ("part" or "part/..") in running order, least important last."""
+"""Name of a case, "part" or "part/..", -> function that measures it, in running order, least important last."""
 
 PARTS = tuple(dict.fromkeys(name.split("/")[0] for name in CASES))
 
 
 def run_here(names: Sequence[str], make_sizes: Callable[[], Sizes]) -> bool:
-    """Run cases in this process until one fails, print their lines, and return whether all succeeded."""
+    """Run cases in this process until one fails, and print a line for each. Return whether all succeeded."""
     for name in names:
         try:
             facts = CASES[name](make_sizes())
@@ -396,7 +396,7 @@ def run_here(names: Sequence[str], make_sizes: Callable[[], Sizes]) -> bool:
 
 
 def print_case(case: str, facts: Mapping[str, Any]) -> None:
-    """Print the line of a case."""
+    """Print the JSON line of a case."""
     print_line(**{"benchmark": "gpu", "case": case, **facts})
     sys.stdout.flush()
 
@@ -412,13 +412,13 @@ def print_case(case: str, facts: Mapping[str, Any]) -> None:
 def main(
     parts: tuple[str, ...], cases: tuple[str, ...], minutes: float, case_minutes: float, here: bool, **settings: Any
 ) -> None:
-    """Measure the speed of learning, training and evaluation on a GPU; one JSON line for each case."""
+    """Measure the speed of learning, training and evaluation on a GPU, and print a JSON line for each case."""
     started = time.monotonic()
     names = [name for name in CASES if (name in cases if cases else name.split("/")[0] in parts)]
     learning = [name for name in names if name.startswith("learner/")]
     if here:
         if learning == names:
-            request_determinism()  # the same flag as in `generate`
+            request_determinism()  # deterministic operations, as in `generate`
         sys.exit(0 if run_here(names, partial(chosen_sizes, **settings)) else 1)
     failures = 0
     for _, group in groupby(names, key=lambda name: name in learning):
@@ -434,22 +434,22 @@ def main(
 
 
 def child_environment() -> dict[str, str]:
-    """Return environment variables of child processes, which let JAX use more than three quarters of GPU memory."""
-    names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX refuses the two variables together
+    """Return the environment variables of child processes, which let JAX use 92 % of the GPU memory."""
+    names = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")  # JAX accepts only one of both
     return {**os.environ, **({} if any(name in os.environ for name in names) else {names[0]: "0.92"})}
 
 
 def chosen_sizes(small: bool, seconds: float | None) -> Sizes:
-    """Return the benchmark's sizes: small on request or on a CPU. Initialises JAX."""
+    """Return the sizes of the measurements, which are small on request or on a CPU. This call initialises JAX."""
     sizes = FULL_SIZES
     if small or jax.default_backend() == "cpu":
         sizes = SMALL_SIZES
-        jax.config.update("jax_disable_most_optimizations", True)  # otherwise nearly all of the time is compilation
+        jax.config.update("jax_disable_most_optimizations", True)  # otherwise compilation takes nearly all of the time
     return replace(sizes, seconds=sizes.seconds if seconds is None else seconds)
 
 
 def child_options(names: Sequence[str], small: bool, seconds: float | None) -> list[str]:
-    """Return the command-line options of a child process that measures cases under the same settings."""
+    """Return the command-line options of a child process that measures some cases with the same settings."""
     options = [word for name in names for word in ("--case", name)]
     options += ["--seconds", str(seconds)] if seconds is not None else []
     return options + ["--small"] * small

@@ -1,13 +1,13 @@
-"""Speed of learning: `make bench-learn`.
+"""Measure the speed of learning and evaluation: `make bench-learn`.
 
-    ego      steps/s of an ego with teammate H4 by profile, compared with the first profile
-    jaxmarl  self-play with the paper's network compared with JaxMARL's recurrent IPPO: `PEER=file`, see `peers`
-    ad       AD's training on state records by encoder, compared with the paper's encoder on float32 observations from
-             a reader of the published format
-    act      the evaluator's steps/s with `cached` acting, compared with `exact` acting
-    tasks    minutes of all 160 test tasks with `cached` acting, compiling included
+    ego      steps/s of PPO training of an ego with teammate H4, for each profile compared with the first profile
+    jaxmarl  steps/s of self-play with the paper's network, compared with JaxMARL's recurrent IPPO: `PEER=file`
+    ad       transitions/s of AD training on state records, for each encoder compared with the paper's encoder on
+             float32 observations from a reader of the published format
+    act      steps/s of the evaluator with `cached` acting, compared with `exact` acting
+    tasks    minutes to evaluate all 160 test tasks with `cached` acting, including compilation
 
-One JSON line each. Models are untrained, since speed does not depend on their weights.
+One JSON line is printed for each measurement. Models are untrained, since speed does not depend on the parameters.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any, get_args
 import click
 import jax
 import numpy as np
-from icrl4aht_baselines.agents.egos import Acting, PlayMode, learned
+from icrl4aht_baselines.agents.egos import Acting, PlayMode, trained_policy
 from icrl4aht_baselines.evaluate.evaluator import evaluate, play_episodes, prepare_rollout
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS, Protocol
 from icrl4aht_baselines.methods.ad import dropped_steps
@@ -55,18 +55,18 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.sampling.ad import ADBatch, ADSampler
 from icrl4aht_data.writing.published import FROM_PUBLISHED, to_published
 
-_UPDATES, _PEER_UPDATES = 3, 2  # per measured call
+_UPDATES, _PEER_UPDATES = 3, 2  # updates per measured call
 _print = partial(print_line, "learn")
 
 
 def heuristic_learner(layout: Layout, config: PPOConfig) -> Learner:
-    """Return an ego with these hyper-parameters and teammate H4."""
+    """Return the learner of an ego with teammate H4 and the given hyper-parameters."""
     mate = build_teammate(layout, heuristic_teammate("utility_greedy", "default", 0), noise="seeded")
     return Learner(Environment(layout), mate, config)
 
 
 def ego_updates(layout: Layout, config: PPOConfig) -> Callable[[], None]:
-    """Return a compiled call of `_UPDATES` updates of an ego, which waits for the result."""
+    """Return a compiled function that makes `_UPDATES` updates of an ego and waits for the result."""
     learner = heuristic_learner(layout, config)
     update, state = compiled_update(learner), jax.jit(learner.init)(jax.random.key(0))
 
@@ -81,7 +81,7 @@ def ego_updates(layout: Layout, config: PPOConfig) -> Callable[[], None]:
 
 
 def compare_egos(layout: Layout, configs: dict[str, PPOConfig], rounds: int) -> None:
-    """Print steps/s of every profile's ego, and the ratio to the first profile."""
+    """Print steps/s of training an ego with each profile, and the ratio to the first profile."""
     ways = {name: ego_updates(layout, config) for name, config in configs.items()}
     steps = {name: _UPDATES * config.steps_per_update for name, config in configs.items()}
     rates, first = rates_in_turn(ways, steps, rounds), next(iter(configs))
@@ -92,7 +92,7 @@ def compare_egos(layout: Layout, configs: dict[str, PPOConfig], rounds: int) -> 
 
 
 def compare_jaxmarl(script: Path, layout: Layout, environments: int, rounds: int) -> None:
-    """Print steps/s of our self-play (the paper's network, encoder `words`), and the ratio to JaxMARL's."""
+    """Print steps/s of our self-play (the paper's network, encoder `words`), and the ratio to JaxMARL."""
     from benchmarks.peers import jaxmarl_environment, jaxmarl_training  # only this part needs JaxMARL
 
     config = PPOConfig(environments=environments, rollout=64, minibatches=min(environments, 8), warmup=0.05)
@@ -113,9 +113,9 @@ def compare_jaxmarl(script: Path, layout: Layout, environments: int, rounds: int
 
 
 def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
-    """Yield a sampler's windows as batches, read as in the published code.
+    """Yield the windows of a sampler as batches that are read as in the published code.
 
-    Values of the step before a window stay 0, since speed does not depend on them.
+    The step before a window has zeros instead of its values, since speed does not depend on them.
     """
     number = {int(history): k for k, history in enumerate(sampler.dataset.ids)}
     read, i = published_reader(folder, sampler.length), 0
@@ -136,12 +136,12 @@ def published_batches(folder: Path, sampler: ADSampler) -> Iterator[ADBatch]:
 
 
 def size_options(size: str, **changes: Any) -> ModelOptions:
-    """Return AD's architecture for a size name."""
+    """Return AD's architecture for the name of a model size."""
     return ModelOptions(**SIZES[size].model | changes)
 
 
 def training_steps(trainer: Trainer, batches: Iterator[Any], steps: int) -> Callable[[], None]:
-    """Return a compiled call of several training steps, which waits for each step."""
+    """Return a compiled function that makes several training steps and waits for each of them."""
     state = trainer.init()
 
     def run(count: int = steps) -> None:
@@ -156,7 +156,7 @@ def training_steps(trainer: Trainer, batches: Iterator[Any], steps: int) -> Call
 def compare_training(
     dataset: Dataset, size: str, encoders: Sequence[EncoderKind], options: TrainOptions, steps: int, rounds: int
 ) -> None:
-    """Print transitions/s of AD by encoder, and the ratio to the paper's encoder on the published format."""
+    """Print transitions/s of AD training for each encoder, and the ratio to the paper's encoder and data format."""
     sampler = dataset.ad(batch_size=options.batch_size, length=options.context, seed=1)
     ways: dict[str, Callable[[], None]] = {}
     loaders = {}
@@ -179,18 +179,18 @@ def compare_training(
 
 
 def untrained_ad(layout: Layout, size: str, acting: Acting) -> Policy:
-    """Return an ego that acts by an untrained AD model."""
+    """Return an untrained AD model as an ego."""
     model = size_options(size)
     method = get_method("ad")(model, overcooked_world([layout], model.encoder))
-    return learned(method, method.init(jax.random.key(0)), SIZES[size].context, PlayMode(acting))
+    return trained_policy(method, method.init(jax.random.key(0)), SIZES[size].context, PlayMode(acting))
 
 
 def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -> Callable[[], None]:
-    """Return a compiled call that plays one episode of every task with a full window."""
+    """Return a compiled function that plays one episode of every task with full windows."""
     protocol = replace(PROTOCOLS["seeded"], steps=steps, episodes=sys.maxsize)
     policy = untrained_ad(tasks[0].layout, size, acting)
     episodes = play_episodes(prepare_rollout(lambda layout: policy, tasks, protocol))
-    # Exact acting always computes all K positions, cached acting only the positions in the window.
+    # Windows must be full for cached acting, because exact acting always computes all K positions.
     for _ in range(-(-SIZES[size].context // steps) if acting == "cached" else 1):
         next(episodes)
     return lambda: jax.block_until_ready(next(episodes))
@@ -199,7 +199,7 @@ def acting_steps(tasks: Sequence[Task], size: str, acting: Acting, steps: int) -
 def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int) -> None:
     """Print steps/s of cached acting on some tasks of a layout, and the ratio to exact acting."""
     tasks = [task for task in published_tasks(track_of(layout.name)) if task.layout == layout][:most]
-    dropped = dropped_steps(SIZES[size].context)  # steps between two computations of a full window
+    dropped = dropped_steps(SIZES[size].context)  # number of steps after which the window is computed again
     lengths: dict[Acting, int] = {"cached": dropped * -(-10 * steps // dropped), "exact": steps}
     ways = {acting: acting_steps(tasks, size, acting, n) for acting, n in lengths.items()}
     rates = rates_in_turn(ways, {acting: n * len(tasks) for acting, n in lengths.items()}, rounds)
@@ -207,7 +207,7 @@ def compare_acting(layout: Layout, size: str, steps: int, rounds: int, most: int
 
 
 def evaluate_all_tasks(size: str, protocol: Protocol) -> None:
-    """Print the minutes for all test tasks with one untrained AD per layout, including compilation."""
+    """Print the minutes to evaluate all test tasks with an untrained AD model per layout, including compilation."""
     tasks = [task for track in TRACKS for task in published_tasks(track)]
     seconds = elapsed(lambda: evaluate("AD", lambda layout: untrained_ad(layout, size, "cached"), tasks, protocol))
     _print(part="tasks", size=size, tasks=len(tasks), episodes=protocol.episodes, minutes=round(seconds / 60, 2))
@@ -244,13 +244,13 @@ def main(
     encoders: tuple[EncoderKind, ...],
     **numbers: int,
 ) -> None:
-    """Measure the speed of learning egos and of training and playing sequence models; one JSON line each."""
+    """Measure the speed of training egos and of training and evaluating sequence models; print JSON lines."""
     if "jaxmarl" in parts and not peer:
         raise click.UsageError("--part jaxmarl: expected --peer FILE, a copy of JaxMARL's ippo_rnn_overcooked_v2.py")
     parts, here = parts or tuple(part for part in PARTS_OF_LEARNING if peer or part != "jaxmarl"), get_layout(layout)
     loaded = {profile.name: profile for profile in map(load_profile, profiles)}
     threads = [profile.xla_threads for profile in loaded.values() if profile.xla_threads]
-    if threads and set(parts) == {"ego"}:  # sequence models use all cores
+    if threads and set(parts) == {"ego"}:  # other parts need all cores
         limit_xla_threads(threads[-1])
     if "ego" in parts:
         compare_egos(here, {name: profile.ego for name, profile in loaded.items()}, rounds)

@@ -1,13 +1,14 @@
-"""Windows/s with every cache compared with two readers of the published format: `make bench-loader`.
+"""Compare the loader's windows/s with two readers of the published format: `make bench-loader`.
 
-All read the same histories (bundled ones, rotated by complete episodes) and make the same windows:
+All readers make the same windows of the same histories, which are bundled histories rotated by complete episodes:
 
     published   h5py, float32 gzip-6, chunks of 4096, slices merged per history, 512 MB chunk cache, one thread
     fair        the same data in chunks of 500, read_direct into a preallocated batch
-    ours        ram, mmap, stream (with and without decoded chunks kept); states, uint8, float32; batch buffers reused
+    ours        caches ram, mmap and stream (with and without decoded chunks in memory); state records, uint8 and
+                float32 observations; batch buffers are reused
 
-Readers take turns, round by round. One JSON line for each of our readers, with the ratio to both peers and our target
-ratio.
+Readers take turns in rounds. One JSON line is printed for each of our readers and each peer, with the ratio of both and
+our target ratio to the reader `published`.
 """
 
 from __future__ import annotations
@@ -39,17 +40,17 @@ _AIMS = {("ram", "state"): 8000, ("ram", "uint8"): 400, ("ram", "float32"): 200}
 
 CACHES = ("ram", "mmap", "stream", "stream, nothing kept")
 REPEATS = {"state": 10, "uint8": 3, "float32": 3}
-"""Form of observations -> batches per round, of which the median is reported."""
+"""Form of observations -> number of batches per round, whose median time is used."""
 
 
 _READ = ("obs", "actions", "rewards", "dones")
 
 ReadWindows = Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]]
-"""(histories int (B,), starts int (B,)) -> field -> windows (B, L, ...)."""
+"""Function from (histories int (B,), starts int (B,)) to field -> windows (B, L, ...)."""
 
 
 def published_reader(folder: Path, length: int) -> ReadWindows:
-    """Return a reader as in the published code: one slice for overlapping windows, cut and stacked."""
+    """Return a reader as in the published code, which reads one slice for overlapping windows and cuts it."""
     file = h5py.File(folder / HISTORIES_H5, "r", rdcc_nbytes=512 * 2**20)
 
     def read(ids: np.ndarray, starts: np.ndarray) -> dict[str, np.ndarray]:
@@ -75,7 +76,7 @@ def published_reader(folder: Path, length: int) -> ReadWindows:
 
 
 def fair_reader(folder: Path, length: int, batch: int) -> ReadWindows:
-    """Return a reader that fills the same buffer for every batch; the chunks of the files are as long as a window."""
+    """Return a reader that fills one reused buffer, from files with chunks as long as a window."""
     file = h5py.File(folder / HISTORIES_H5, "r")
     first: Any = {name: file[f"/0/{name}"] for name in _READ}
     out = {name: np.ones((batch, length, *data.shape[1:]), data.dtype) for name, data in first.items()}
@@ -91,7 +92,7 @@ def fair_reader(folder: Path, length: int, batch: int) -> ReadWindows:
 
 
 def make_data(folder: Path, layout: str, histories: int) -> None:
-    """Write the histories as lite, published and fair files, unless they exist."""
+    """Write the histories as files for our readers, the published reader and the fair reader, unless they exist."""
     if (folder / "done").exists():
         return
     shutil.rmtree(folder, ignore_errors=True)
@@ -107,7 +108,7 @@ def make_data(folder: Path, layout: str, histories: int) -> None:
 
 
 def rotated_histories(source: Dataset, count: int) -> Iterator[NewHistory]:
-    """Yield a selection's histories endlessly, rotated by one more episode in each round."""
+    """Yield `count` histories: those of a selection in turn, rotated by one more episode in each round."""
     kept = source.info.environment.kept_steps
     for number in range(count):
         history, episodes = source[number % len(source)], number // len(source)
@@ -120,8 +121,8 @@ def rotated_histories(source: Dataset, count: int) -> Iterator[NewHistory]:
 
 
 def batch_seconds(sampler: ADSampler, buffer: ADBatch | None, cache: str, first: int) -> float:
-    """Return the median seconds per batch, from batch `first` on."""
-    sampler.batch(10**6, buffer)  # warm-up: decodes chunks, and maps the buffer's pages
+    """Return the median seconds per batch, for batches from number `first` on."""
+    sampler.batch(10**6, buffer)  # warm-up, which decodes chunks and touches the buffer's memory
     taken = []
     for i in range(first, first + REPEATS[sampler.dataset.obs]):
         if cache == "stream, nothing kept":
@@ -131,7 +132,7 @@ def batch_seconds(sampler: ADSampler, buffer: ADBatch | None, cache: str, first:
 
 
 def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads: int, peer_windows: int) -> None:
-    """Measure our samplers with every cache mode and form of observations, and both peers."""
+    """Compare our samplers, with each cache and form of observations, with both peers."""
     dataset: Any = load_icrl4aht(folder / "lite", threads=threads)
     windows_of = dataset.ad(batch_size=batch, length=length, seed=1).windows
     peers = {
@@ -153,7 +154,7 @@ def compare_readers(folder: Path, batch: int, length: int, rounds: int, threads:
         held, buffer = "", None
         for (cache, obs), sampler in samplers.items():
             if obs != held:
-                buffer = None  # one buffer at a time, since a float32 batch is large
+                buffer = None  # keeps one buffer at a time, since float32 batches are large
                 held, buffer = obs, sampler.empty()
             rates[cache, obs].append(batch / batch_seconds(sampler, buffer, cache, 1000 * number + 1))
     for (cache, obs), peer in product(samplers, peers):

@@ -1,7 +1,7 @@
-"""Helpers of the benchmarks: JSON lines, comparison with a peer in rounds, child processes, and FLOP counts.
+"""Helpers of the benchmarks: JSON lines, comparisons with a peer in rounds, child processes, and FLOP counts.
 
-Implementations take turns, round by round, so the load of the machine is similar for all. A ratio is the
-median over rounds of the ratio within a round.
+Compared implementations take turns in rounds, so that the load of the machine is similar for all of them. A reported
+ratio is the median over rounds of the ratio within a round.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def print_line(benchmark: str, **facts: Any) -> None:
 
 
 def elapsed(work: Callable[[], Any]) -> float:
-    """Return the seconds that a call takes."""
+    """Call a function. Return the duration of the call in seconds."""
     started = time.perf_counter()
     work()
     return time.perf_counter() - started
@@ -35,12 +35,12 @@ def elapsed(work: Callable[[], Any]) -> float:
 def rates_in_turn(
     ways: Mapping[str, Callable[[], Any]], steps: float | Mapping[str, float], rounds: int
 ) -> dict[str, list[float]]:
-    """Return steps/s of every implementation in every round.
+    """Measure implementations in turn. Return name of an implementation -> steps/s in each round.
 
     Args:
-        ways: name -> compiled call of an implementation, which waits for its result.
-        steps: steps per call, one number or one for each name.
-        rounds: measured calls per implementation.
+        ways: name of an implementation -> compiled function that waits for its result.
+        steps: number of steps per call, or name of an implementation -> its number of steps.
+        rounds: number of measured calls per implementation.
     """
     rates: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(rounds):
@@ -50,7 +50,7 @@ def rates_in_turn(
 
 
 def compared(rates: Mapping[Any, list[float]], way: Any, peer: str) -> dict[str, float]:
-    """Return the median steps/s of an implementation and its peer, and median, least and greatest ratio by round."""
+    """Return median steps/s of an implementation and its peer, and median, minimum and maximum of their ratio."""
     ratios = [ours / theirs for ours, theirs in zip(rates[way], rates[peer], strict=True)]
     facts = {
         "steps_per_second": statistics.median(rates[way]),
@@ -63,21 +63,21 @@ def compared(rates: Mapping[Any, list[float]], way: Any, peer: str) -> dict[str,
 
 
 def compiled_call(function: Callable[[Any], Any], key: Any) -> Callable[[], Any]:
-    """Return a compiled call of a JAX function with a key, which waits for the result."""
-    import jax  # not at the top: readers are measured without JAX
+    """Compile a JAX function. Return a function that calls it with `key` and waits for the result."""
+    import jax  # imported here, because readers are measured without JAX
 
     compiled = jax.jit(function).lower(key).compile()
     return lambda: jax.block_until_ready(compiled(key))
 
 
 class MeasuredProgram(NamedTuple):
-    """A compiled function with its cost.
+    """Compiled function with its costs.
 
     Attributes:
         call: the compiled function.
-        flops: operations of its matrix products, see `product_flops`.
-        compile_seconds: time of tracing and compiling.
-        bytes: device memory of arguments, results and temporary arrays, as the compiler planned it.
+        flops: floating-point operations of the matrix products, see `product_flops`.
+        compile_seconds: duration of tracing and compilation in seconds.
+        bytes: device memory that the compiler planned for arguments, results and temporary arrays.
     """
 
     call: Callable[..., Any]
@@ -87,7 +87,7 @@ class MeasuredProgram(NamedTuple):
 
 
 def compile_measured(function: Any, *arguments: Any) -> MeasuredProgram:
-    """Compile a jitted function for these arguments."""
+    """Compile a jitted function for some arguments, and measure its costs."""
     started = time.perf_counter()
     traced = function.trace(*arguments)
     compiled = traced.lower().compile()
@@ -100,11 +100,11 @@ def compile_measured(function: Any, *arguments: Any) -> MeasuredProgram:
 
 
 def product_flops(program: Any) -> float:
-    """Return the floating-point operations of a program's matrix products, 2 * M * N * K each.
+    """Return the number of floating-point operations in a program's matrix products, 2 * M * N * K for each.
 
-    Loops of a known length (`scan`, `lax.map`) count every round, other loops one, and a condition its most expensive
-    branch. Everything else, such as lookups, softmax and the optimizer, counts nothing. Recomputation counts only if
-    the program itself asks for it (`jax.checkpoint`).
+    The rounds of a loop are all counted if their number is known (`scan`, `lax.map`), otherwise only one. Of a
+    condition, the most expensive branch is counted. Other operations, such as softmax and the optimizer, are not
+    counted. Recomputation is counted only if the program requests it (`jax.checkpoint`).
 
     Args:
         program: a jaxpr, closed or not, such as `jax.jit(f).trace(..).jaxpr`.
@@ -132,7 +132,7 @@ def _inner_programs(params: dict[str, Any]) -> Iterator[Any]:
 
 
 PrintFacts = Callable[[str, Mapping[str, Any]], None]
-"""Called with the name of a case and the facts of its line."""
+"""Function that prints the line of a case, called with the name of the case and its facts."""
 
 
 def run_isolated(
@@ -144,19 +144,18 @@ def run_isolated(
     case_seconds: float,
     environment: Mapping[str, str] | None = None,
 ) -> int:
-    """Run cases in a child process, and in a new one after each failure, and return the number of failures.
+    """Run cases in a child process, and in a new one after each failure. Return the number of failures.
 
-    So a crash or full memory affects one case only.
-
-    A child runs its cases in order and prints one JSON object for each to stdout, with the name as "case"; it ends
-    after one with "error". A case without a result (child crashed, stopped or never started) gets a line, too.
+    A crash or an out-of-memory error therefore affects only one case. A child runs its cases in order, and prints a
+    JSON object for each to stdout, with the name as "case". A child ends after a case with "error". If a child crashes
+    or is stopped, a line is also printed for the case without a result.
 
     Args:
         cases: names of the cases.
-        command: names -> command line of a child that runs them.
-        print_facts: prints one line.
-        until: `time.monotonic()` at which the running child is killed and no other is started.
-        case_seconds: limit of a single case, the start of its process included.
+        command: function from names of cases to the command line of a child that runs them.
+        print_facts: function that prints the line of a case.
+        until: value of `time.monotonic()` at which the running child is killed, and after which none is started.
+        case_seconds: time limit of a single case, including the start of its process.
         environment: environment variables of the children; inherited by default.
     """
     pending, failures = list(cases), 0
@@ -171,7 +170,7 @@ def run_isolated(
                 line = child.stdout.readline()
                 stopped = not timer.is_alive()
                 timer.cancel()
-                if line.startswith("{"):  # other output is dropped
+                if line.startswith("{"):  # other output is ignored
                     facts = json.loads(line)
                     failed = "error" in facts
                     print_facts(pending.pop(0), {name: value for name, value in facts.items() if name != "case"})
@@ -188,10 +187,10 @@ def run_isolated(
 
 
 def folder_size(folder: Path) -> int:
-    """Return the bytes of all files below a folder."""
+    """Return the total size in bytes of all files in a folder and its subfolders."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def peak_memory() -> float:
-    """Return the highest resident memory of this process so far, in MiB."""
+    """Return the peak resident memory of this process so far, in MiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -1,8 +1,8 @@
-"""Peers of benchmarks and differential tests: JaxMARL's environment on our layouts, and its recurrent IPPO.
+"""Peers for benchmarks and differential tests: JaxMARL's environment on our layouts, and JaxMARL's recurrent IPPO.
 
-The learner is JaxMARL's `baselines/IPPO/ippo_rnn_overcooked_v2.py`, which is not in JaxMARL's package: it is loaded
-from a copy. Modules that it imports only for logging and configuration (hydra, omegaconf, wandb) are replaced by
-stubs; it also needs distrax, from the extra `peers`.
+The learner is JaxMARL's script `baselines/IPPO/ippo_rnn_overcooked_v2.py`. JaxMARL's package does not contain the
+script, so it is loaded from a copy. Modules that the script imports only for logging and configuration (hydra,
+omegaconf, wandb) are replaced by stubs. The script also needs distrax, from the extra `peers`.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from benchmarks.harness import compiled_call
 from icrl4aht_data.benchmark.facts import EPISODE_STEPS
 from icrl4aht_data.overcooked.layouts import Layout
 
-with redirect_stdout(sys.stderr):  # JaxMARL prints on import
+with redirect_stdout(sys.stderr):  # JaxMARL prints when it is imported
     from jaxmarl.environments.multi_agent_env import MultiAgentEnv
     from jaxmarl.environments.overcooked_v2.layouts import Layout as PeerLayout
     from jaxmarl.environments.overcooked_v2.overcooked import OvercookedV2
 
 
 def jaxmarl_environment(layout: Layout, max_steps: int = EPISODE_STEPS) -> OvercookedV2:
-    """Return JaxMARL's OvercookedV2 on our map, with the benchmark's options."""
+    """Return JaxMARL's OvercookedV2 environment on the map of a layout, with the benchmark's options."""
     return OvercookedV2(
         PeerLayout.from_string("\n".join(layout.rows), possible_recipes=[list(r) for r in layout.recipes]),
         max_steps=max_steps,
@@ -43,14 +43,14 @@ def jaxmarl_environment(layout: Layout, max_steps: int = EPISODE_STEPS) -> Overc
 
 
 def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, updates: int) -> Callable[[], Any]:
-    """Return a compiled call of JaxMARL's IPPO on an environment, which initialises, updates and waits.
+    """Return a compiled function that trains JaxMARL's IPPO from the start and waits for the result.
 
-    The call returns what the script's function `train` returns.
+    The result is that of the script's function `train`.
 
     Args:
-        script: a copy of JaxMARL's file.
-        env: the environment to use instead of the script's.
-        config: hyper-parameters.
+        script: path of a copy of JaxMARL's script.
+        env: environment to train in, instead of the one that the script makes.
+        config: hyper-parameters of the training.
         updates: number of updates.
 
     Raises:
@@ -85,7 +85,7 @@ def jaxmarl_training(script: Path, env: MultiAgentEnv, config: PPOConfig, update
 
 
 def _load_script(path: Path) -> ModuleType:
-    """Import the learner's file as a module."""
+    """Import the copy of JaxMARL's script as a module."""
     silent: Any = ModuleType("silent")
     silent.main = lambda **_: lambda function: function
     silent.log = lambda metric: None
@@ -94,7 +94,7 @@ def _load_script(path: Path) -> ModuleType:
         sys.modules.setdefault(name, silent)
     spec = importlib.util.spec_from_file_location("jaxmarl_ippo", path)
     if spec is None or spec.loader is None:
-        raise click.UsageError(f"{path}: not a Python file")
+        raise click.UsageError(f"{path}: not a Python file, expected a copy of JaxMARL's script")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

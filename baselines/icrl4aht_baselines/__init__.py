@@ -1,11 +1,11 @@
-"""Reference agents and the one evaluator of the benchmark.
+"""Reference agents, and the evaluator of the benchmark.
 
-One line imports what an evaluation needs:
+The names that an evaluation needs are imported from this package:
 
     from icrl4aht_baselines import evaluate, find_agent, from_host, report, test_tasks
 
-`evaluate` and `report` are packages as well: calling one of them calls its function of the same name. Everything is
-imported when it is first used, because JAX takes seconds to import.
+`evaluate` and `report` are packages that can be called like their functions of the same name. Modules are imported
+when they are first used, because importing JAX takes seconds.
 """
 
 from importlib import import_module
@@ -25,7 +25,7 @@ _MODULES = {"find_agent": "agents.egos", "from_host": "agents.host", "test_tasks
 
 
 class CallablePackage(ModuleType):
-    """Package that can be called like its function of the same name."""
+    """Package whose call runs its function of the same name, such as `evaluate.evaluate`."""
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         return getattr(self, self.__name__.rpartition(".")[2])(*args, **options)

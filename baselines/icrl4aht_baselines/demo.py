@@ -1,4 +1,4 @@
-"""`make demo`: from the bundled histories to a model that learns within its context, and a picture of it."""
+"""`make demo`: train a model on bundled histories, and show whether it learns within its context."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from icrl4aht_data.utils.progress import progress_bars
 
 DEMO_LAYOUT = "rooms-0-46"
 _SOURCE = "search"
-_EPISODES = 5  # of a window, which begins where a history begins, as an evaluation does; later ones show nothing new
+_EPISODES = 5  # episodes of a window; the script that made the histories finds out the dish within them
 
 _MODEL = ModelOptions(
     width=128, recurrent_layers=1, dropout=0.0, encoder="mlp", teammate_actions=True, reward_scale=0.05
@@ -47,20 +47,22 @@ _TRAINING = TrainOptions(
 _PROTOCOL = get_protocol("seeded", 10)
 
 _AGENTS = {"stay": "never moves", "search": "the script that it imitates", "oracle": "a script that is told the dish"}
-"""Reference egos that the picture shows, and what they do."""
+"""Reference ego in the figure -> description of its behaviour."""
 
 _OWN_STYLE: dict[str, Any] = {"color": "C0", "linewidth": 2.2}
 
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """What the demo trains and measures; the defaults take at most 7 minutes on two cores.
+    """Settings of the demo; the defaults take at most 7 minutes on two cores.
 
     Attributes:
         root: folder of the release.
-        model, training: of Hybrid-AD, the model that trains fastest; chosen on validation tasks.
+        model: architecture of Hybrid-AD, which trains fastest.
+        training: settings of the training, chosen on validation tasks.
         tasks: tasks to evaluate on; None for the validation tasks of `DEMO_LAYOUT`.
-        protocol, seeds: of the evaluation.
+        protocol: protocol of the evaluation.
+        seeds: seeds of the evaluation.
     """
 
     root: Path = MINI
@@ -72,12 +74,12 @@ class DemoSettings:
 
 
 def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) -> Path:
-    """Load, sample, verify, train, evaluate with and without memory, draw, and print what is done.
+    """Run the demo: load, sample and verify a release; train a model; evaluate it with and without memory; draw.
 
     Args:
-        out: folder; the same call resumes a stopped one.
-        console: receives text and progress.
-        settings: of training and evaluation.
+        out: output folder; the same call with this folder resumes a stopped demo.
+        console: console for the printed text.
+        settings: settings of the demo.
 
     Returns:
         Path of the report, an HTML page.
@@ -91,91 +93,91 @@ def run_demo(out: Path, console: Console, settings: DemoSettings | None = None) 
     settings = settings or DemoSettings()
     paths = [out / name for name in ("learning_curves.png", "episode.gif", "adaptation.png", "report.html")]
     for path in paths:
-        check_output(path, overwrite=(out / "run").is_dir())  # of a stopped run
+        check_output(path, overwrite=(out / "run").is_dir())  # a stopped demo is resumed
     out.mkdir(parents=True, exist_ok=True)
     curves, episode, picture, page = paths
 
-    def say(number: int, text: str) -> None:
+    def print_stage(number: int, text: str) -> None:
         console.print(f"[bold]{number}/6[/bold] ({time.perf_counter() - started:.0f} s) {text}")
 
-    def write(text: str) -> None:
+    def print_text(text: str) -> None:
         console.print(text, highlight=False, markup=False)
 
-    say(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}", source="{_SOURCE}")')
+    print_stage(1, f'ds = load_icrl4aht(split="train", layout="{DEMO_LAYOUT}", source="{_SOURCE}")')
     dataset = load_icrl4aht(settings.root, split="train", layout=DEMO_LAYOUT, source=_SOURCE)
     plot_learning_curves(load_icrl4aht(settings.root), curves)
     _draw_best_episode(dataset, episode)
-    write(f"{dataset!r}\nlearning curves: {curves}\nbest episode: {episode}")
+    print_text(f"{dataset!r}\nlearning curves: {curves}\nbest episode: {episode}")
 
-    say(2, 'ds.ad(batch_size=8, length=500, labels="expert")[0]')
-    write(dataset.ad(batch_size=8, length=500, labels="expert")[0].describe())
+    print_stage(2, 'ds.ad(batch_size=8, length=500, labels="expert")[0]')
+    print_text(dataset.ad(batch_size=8, length=500, labels="expert")[0].describe())
 
-    say(3, "verifying every byte and every step")
+    print_stage(3, "verifying every byte and every step")
     verified = verify_release(settings.root, level="deep")
     if not verified.ok:
         raise ReleaseError(f"{settings.root}: {verified.findings[0].file}: {verified.findings[0].problem}")
-    write(
+    print_text(
         f"no problem in {verified.files} files, {verified.chunks} chunks, {verified.transitions:,} transitions replayed"
     )
 
     training = settings.training
-    say(4, f"training Hybrid-AD on windows of {training.context:,} steps: {training.steps} steps")
+    print_stage(4, f"training Hybrid-AD on windows of {training.context:,} steps: {training.steps} steps")
     run = out / "run"
     histories = HistoryOptions((DEMO_LAYOUT,), str(settings.root), source=(_SOURCE,), labels="expert", first=_EPISODES)
     job = prepare("hybrid_ad", settings.model, training, histories)
     with progress_bars(unit="steps") as show:
         job.train(run, done=show_steps(show, "Hybrid-AD", training.steps))
-    write(f"losses on training and held-out histories: {run / RUN_CURVES}")
+    print_text(f"losses on training and held-out histories: {run / RUN_CURVES}")
 
     tasks = settings.tasks or demo_tasks()
-    say(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
+    print_stage(5, f"evaluating it and {', '.join(_AGENTS)} on {len(tasks)} validation tasks")
     agent = find_agent(run, greedy=False)
 
-    def played(one: NamedEgo, folder: str, **control: Any) -> EvaluationRun:
+    def evaluate_into(one: NamedEgo, folder: str, **control: Any) -> EvaluationRun:
         rules, where = settings.protocol, out / "results" / folder
         return evaluate_agent(one, tasks, rules, where, seeds=settings.seeds, **control)
 
-    own, cleared = played(agent, agent.name), played(agent, "cleared", control="cleared")
-    runs = [own, cleared, *(played(find_agent(name), name) for name in _AGENTS)]
-    write(block_table(runs).to_string())
+    own, cleared = evaluate_into(agent, agent.name), evaluate_into(agent, "cleared", control="cleared")
+    runs = [own, cleared, *(evaluate_into(find_agent(name), name) for name in _AGENTS)]
+    print_text(block_table(runs).to_string())
 
-    say(6, "drawing")
+    print_stage(6, "drawing")
     draw_adaptation(runs, picture)
     write_page(runs, page)
-    write(f"return by episode: {picture}\nreport: {page}")
-    write(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(own, cleared)}")
+    print_text(f"return by episode: {picture}\nreport: {page}")
+    print_text(f"done in {time.perf_counter() - started:.0f} s\n\n{conclusion(own, cleared)}")
     return page
 
 
 def demo_tasks() -> tuple[Task, ...]:
-    """Return the validation tasks of `DEMO_LAYOUT`: new teammates, dishes of training."""
+    """Return the validation tasks of `DEMO_LAYOUT`, which have new teammates but the dishes of training."""
     return tuple(task for task in bundled_tasks(PREFERENCE, "validation") if task.layout.name == DEMO_LAYOUT)
 
 
 def block_table(runs: Sequence[EvaluationRun]) -> pd.DataFrame:
-    """Return the mean returns of some agents (rows) in the blocks of episodes that were played (columns)."""
+    """Return a table of mean returns, with a row for each agent and a column for each block of episodes."""
     means = {
-        run.agent: {block: mean_of(of.blocks[block] for of in run.returns.values()) for block in _blocks(run)}
+        run.agent: {block: mean_of(of.blocks[block] for of in run.returns.values()) for block in _played_blocks(run)}
         for run in runs
     }
     return pd.DataFrame(means).T.map("{:z.1f}".format).rename(columns="episodes {}".format)
 
 
-def _blocks(run: EvaluationRun) -> list[str]:
-    """Return the blocks of episodes that were played."""
+def _played_blocks(run: EvaluationRun) -> list[str]:
+    """Return the names of the blocks of episodes that were played in all tasks of a run."""
     return [block for block in EPISODE_BLOCKS if all(block in of.blocks for of in run.returns.values())]
 
 
-def find_rise(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
-    """Return how much more a run earns in its last block of episodes than in its first episode, or than another run.
+def find_gain(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInterval:
+    """Return a run's return in its last block of episodes minus that in its first episode, or minus another run's.
 
-    Differences are paired by task and seed; cells weigh the same.
+    Differences are paired by task and seed. Each combination of layout and teammate family has the same weight.
 
     Args:
-        run: the results.
-        other: results of another agent; if given, the difference is to its last block, not to the first episode.
+        run: results of an agent.
+        other: results of another agent; if given, its return in the last block is subtracted.
     """
-    last = _blocks(run)[-1]
+    last = _played_blocks(run)[-1]
     base, block = (run, "1") if other is None else (other, last)
     return mean_interval(
         *(of.blocks[last][0] - base.returns[cell].blocks[block][0] for cell, of in run.returns.items())
@@ -183,8 +185,8 @@ def find_rise(run: EvaluationRun, other: EvaluationRun | None = None) -> MeanInt
 
 
 def conclusion(own: EvaluationRun, cleared: EvaluationRun) -> str:
-    """Return whether the model learns within its context, and the limits of what was measured."""
-    rise, memory = find_rise(own), find_rise(own, cleared)
+    """Return text that says whether the model learns within its context, and how far the measurement can be trusted."""
+    rise, memory = find_gain(own), find_gain(own, cleared)
     verdict = "rises by what it remembers" if rise.low > 0 and memory.low > 0 else "does not rise by what it remembers"
     return (
         f"Its return {verdict}: {rise.text(sign='+')} from the first episode to the last ones, {memory.text(sign='+')} "
@@ -195,7 +197,7 @@ def conclusion(own: EvaluationRun, cleared: EvaluationRun) -> str:
 
 
 def draw_adaptation(runs: Sequence[EvaluationRun], path: Path) -> None:
-    """Draw the mean return of each episode, a line for each run; the model's memory cleared is dashed."""
+    """Draw each run's mean return in every episode; the model with its memory cleared has a dashed line."""
     figure, (axes,) = panel_grid(
         [f"{DEMO_LAYOUT}, validation teammates: one dish is wanted, and nothing shows which"],
         1,
@@ -218,7 +220,7 @@ def draw_adaptation(runs: Sequence[EvaluationRun], path: Path) -> None:
 
 
 def _draw_best_episode(dataset: Dataset, path: Path) -> None:
-    """Draw the episode with the highest return of the history that ends best, the latest of several."""
+    """Draw the best episode of the history with the highest final return; of equal ones the latest."""
     history = dataset[int(np.argmax(dataset.column("return_end")))]
     returns = history.returns()
     best = len(returns) - 1 - int(np.argmax(returns[::-1]))

@@ -1,4 +1,4 @@
-"""Returns of the reference egos with every test task, and the cards of the package that state them."""
+"""Returns of the reference egos in every test task, and the package's cards that state them."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from icrl4aht_data.utils.templates import markdown_table
 HEADROOM_FILES = ("headroom.json", "headroom.md", "stay.json", "behaviours.json")
 
 HeadroomCells = Mapping[str, Mapping[str, Mapping[str, float]]]
-"""Layout -> family -> reference ego -> mean return."""
+"""Layout -> teammate family -> reference ego -> mean return."""
 
 
 def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., None]) -> list[EvaluationRun]:
-    """Evaluate every reference ego under every protocol into out/<protocol>/<agent>; finished tasks are kept.
+    """Evaluate every reference ego under every protocol; results are stored in OUT/PROTOCOL/AGENT and reused.
 
-    `stay` also plays the validation tasks, since scores are relative to it. Under the protocol of the scores, the egos
-    play with the seeds of the agents' results, under others with seed 0.
+    The ego `stay` also plays the validation tasks, since scores are relative to its returns. Under the protocol of the
+    scores, egos play with the seeds of submitted results, under other protocols with seed 0.
 
     Args:
         out: folder of the results.
-        protocols: their names.
-        show: called with (name, episodes played, episodes), for progress.
+        protocols: names of the protocols.
+        show: function for progress, called with (name, episodes played, number of episodes).
     """
     runs = []
     for protocol, agent in product(protocols, REFERENCES):
@@ -46,23 +46,23 @@ def measure_headroom(out: Path, protocols: Sequence[str], show: Callable[..., No
     return runs
 
 
-def find_alike_tasks() -> list[list[str]]:
-    """Return lists of test task ids; the teammates of the tasks in a list act alike."""
+def find_equal_teammates() -> list[list[str]]:
+    """Return groups of test task ids whose teammates behave the same, without groups of one task."""
     tasks = [task for track in TRACKS for task in bundled_tasks(track, "test")]
     return [[task.task_id for task in alike] for alike in find_behaviours(tasks) if len(alike) > 1]
 
 
 def write_headroom_cards(runs: Sequence[EvaluationRun], alike: Sequence[Sequence[str]], folder: Path) -> list[Path]:
-    """Write `HEADROOM_FILES` into a folder. Return their paths.
+    """Write the files `HEADROOM_FILES` into a folder. Return their paths.
 
-    headroom.json holds protocol -> layout -> family -> reference ego -> mean return with the test tasks, stay.json
-    protocol -> task id -> mean return of `stay`, behaviours.json `alike`, see `find_alike_tasks`.
+    headroom.json holds protocol -> layout -> family -> reference ego -> mean return in the test tasks, stay.json holds
+    protocol -> task id -> mean return of `stay`, and behaviours.json holds the result of `find_equal_teammates`.
     """
     content: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     stays: dict[str, dict[str, float]] = {}
     for run in runs:
         for cell, returns in run.returns.items():
-            means = returns.mean.mean(axis=1)  # of each task
+            means = returns.mean.mean(axis=1)  # mean return of each task
             if cell.kind == "test":
                 egos = content.setdefault(run.protocol, {}).setdefault(cell.layout, {}).setdefault(cell.family, {})
                 egos[run.agent] = round(float(means.mean()), 3)
@@ -77,7 +77,11 @@ def write_headroom_cards(runs: Sequence[EvaluationRun], alike: Sequence[Sequence
 
 
 def headroom_markdown(protocols: Mapping[str, HeadroomCells]) -> str:
-    """Return the headroom card: protocol -> cells, as Markdown."""
+    """Return the headroom card as Markdown, with a table for each protocol.
+
+    Args:
+        protocols: protocol -> returns of the reference egos.
+    """
     lines = [
         "# Headroom: what an ego can change",
         "",
@@ -97,10 +101,10 @@ def headroom_markdown(protocols: Mapping[str, HeadroomCells]) -> str:
 
 
 def published_table(layouts: HeadroomCells) -> str:
-    """Return a Markdown table of reference egos and the paper's methods: a row per layout, means over families.
+    """Return a Markdown table of mean returns on each layout, of the reference egos and the paper's methods.
 
     Args:
-        layouts: measured under the protocol `published`.
+        layouts: returns of the reference egos under the protocol `published`.
     """
     body, paper = [], ("random", *PAPER_METHODS)
     for layout in (name for name in TEST_LAYOUTS if name in layouts):

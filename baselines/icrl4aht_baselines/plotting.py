@@ -1,4 +1,4 @@
-"""Figures of a training's log, and what other figures share."""
+"""Figures of training logs, and helpers for other figures."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from icrl4aht_data.plotting import MOST_PANELS, legend_below, new_figure, return
 def plot_training_log(metrics: Path, path: Path, title: str) -> None:
     """Plot the numbers of a run's metrics.jsonl over the training steps, in at most `MOST_PANELS` panels.
 
-    Each number has a panel with a line per part of the data; returns have a panel per layout with a line per kind of
-    teammate, on one axis. Thick lines are running means over a twentieth of the points, thin ones the points.
+    Each logged number has a panel with a line for each part of the data. Returns have a panel for each layout, with a
+    line for each kind of teammate and a shared axis. Thick lines are running means over a twentieth of the points;
+    thin lines connect the points.
     """
     lines = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines()]
     numbers = pd.DataFrame(lines).melt(["step", "part"], var_name="panel", value_name="number").dropna()
@@ -52,7 +53,7 @@ def plot_training_log(metrics: Path, path: Path, title: str) -> None:
 def panel_grid(
     titles: Sequence[str], columns: int, size: tuple[float, float], x_label: str, **sharing: Any
 ) -> tuple[Any, list[Any]]:
-    """Return a figure and its axes: a panel of this size in inches for each title, and hidden ones in the last row."""
+    """Return a figure and its axes: a panel for each title, of a size in inches, and hidden panels in the last row."""
     rows = -(-len(titles) // columns)
     figure = new_figure(size[0] * columns + 0.3, size[1] * rows + 0.6)
     grid: list[Any] = [*figure.subplots(rows, columns, squeeze=False, **sharing).flat]

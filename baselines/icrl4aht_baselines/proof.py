@@ -1,11 +1,11 @@
-"""What a release teaches: models trained on its histories alone, and what they earn on validation tasks.
+"""Proof that a release teaches: models trained on its histories alone, and their returns on validation tasks.
 
-    OUT/SOURCE-LEARNER-sSEED/run         run folder, as of `train`
-    OUT/SOURCE-LEARNER-sSEED/results     results on the validation tasks of a set, with memory and without
+    OUT/SOURCE-LEARNER-sSEED/run         run folder of a training
+    OUT/SOURCE-LEARNER-sSEED/results     results on the sets of validation tasks, with memory and without
     OUT/references/...                   results of egos to compare with
-    OUT/proof.json                       all of it, which the card of the release shows
+    OUT/proof.json                       summary of all results, which the card of the release shows
 
-Every training is one job of a queue; finished ones are kept, stopped ones continue.
+Each training is a job of a queue. Finished jobs are reused, and stopped jobs resume.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ from icrl4aht_data.utils.files import atomic_write, file_hash, parse_json, read_
 TEAMMATE_TRACK = "teammate"
 
 PROOF_PROTOCOL = get_protocol("seeded", 20)
-"""Protocol of the evaluations: as many episodes as the longest block that the proof reports."""
+"""Protocol of the evaluations, with 20 episodes, because the proof reports the episodes 1 and 6 to 20."""
 
 _SEEDS = {PREFERENCE: range(4), TEAMMATE_TRACK: range(1)}
-"""Set of tasks -> seeds of each. A rise compares with one episode of each task and seed, so one seed would be few."""
+"""Set of tasks -> seeds of its tasks. The first episode is reported separately, so one seed would be too few."""
 
 COMPARED_EGOS = {PREFERENCE: ("stay", "search"), TEAMMATE_TRACK: ("stay", "rl2-reference")}
-"""Set of tasks -> the egos that models are compared with."""
+"""Set of tasks -> names of the egos that models are compared with."""
 
 
 class ProofLearner(NamedTuple):
-    """A method and what it learns.
+    """A method and the actions that it learns.
 
     Attributes:
         method: name of the method.
-        labels: None for the histories' own actions, or "expert".
-        title: text for tables.
+        labels: "expert" for expert labels, or None for the actions in the histories.
+        title: name in tables.
     """
 
     method: str
@@ -64,22 +64,24 @@ LEARNERS = {
     "ad-expert": ProofLearner("ad", "expert", "AD, expert labels"),
     "dpt-expert": ProofLearner("dpt", "expert", "DPT, expert labels"),
 }
-"""Name of a folder -> what is trained."""
+"""Name on the command line and in folders -> learner."""
 
 _MODEL = ModelOptions(**{**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0})
-# Histories of `search` find out everything in the first episodes: windows begin where these begin, as a test does.
+# The script `search` finds out the dish within the first episodes, so windows begin at a history's start.
 _FIRST_EPISODES = {"search": 5}
 _TRAINING: dict[str, Any] = {"learning_rate": 2e-3, "validate_every": 10**6, "save_every": 10**6, "log_every": 20}
 
 
 @dataclass(frozen=True)
 class ProofOptions:
-    """Settings of all trainings.
+    """Settings that all trainings of the proof share.
 
     Attributes:
-        root: folder or address of a release; None for the bundled one.
-        steps, batch_size, context: see `TrainOptions`. With the defaults a training takes about 35 minutes on a core.
-        tasks: set of tasks -> its tasks; by default the validation tasks of a track in which the ego matters.
+        root: folder or address of a release; None for the bundled release.
+        steps: number of training steps; with the defaults, a training takes about 35 minutes on a core.
+        batch_size: number of windows or contexts in a batch.
+        context: K, steps of a window or transitions of a context.
+        tasks: set of tasks -> its tasks; by default validation tasks, see `task_sets`.
     """
 
     root: str | None = None
@@ -90,7 +92,7 @@ class ProofOptions:
 
     @property
     def task_sets(self) -> dict[str, tuple[Task, ...]]:
-        """The tasks of each set."""
+        """Set of tasks -> its tasks; by default validation tasks of two tracks, without those that have no headroom."""
         if self.tasks is not None:
             return self.tasks
         played = [*bundled_tasks(TEAMMATE_TRACK, "validation"), *bundled_tasks(TEAMMATE_TRACK, "diverse")]
@@ -102,15 +104,15 @@ class ProofOptions:
 
 @dataclass(frozen=True)
 class ProofJob:
-    """One training and its evaluation, a job of a queue, see `icrl4aht_generation.jobs.job.Job`.
+    """Job that trains a model on histories and evaluates it, see `icrl4aht_generation.jobs.job.Job`.
 
     Attributes:
         source: source of the histories, or "all".
-        learner: one of `LEARNERS`.
+        learner: a name in `LEARNERS`.
         seed: seed of the training.
-        options: settings of all trainings.
-        out: folder of all of them.
-        xla_threads: threads of XLA on a CPU.
+        options: settings that all trainings share.
+        out: folder of all trainings.
+        xla_threads: number of XLA threads on a CPU.
     """
 
     source: str
@@ -123,63 +125,63 @@ class ProofJob:
 
     @property
     def name(self) -> str:
-        """Name of the folder."""
+        """Name of the job's folder."""
         return f"{self.source}-{self.learner}-s{self.seed}"
 
     @property
     def label(self) -> str:
-        """Method, labels, source and seed."""
+        """Name of the job in progress displays: method, labels, source and seed."""
         return f"{LEARNERS[self.learner].title}, {self.source} histories, seed {self.seed}"
 
     @property
     def folder(self) -> Path:
-        """Folder of the run and its results."""
+        """Folder of the training run and of its results."""
         return self.out / self.name
 
     @property
     def updates(self) -> int:
-        """Training steps."""
+        """Number of training steps."""
         return self.options.steps
 
     @property
     def training(self) -> TrainOptions:
-        """Settings of the training."""
+        """Settings of this training, for the trainer."""
         own = self.options
         return TrainOptions(own.steps, own.batch_size, own.context, seed=self.seed, **_TRAINING)
 
     @property
     def result_file(self) -> Path:
-        """File of the finished job: a `ProofTraining`, and the settings."""
+        """Path of the file with the results of the finished job."""
         return self.folder / "result.json"
 
     def is_finished(self) -> bool:
-        """Return whether the result of these settings is there."""
+        """Return whether a result with the settings of this job is stored."""
         return self.result_file.is_file() and self.result()["settings"] == self.settings
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the result depends on, beside the release."""
+        """All settings that the result depends on, as JSON; the content of the release is not among them."""
         tasks = {name: [task.task_id for task in own] for name, own in self.options.task_sets.items()}
         return {"train": asdict(self.training), "root": self.options.root, "tasks": tasks}
 
     def result(self) -> dict[str, Any]:
-        """Return the content of result.json: `settings`, `minutes` of training, and `returns`, see `play`."""
+        """Return the content of result.json: `settings`, `minutes` of training, and `returns` of `play_sets`."""
         return parse_json(read_text(self.result_file))
 
     def progress(self) -> tuple[int, float] | None:
-        """Return training steps done, and steps of histories per second."""
+        """Return the number of finished training steps, and history steps per second; None before the first log."""
         timing = last_line(self.folder / "run" / TIMING)
         if not timing:
             return None
         return timing["step"], timing["steps_per_second"] * self.options.batch_size * self.options.context
 
     def finished_text(self) -> str:
-        """Return the text on the finished job."""
+        """Return a note on the result for progress displays: mean returns on the track preference."""
         returns = self.result()["returns"]
         return f"first episode {returns[PREFERENCE]['1']:.1f}, episodes 6 to 20 {returns[PREFERENCE]['6-20']:.1f}"
 
     def run(self, on_update: OnUpdate = lambda updates, speed: None, wait: bool = False) -> None:
-        """Train, evaluate with memory and without, and write the result."""
+        """Train the model, evaluate it with and without memory, and write the result."""
         with run_lock(self.folder, wait=wait):
             if self.is_finished():
                 return
@@ -192,30 +194,30 @@ class ProofJob:
             content = {
                 "settings": self.settings,
                 "minutes": round(_training_seconds(run / TIMING) / 60, 1),
-                "returns": play(find_agent(run, greedy=False), self.options, self.folder / "results"),
+                "returns": play_sets(find_agent(run, greedy=False), self.options, self.folder / "results"),
             }
             with atomic_write(self.result_file) as partial:
                 write_json(partial, content)
 
 
 def _training_seconds(timing: Path) -> float:
-    """Return the seconds of a training, those of several processes that resumed it together."""
+    """Return the duration of a training in seconds, from its timing log, which also covers resumed parts."""
     lines = [parse_json(line) for line in read_text(timing).splitlines()]
     steps = np.diff([0, *(line["step"] for line in lines)])
     return float(np.sum(steps / [line["steps_per_second"] for line in lines]))
 
 
-def play(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = True) -> dict[str, dict[str, float]]:
-    """Evaluate an agent on each set of tasks.
+def play_sets(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = True) -> dict[str, dict[str, float]]:
+    """Evaluate an agent on each set of tasks of the proof.
 
     Args:
-        agent: the agent.
-        options: with the tasks.
+        agent: agent to evaluate.
+        options: settings with the sets of tasks.
         out: folder of the results.
-        controls: whether to play with the memory cleared before each episode as well.
+        controls: whether the agent also plays with its memory cleared before each episode.
 
     Returns:
-        Name of the set, with " cleared" for the second -> block of episodes -> mean return of the tasks.
+        Name of the set, followed by " cleared" for cleared memory -> block of episodes -> mean return.
     """
     found = {}
     for control in (None, "cleared")[: 1 + controls]:
@@ -229,12 +231,12 @@ def play(agent: NamedEgo, options: ProofOptions, out: Path, controls: bool = Tru
 
 
 def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[str, float]]], path: Path) -> Path:
-    """Write what finished trainings earn, one entry for each source and learner with a value for each training.
+    """Write the returns of finished trainings: an entry for each source and learner, with a value for each training.
 
     Args:
-        jobs: the trainings.
-        references: ego -> what `play` returned.
-        path: the file; replaced.
+        jobs: jobs of the trainings; unfinished ones are skipped.
+        references: name of an ego -> returns from `play_sets`.
+        path: path of the file, which is replaced.
     """
     entries: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for job in jobs:
@@ -275,6 +277,6 @@ def write_proof(jobs: Sequence[ProofJob], references: dict[str, dict[str, dict[s
 
 
 def run_references(options: ProofOptions, out: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Evaluate the egos of `COMPARED_EGOS`, or read what they earned. Return ego -> what `play` returns."""
+    """Return name of an ego in `COMPARED_EGOS` -> returns from `play_sets`; stored results are reused."""
     names = dict.fromkeys(name for of_set in COMPARED_EGOS.values() for name in of_set)
-    return {name: play(find_agent(name), options, out / "references" / name, controls=False) for name in names}
+    return {name: play_sets(find_agent(name), options, out / "references" / name, controls=False) for name in names}

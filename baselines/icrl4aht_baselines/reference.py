@@ -1,15 +1,16 @@
-"""Make the reference models step by step, from a release of noise histories to evaluated models and their cards.
+"""Make the reference models, from a release of noise histories to evaluated models and their cards.
 
     OUT/noise/lite              release of noise histories, as `icrl4aht-data generate --profile noise` makes it
     OUT/rl2-reference-TRACK     RL^2, trained by playing with the training teammates of that release
     OUT/agent-TRACK             histories of RL^2 with falling noise, source `agent`
-    OUT/rising-TRACK            such histories that begin at random, see `RL2_HISTORIES`
-    OUT/NAME-TRACK              run folder of a model
-    OUT/NAME-TRACK-first        its first training, before it was labelled on histories of its own
-    OUT/NAME-TRACK-own          these histories, and OUT/NAME-TRACK-mixed with the others
+    OUT/rising-TRACK            histories of RL^2 that begin with random actions, see `RL2_HISTORIES`
+    OUT/NAME-TRACK              run folder of the model NAME
+    OUT/NAME-TRACK-first        run folder of the first training of a model with two trainings
+    OUT/NAME-TRACK-own          histories that this first model plays, labelled by RL^2
+    OUT/NAME-TRACK-mixed        the histories of the first training together with the model's histories
     OUT/results/NAME-TRACK/...  results on validation tasks and on test tasks
 
-Everything resumes: finished parts are kept, stopped ones continue.
+Finished parts are reused, and stopped parts resume.
 """
 
 from __future__ import annotations
@@ -45,20 +46,20 @@ from icrl4aht_data.utils.templates import fill_template
 from icrl4aht_data.writing.combine import combine_releases
 
 PROFILE = "noise"
-"""Profile of the release that everything starts from."""
+"""Name of the profile that the release of noise histories is generated with."""
 
 RL2_HISTORIES = {
     "agent": NoiseConfig(8, 40, start=(0.2, 0.9), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.2, 0.8)),
     "rising": NoiseConfig(8, 40, start=(0.8, 1.0), end=(0.0, 0.0), begin=(0.0, 0.0), finish=(0.4, 0.9)),
 }
-"""Kind of data -> noise of histories of RL^2 with each teammate. The end of every history is without noise. Those of
-`rising` begin at random or nearly so, as learners begin, for a model that imitates how they improve."""
+"""Kind of data -> noise of the histories that RL^2 plays with each teammate. Every history ends without noise. Those of
+the kind `rising` begin with mostly random actions, like a learner, for a model that imitates the improvement."""
 
 OWN_HISTORIES = NoiseConfig(2, 20, start=(0.0, 0.0))
-"""Histories that a model plays itself: 2 of 10 with each teammate. They are shorter, a ninth of all episodes."""
+"""Noise and number of the histories that a model itself plays for its second training: 1 in 9 of all episodes."""
 
 OWN_SHARE = 0.5
-"""Learning rate of a training on own histories, as a share of the first training's."""
+"""Learning rate of a model's second training relative to that of the first."""
 
 EVALUATIONS = {
     "validation": ("validation", "seeded", 1),
@@ -66,37 +67,37 @@ EVALUATIONS = {
     "test-seeded": ("test", "seeded", 3),
     "test-published": ("test", "published", 1),
 }
-"""Folder of results -> split of the tasks, protocol, and number of seeds."""
+"""Name of a folder of results -> split of the tasks, protocol, and number of seeds."""
 
 TRACK_VIEWS: dict[str, dict[str, Any]] = {
     "teammate": {},
     "layout": {"mirror": True, "hide_recipe": ("asymm_both",)},
 }
-"""Track -> values of `HistoryOptions` for all of its models. Models of the layout track are tested on other layouts
-than they are trained on, so they learn from mirrored games, too; asymm_right has no recipe indicator that the ego could
-see, so that of asymm_both is hidden from them."""
+"""Track -> values of `HistoryOptions` for all of its models. Models of the layout track are tested on new layouts, so
+they are also trained on mirrored games. On the test layout asymm_right the ego cannot see a recipe indicator, so the
+indicator of the training layout asymm_both is hidden."""
 
 TRACK_PLAY: dict[str, dict[str, Any]] = {
     "teammate": {},
     "layout": {"rearranged": 70, "four_recipes": True},
 }
-"""Track -> values of `PlayOptions` for its models that learn by playing."""
+"""Track -> values of `PlayOptions` for models that learn by playing."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a reference model is made.
+    """Settings that a reference model is made with.
 
     Attributes:
         method: name of the method.
-        data: kind of the histories that it learns from, one of `RL2_HISTORIES`; empty for learning by playing.
+        data: kind of the training histories, one of `RL2_HISTORIES`; empty for learning by playing.
         model: values of `ModelOptions`.
         train: values of `TrainOptions`.
         histories: values of `HistoryOptions`.
-        own_round: whether a second training follows, with histories that the model plays and RL^2 labels, in addition
-            to the first ones.
-        greedy: whether it plays its most probable actions or draws them.
-        role: what the package bundles it for.
+        own_round: whether a second training follows, on the first histories and on histories that the model itself
+            plays and RL^2 labels.
+        greedy: whether the model takes its most probable actions or samples its actions.
+        role: purpose of the model in the package.
     """
 
     method: str
@@ -111,7 +112,7 @@ class Recipe:
 
 _TINY: dict[str, Any] = {**SIZES["tiny"].model, "teammate_actions": True, "reward_scale": 0.05, "dropout": 0.0}
 _STEPS: dict[str, Any] = {"steps": 4000, "batch_size": 16, "context": 200, "learning_rate": 2e-3}
-# DPT has another query after every part of a context.
+# With K + 1 queries, each prefix of a context of K transitions has a different one.
 _QUERIES: dict[str, Any] = {"labels": "expert", "queries": _STEPS["context"] + 1}
 _LONG: dict[str, Any] = {**_STEPS, "steps": 3000, "batch_size": 4, "context": 1000}
 
@@ -127,16 +128,16 @@ RECIPES = {
     ),
     "ad-rising": Recipe("ad", "rising", _TINY, _LONG, role="gains most by its memory"),
 }
-"""Reference models by name; the bundled ones have the same names."""
+"""Name of a reference model -> how it is made. The bundled models have the same names."""
 
 
 class ReferenceOutcome(NamedTuple):
     """Outcome of one reference model on one track.
 
     Attributes:
-        name: name of the recipe.
-        track: the track.
-        run: the model's run folder.
+        name: name in `RECIPES`.
+        track: name of the track.
+        run: run folder of the model.
         results: name in `EVALUATIONS` -> folder of results.
     """
 
@@ -154,25 +155,25 @@ def make_reference(
     evaluates: bool = True,
     teacher: str | None = None,
 ) -> ReferenceOutcome:
-    """Make a reference model of a track, with everything that it needs, or resume it.
+    """Make a reference model of a track with everything that it needs, or resume a stopped call.
 
     Args:
-        name: one of `RECIPES`.
-        track: the track.
-        out: folder, see this module's docstring.
-        show: called with (description, units done, units, note), for progress.
-        evaluates: whether to evaluate it as well.
-        teacher: agent whose histories are recorded and who labels them, such as the bundled `rl2-reference`; without
-            it, RL^2 is trained first. Existing releases and runs are kept, even if they were made with another teacher.
+        name: a name in `RECIPES`.
+        track: name of the track.
+        out: output folder; its content is described at the top of this module.
+        show: function for progress, called with (description, units done, units, note).
+        evaluates: whether the model is also evaluated.
+        teacher: name or run folder of the agent that plays and labels the histories, such as `rl2-reference`; if None,
+            RL^2 is trained first. Existing releases and runs are reused, even if made with another teacher.
 
     Raises:
-        OptionError: if a run folder holds a run of other settings. Existing releases are not checked.
+        OptionError: if a run folder holds a run with other settings. Existing releases are not checked.
         TrainingStopped: after SIGTERM or SIGINT during a training, which is saved.
     """
-    steps, recipe = _Steps(out, track, show, teacher), RECIPES[name]
+    steps, recipe = _ReferenceSteps(out, track, show, teacher), RECIPES[name]
     run = out / f"{name}-{track}"
     if not recipe.data:
-        run = steps.play()
+        run = steps.train_by_playing()
     else:
         histories, first = steps.teacher_histories(recipe.data), None
         if recipe.own_round:
@@ -183,11 +184,11 @@ def make_reference(
     return ReferenceOutcome(name, track, run, steps.evaluate(name, run, recipe) if evaluates else {})
 
 
-def check_taught(name: str) -> None:
-    """Check that a reference model learns from histories of a teacher.
+def check_learns_from_teacher(name: str) -> None:
+    """Check that a reference model learns from histories of a teacher, so that a teacher may be chosen.
 
     Raises:
-        OptionError: if it does not.
+        OptionError: if the model learns by playing.
     """
     if not RECIPES[name].data:
         taught = ", ".join(each for each, recipe in RECIPES.items() if recipe.data)
@@ -195,8 +196,8 @@ def check_taught(name: str) -> None:
 
 
 @dataclass(frozen=True)
-class _Steps:
-    """The steps towards the reference models of a track; each of them is skipped if it was done before."""
+class _ReferenceSteps:
+    """Steps that make the reference models of a track; a step is skipped if its output exists."""
 
     out: Path
     track: str
@@ -204,7 +205,7 @@ class _Steps:
     teacher: str | None = None
 
     def noise_release(self) -> Path:
-        """Generate the release of noise histories. Return its folder."""
+        """Generate the release of noise histories. Return the folder of the release."""
         folder = self.out / "noise"
         if not (folder / "lite").is_dir():
             command = ["-m", "icrl4aht_data", "generate", "--profile", PROFILE, "--out", str(folder)]
@@ -214,10 +215,10 @@ class _Steps:
         return folder / "lite"
 
     def teammates(self, number: int = 0) -> Any:
-        """Return the teammates of the noise histories on the track's layouts, and diverse ones, see `collect_release`.
+        """Return the teammates of the noise histories on the track's layouts, and diverse teammates.
 
         Args:
-            number: number of the collection, in the tasks' seeds.
+            number: number of the collection, which determines the seeds of the tasks, see `release_teammates`.
         """
         noise = load_icrl4aht(self.noise_release(), layout=list(TRACKS[self.track]["train"]))
         return release_teammates(noise, number, self.diverse_tasks())
@@ -226,8 +227,8 @@ class _Steps:
         """Return the training tasks with diverse teammates."""
         return read_tasks(manifest_path(self.track, "train", "diverse"))
 
-    def play(self) -> Path:
-        """Train RL^2 by playing with the teammates of the noise histories and diverse ones. Return its run folder."""
+    def train_by_playing(self) -> Path:
+        """Train RL^2 by playing with the teammates of the noise histories and diverse ones. Return the run folder."""
         recipe, folder = RECIPES["rl2-reference"], self.out / f"rl2-reference-{self.track}"
         options = TrainOptions(**recipe.train)
         root = str(self.noise_release())
@@ -238,15 +239,15 @@ class _Steps:
         return folder
 
     def teacher_histories(self, kind: str) -> Path:
-        """Record histories of the teacher with noise as in `RL2_HISTORIES[kind]`. Return the path of the release."""
+        """Record histories of the teacher, with noise as in `RL2_HISTORIES[kind]`. Return the folder of the release."""
         folder = self.out / f"{kind}-{self.track}"
         if not folder.is_dir():
-            agent = find_agent(self.teacher or self.play(), greedy=False)
+            agent = find_agent(self.teacher or self.train_by_playing(), greedy=False)
             collect_release(agent, self.teammates(), RL2_HISTORIES[kind], folder, progress=self.show)
         return folder
 
     def train(self, recipe: Recipe, root: Path, folder: Path, before: Path | None = None) -> None:
-        """Train a model on a release, after a first training from `before` at a lower learning rate."""
+        """Train a model on a release; with `before`, start from that run at a lower learning rate."""
         options = TrainOptions(**recipe.train)
         if before:
             options = replace(options, learning_rate=OWN_SHARE * options.learning_rate)
@@ -257,18 +258,18 @@ class _Steps:
         job.train(folder, params=params, done=show_steps(self.show, folder.name, options.steps))
 
     def add_own_histories(self, histories: Path, first: Path, run: Path) -> Path:
-        """Record histories of a model that the teacher labels. Return the release of these and the given ones."""
+        """Record histories of a model, labelled by the teacher. Return a release of them and the given histories."""
         own, mixed = (run.with_name(f"{run.name}-{kind}") for kind in ("own", "mixed"))
         if not mixed.is_dir():
             if not own.is_dir():
-                labeller = find_agent(self.teacher or self.play())
+                labeller = find_agent(self.teacher or self.train_by_playing())
                 teammates, agent = self.teammates(number=1), find_agent(first, greedy=False)
                 collect_release(agent, teammates, OWN_HISTORIES, own, labeller=labeller, progress=self.show)
             combine_releases(mixed, [histories, own])
         return mixed
 
     def evaluate(self, name: str, run: Path, recipe: Recipe) -> dict[str, Path]:
-        """Return the folders of a model's results, by their names in `EVALUATIONS`."""
+        """Evaluate a model. Return name in `EVALUATIONS` -> folder of results."""
         model, agent = f"{name}-{self.track}", find_agent(run, greedy=recipe.greedy)._replace(name=name)
         found = {kind: self.out / "results" / model / kind for kind in EVALUATIONS}
         for kind, (split, protocol, seeds) in EVALUATIONS.items():
@@ -280,13 +281,13 @@ class _Steps:
 def write_bundled_card(
     name: str, outcomes: Sequence[ReferenceOutcome], folder: Path = MODELS, teacher: str | None = None
 ) -> Path:
-    """Write the card of a bundled model: its results on test and validation tasks, and its training. Return its path.
+    """Write the card of a bundled model, with its training and its results. Return the path of the card.
 
     Args:
-        name: of the bundled model.
-        outcomes: of its tracks, evaluated.
-        folder: of the bundled models.
-        teacher: the agent that it was made with, see `make_reference`.
+        name: name of the bundled model.
+        outcomes: evaluated outcomes of the model's tracks.
+        folder: folder of the bundled models.
+        teacher: agent that the histories were recorded of, see `make_reference`.
     """
     (run,) = merge([read_run(found.results["test-seeded"]) for found in outcomes])
     validation = merge([read_run(found.results[kind]) for found in outcomes for kind in ("validation", "diverse")])
@@ -305,14 +306,14 @@ def model_card(
     validation: Sequence[EvaluationRun] = (),
     drawn: Sequence[str] = (),
 ) -> str:
-    """Return README.md of a bundled model, which has a model for each track.
+    """Return the text of README.md for a bundled model.
 
     Args:
-        run: results of all of its models on test tasks. The card's table of models has a row for each.
+        run: results on test tasks of the models of all tracks; the card's table of models has a row for each.
         title: name of the bundled model.
-        command: command that makes it.
-        validation: further results, on validation tasks under the same protocol, which get tables, too.
-        drawn: tracks for which the folder has a figure of the model's training.
+        command: command that makes the model.
+        validation: results on validation tasks under the same protocol, which are also shown in tables.
+        drawn: tracks for which the folder has a figure of the training curves.
     """
     models: dict[str, list[ResultSource]] = defaultdict(list)
     for source in run.sources:
@@ -352,7 +353,7 @@ def training_sentence(config: Mapping[str, Any]) -> str:
     """Return a sentence on what a model was trained on.
 
     Args:
-        config: config.json of its run.
+        config: content of config.json in the model's run folder.
     """
     if "groups" in config["histories"]:
         sentence, play = "It was trained by playing with teammates, not on learning histories.", config.get("play", {})
@@ -369,7 +370,7 @@ def training_sentence(config: Mapping[str, Any]) -> str:
 
 
 def _model_row(run: EvaluationRun, sources: Sequence[ResultSource]) -> str:
-    """Return a row of the table of models: training data and seed of one model, and its evaluation."""
+    """Return a row of the card's table of models: layouts, training data, seed and evaluation of one model."""
     trained: dict[str, Any] = sources[0].trained or {}
     histories = trained["config"]["histories"]
     instances = instances_range(len(run.cells[cell]) for source in sources for cell in source.tasks)

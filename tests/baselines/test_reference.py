@@ -56,7 +56,7 @@ def test_unknown_names(tmp_path):
     with pytest.raises(
         OptionError, match=r"rl2-reference learns from no histories.*ad-reference, dpt-reference, ad-rising"
     ):
-        reference.check_taught("rl2-reference")
+        reference.check_learns_from_teacher("rl2-reference")
     command = ["research", "reference", "--name", "rl2-reference", "--out", str(tmp_path / "out"), "--teacher"]
     assert "unknown agent" in run_cli(*command, "rl2-referenc", code=2) and not (tmp_path / "out").exists()
 

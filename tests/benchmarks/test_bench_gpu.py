@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import pytest
-from icrl4aht_baselines.agents.egos import learned
+from icrl4aht_baselines.agents.egos import trained_policy
 from icrl4aht_baselines.evaluate.protocols import PROTOCOLS
 from icrl4aht_baselines.evaluate.rollout import EvaluationRollout
 from icrl4aht_baselines.training.options import TrainOptions
@@ -131,7 +131,7 @@ def test_acting_lowers_for_cuda():
     method = ad_method(architecture(SMALL_SIZES, "tiny", "mlp", "float32"), [tasks[0].layout])
     params = jax.eval_shape(method.init, jax.random.key(0))
     mates = [build_teammate(task.layout, task.teammate, TEAMMATE, "seeded") for task in tasks]
-    rollout = EvaluationRollout(tasks[0].layout, learned(method, params, 10), mates, PROTOCOLS["seeded"])
+    rollout = EvaluationRollout(tasks[0].layout, trained_policy(method, params, 10), mates, PROTOCOLS["seeded"])
     params_and_keys = params, jax.eval_shape(lambda: jax.random.split(jax.random.key(0)))
     state = jax.eval_shape(lambda params, keys: rollout.start(keys), *params_and_keys)
     jax.jit(rollout.episode).trace(params, rollout.teammate_params, state).lower(lowering_platforms=("cuda",))

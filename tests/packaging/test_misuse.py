@@ -57,9 +57,9 @@ release build a b --out c | unexpected extra argument
 generate --out g --address there:1 | --address needs --executor ray
 train ad --layout demo_wide --coordinator x | x: expected HOST:PORT, such as 10.0.0.1:6000
 train ad --layout demo_wide --process 1 | expected a --coordinator HOST:PORT as well
-train rl2 --layout demo_wide --size tiny | --size: not with rl2, which learns by playing
-train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: not with rl2, which learns by playing
-train ad --layout demo_wide --epochs 2 | --epochs: not with ad, only with rl2, which learns by playing
+train rl2 --layout demo_wide --size tiny | --size: cannot be used with rl2, which learns by playing
+train rl2 --layout demo_wide --next-obs --context 5 | --context, --next-obs: cannot be used with rl2, which learns
+train ad --layout demo_wide --epochs 2 | --epochs: cannot be used with ad, only with rl2, which plays
 research reference --name rl2-reference --no-evaluate --bundle-as rl2-x | its card states its results
 research reference --name rl2-reference --bundle-as Bad-Name | name = 'Bad-Name': expected words of small letters
 results | Missing option '--out'
@@ -68,7 +68,7 @@ evaluate --agent ad-referenc --out e | Did you mean 'ad-reference'
 evaluate --agent empty --out e | empty: not a run: config.json is missing
 evaluate --agent stay --out e --suite none | none: no such folder; `icrl4aht-data teammates`
 evaluate --agent stay --out e --split train | unknown split 'train'; valid: test, validation
-evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --manifest: not with --split, which
+evaluate --agent stay --out e --manifest {MINI}/meta/tasks.jsonl --split test | --manifest: cannot be used with --split
 watch --layout demo_wide --out e.png | e.png: expected a name that ends in .gif
 train ad --layout demo_wide --manifest empty/x | 'empty/x' does not exist
 """

@@ -1,7 +1,7 @@
-"""The models that this package bundles, in the folder `models`: NAME/TRACK is the run folder of a model of one track.
+"""Models that are part of this package: `models/NAME/TRACK` is the run folder of model NAME for one track.
 
-A bundled run has its settings, its last parameters without the optimizer's state, and the curves of its training. NAME
-also has the model's card, and `bundle.json`, which states how the model plays by default.
+A bundled run folder holds the run's settings, its last parameters without the optimizer's state, and its training
+curves. The folder NAME also holds the model's card, and `bundle.json`, which states how the model plays by default.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ MODELS = Path(__file__).parents[1] / "models"
 """Folder of the bundled models."""
 
 MODEL_CARD = "README.md"
-"""File name of a bundled model's card, in the folder NAME."""
+"""File name of a bundled model's card, in the folder `models/NAME`."""
 
 BUNDLE = "bundle.json"
-"""File name of what `BundledModel` says of a model, in the folder NAME."""
+"""Name of the JSON file with the last three fields of a `BundledModel`, in the folder `models/NAME`."""
 
 _LARGEST = 2 * 10**6  # maximum size of a bundled model's parameters, in bytes
 
@@ -40,11 +40,11 @@ class BundledModel(NamedTuple):
     """A bundled model.
 
     Attributes:
-        name: such as "ad-reference".
-        runs: track -> run folder of its model.
-        sampled: whether it draws its actions unless another way of playing is chosen.
-        role: what it is bundled for.
-        date: day on which it was bundled, such as "2026-11-24".
+        name: name of the model, such as "ad-reference".
+        runs: track -> run folder of the model for this track.
+        sampled: whether the model samples its actions by default, instead of taking the most probable ones.
+        role: purpose of the model, such as "best of AD".
+        date: day on which the model was bundled, such as "2026-11-24".
     """
 
     name: str
@@ -55,7 +55,7 @@ class BundledModel(NamedTuple):
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
-    """Return the bundled models by name."""
+    """Return name -> bundled model."""
     found = {}
     for path in sorted(folder.glob("*/")):
         runs = {track: path / track for track in TRACKS if (path / track / CONFIG).is_file()}
@@ -65,7 +65,7 @@ def bundled_models(folder: Path = MODELS) -> dict[str, BundledModel]:
 
 
 def describe_model(model: BundledModel) -> list[str]:
-    """Return a line for each track of a bundled model."""
+    """Return one line of text for each track of a bundled model: method, size, and training data."""
     lines = []
     for track, folder in model.runs.items():
         trained = read_trained(folder)
@@ -81,10 +81,10 @@ def describe_model(model: BundledModel) -> list[str]:
 
 
 def check_bundle_name(name: str) -> None:
-    """Check the name of a bundled model.
+    """Check that a name for a bundled model consists of small letters, digits and hyphens.
 
     Raises:
-        OptionError: if it is not of small letters, digits and hyphens.
+        OptionError: if the name has another form.
     """
     if not re.fullmatch("[a-z][a-z0-9]*(-[a-z0-9]+)+", name):
         raise OptionError(f"name = {name!r}: expected words of small letters and digits with hyphens: ad-reference")
@@ -93,19 +93,18 @@ def check_bundle_name(name: str) -> None:
 def bundle_run(
     run: Path, name: str, track: str, folder: Path = MODELS, *, sampled: bool = False, role: str = ""
 ) -> Path:
-    """Copy a finished run into the bundled models and return its folder there; the track's earlier run is replaced.
+    """Copy a finished run to the bundled models, where it replaces the earlier run of its track. Return the new folder.
 
     Args:
         run: folder of the run.
         name: name of the bundled model.
-        track: the track whose tasks the run plays.
+        track: track of the tasks that the run plays.
         folder: folder of the bundled models.
-        sampled: whether the model draws its actions by default, on all tracks.
-        role: what it is bundled for.
+        sampled: whether the model samples its actions by default, on all tracks.
+        role: purpose of the model, such as "best of AD".
 
     Raises:
-        OptionError: if the name is not of small letters, digits and hyphens, or if the run is not finished or its
-            parameters are too large.
+        OptionError: if the name is invalid, the run is not finished, or its parameters are too large.
     """
     check_bundle_name(name)
     trained, config = read_trained(run), read_config(run)
@@ -118,7 +117,7 @@ def bundle_run(
     target = folder / name / track
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
-    if not is_address(config["histories"]["root"]):  # a path on the training machine, without meaning elsewhere
+    if not is_address(config["histories"]["root"]):  # a path on the training machine means nothing on others
         config["histories"]["root"] = Path(config["histories"]["root"]).name
     (target / CONFIG).write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
     Checkpoints(target / CHECKPOINTS).save({"params": trained.params}, trained.step)

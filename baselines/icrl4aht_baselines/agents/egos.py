@@ -27,25 +27,25 @@ from icrl4aht_data.overcooked.layouts import Layout
 
 Acting = Literal["cached", "exact"]
 ACTING: tuple[Acting, ...] = ("cached", "exact")
-"""Ways of acting of a trained model with a context of K. Neither uses steps before the last K.
+"""How a trained model computes its context of K steps when it acts. Steps before the last K are never used.
 
 `exact` computes the complete context again at every step, as the paper's rolling buffer does. `cached` keeps the keys
 and values of each step. When the window of AD, Hybrid-AD or AMAGO-Offline is full, its oldest fifth is dropped and the
 rest is computed again: the window has between 4/5 K and K steps. The context of DPT changes only when an episode ends,
-so both compute it once for each episode."""
+so it is computed once for each episode with either value."""
 
 
 OTHER_WAYS = ("greedy", "sampled")
-"""Ways of choosing actions, see `PlayMode.greedy`. Results of a model that plays in another way than its own have the
-way in their name, such as "ad-reference (sampled)"."""
+"""Ways of choosing actions, see `PlayMode.greedy`. Results that were not made in a model's default way name the way
+that was used, such as "ad-reference (sampled)"."""
 
 
 class PlayMode(NamedTuple):
-    """Way in which a trained model plays.
+    """How a trained model computes its context and chooses its actions.
 
     Attributes:
-        acting: how it remembers, see `ACTING`.
-        greedy: whether it takes its most probable action, as published, or draws one.
+        acting: how the context is computed, see `ACTING`.
+        greedy: whether the most probable action is taken, as in the paper, or an action is sampled.
     """
 
     acting: Acting = "cached"
@@ -53,26 +53,26 @@ class PlayMode(NamedTuple):
 
     @classmethod
     def from_details(cls, details: Mapping[str, Any]) -> PlayMode:
-        """Return the mode that the details of results state."""
+        """Return the play mode that is stored in the `details` of evaluation results."""
         return cls(details.get("acting", "cached"), not details.get("sampled"))
 
     @property
     def details(self) -> dict[str, Any]:
-        """Settings that results depend on."""
+        """The play mode as entries of the `details` of evaluation results."""
         return {"acting": self.acting} | ({} if self.greedy else {"sampled": True})
 
 
 AS_PUBLISHED = PlayMode()
-"""The way in which runs and most bundled models play unless another one is chosen."""
+"""Default play mode of runs and of most bundled models."""
 
 
 class NamedEgo(NamedTuple):
-    """An ego that was chosen by name.
+    """An ego with its name in reports.
 
     Attributes:
         name: name of the ego in reports.
-        make: layout -> policy.
-        details: settings that results depend on in addition to the name; None for reference egos.
+        make: function from a layout to the ego's policy.
+        details: further settings that the ego's results depend on; None for reference egos.
         run: run folder of a trained model; None for other egos.
     """
 
@@ -95,12 +95,12 @@ def _no_memory(params: Any, key: Any) -> tuple[()]:
 
 
 def stay(layout: Layout) -> Policy:
-    """Return an ego that always takes the action "stay", and so measures the teammate's return without help."""
+    """Return an ego that always takes the action "stay", to measure what the teammate earns without help."""
     return Policy((), _no_memory, _stay, "situation")
 
 
 def random(layout: Layout) -> Policy:
-    """Return an ego that draws uniformly from the six actions: the column `Rnd` of the paper."""
+    """Return an ego that samples uniformly from the six actions, as in the paper's column `Rnd`."""
     return Policy((), _no_memory, _act_randomly, "situation")
 
 
@@ -108,28 +108,29 @@ AGENTS: dict[str, Callable[[Layout], Policy]] = {"stay": stay, "random": random,
 """Reference egos: name -> function from a layout to the policy."""
 
 SCRIPTED: tuple[Callable[..., Policy], ...] = (oracle, searcher)
-"""Scripted reference egos. Their functions take one layout or several, since their parameters are tables of these."""
+"""Scripted reference egos. Their functions take one layout or a list of layouts."""
 
 
 def agent_names() -> tuple[str, ...]:
-    """Return the names that `find_agent` knows: reference egos and bundled models."""
+    """Return the names of all agents that `find_agent` finds by name: reference egos and bundled models."""
     return (*AGENTS, *bundled_models())
 
 
 def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool | None = None) -> NamedEgo:
     """Return a reference ego, a bundled model, or the trained model in a run folder of `icrl4aht-data train`.
 
-    A bundled model plays each layout by its model of the layout's track.
+    A bundled model has one set of parameters per track, and plays each layout with those of the layout's track.
 
     Args:
         name: name of a reference ego or of a bundled model, or path of a run folder.
-        acting: how a trained model remembers, see `ACTING`; "cached" by default.
-        greedy: whether a trained model takes its most probable action or draws one; by default as its published
-            results were made.
+        acting: how a trained model computes its context, see `ACTING`; "cached" by default.
+        greedy: whether a trained model takes its most probable action or samples one; by default as in the model's
+            stored results.
 
     Raises:
-        UnknownNameError: if the name is none of these, or the way of acting is unknown.
-        OptionError: if the run has another format or no checkpoint; from `make`, if the model does not fit the layout.
+        UnknownNameError: if the name or the value of `acting` is unknown.
+        OptionError: if the run has another format or no checkpoint; `NamedEgo.make` raises it for a layout that the
+            model cannot play.
     """
     name = str(name)
     if name in AGENTS:
@@ -155,8 +156,8 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
         track = track_of(layout.name)
         if track not in egos:
             raise OptionError(
-                f"{name}: has no model of track {track}, whose layout is {layout.name}; it has "
-                f"{' and '.join(egos)}: choose tasks of these, or another agent"
+                f"{name}: no model for layout {layout.name} of track {track}, only for tracks {' and '.join(egos)}: "
+                f"choose tasks of these tracks, or another agent"
             )
         return egos[track](layout)
 
@@ -166,12 +167,12 @@ def find_agent(name: str | Path, *, acting: Acting | None = None, greedy: bool |
 
 
 def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Layout], Policy]:
-    """Return the function from a layout to the policy of a trained model.
+    """Return a function from a layout to the policy of a trained model.
 
-    The function raises OptionError, which names `folder`, if the layout's observations have another shape; models of
-    canonical channels play on every layout.
+    The function raises OptionError with the name of `folder` if the layout's observations do not have the shape that
+    the model was trained on. Models that take canonical channels play on every layout.
     """
-    policy = learned(run.method, run.params, run.context, mode)
+    policy = trained_policy(run.method, run.params, run.context, mode)
 
     def make(layout: Layout) -> Policy:
         if run.channels == "own" and layout.obs_shape != run.obs_shape:
@@ -185,17 +186,17 @@ def trained_ego(run: TrainedModel, mode: PlayMode, folder: str) -> Callable[[Lay
     return make
 
 
-def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLISHED) -> Policy:
-    """Return the ego of a trained model. Its memory lasts for the complete task.
+def trained_policy(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLISHED) -> Policy:
+    """Return a trained model as a policy, with a memory that lasts for a complete task.
 
     Args:
         method: the method with which the model was trained.
         params: parameters of the model, float32.
         context: K, number of steps or transitions in the memory.
-        mode: way in which it plays.
+        mode: how the context is computed and actions are chosen.
 
     Raises:
-        UnknownNameError: if there is no such way of acting.
+        UnknownNameError: if `mode.acting` is unknown.
     """
     if mode.acting not in ACTING:
         raise unknown("acting", mode.acting, ACTING)
@@ -212,25 +213,25 @@ def learned(method: Method, params: Any, context: int, mode: PlayMode = AS_PUBLI
 
 
 def with_view(policy: Policy, channels: Channels, hide_recipe: bool = False) -> Policy:
-    """Return a policy that takes inputs of an ego with some channels.
+    """Return a policy that receives observations with the given channels.
 
-    Policies with the same functions have the same functions afterwards.
+    Two policies that share their functions still share them in the results, and so one compiled program.
 
     Args:
-        policy: takes inputs with observations of these channels.
-        channels: "own" for those of the layout, or "canonical".
-        hide_recipe: whether recipe indicators look like counters; with canonical channels only.
+        policy: policy for observations with these channels.
+        channels: "own" for the channels of the layout, or "canonical" for those that all layouts share.
+        hide_recipe: whether recipe indicators look like counters; possible with canonical channels only.
     """
     if channels == "own":
         return policy
-    return policy._replace(act=_without_recipe(policy.act) if hide_recipe else policy.act, sees="canonical_input")
+    return policy._replace(act=_act_without_recipe(policy.act) if hide_recipe else policy.act, sees="canonical_input")
 
 
 @lru_cache(maxsize=16)
-def _without_recipe(act: Callable[..., Any]) -> Callable[..., Any]:
+def _act_without_recipe(act: Callable[..., Any]) -> Callable[..., Any]:
     change = no_change()._replace(hidden=jnp.bool_(True))
 
-    def act_unseeing(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
+    def act_without_recipe(params: Any, memory: Any, ego_input: Any, key: Any) -> tuple[Any, Any]:
         return act(params, memory, ego_input._replace(obs=change.observations(ego_input.obs)), key)
 
-    return act_unseeing
+    return act_without_recipe

@@ -19,9 +19,8 @@ from icrl4aht_data.overcooked.layouts import Layout
 class EgoInput(NamedTuple):
     """Input of an ego with memory: its observation and the outcome of the previous step.
 
-    As in training, the step before the first step of an episode is the last step of the previous episode. Before the
-    first step of a task all `prev_*` fields are zero. A `HostAgent` receives arrays of B tasks, with a leading axis
-    (B,).
+    At the first step of an episode, the `prev_*` fields are of the last step of the previous episode, as in training.
+    At the first step of a task they are zero. A `HostAgent` receives arrays of B tasks, with a leading axis (B,).
 
     Attributes:
         obs: uint8 (5, 5, C), the ego's observation.
@@ -39,14 +38,14 @@ class EgoInput(NamedTuple):
 
 
 class HostPolicy(Policy):
-    """A policy whose functions take a batch of B tasks, with B keys and B `EgoInput`s, for agents without a vmap."""
+    """A policy with functions of B tasks, that is of B keys and B `EgoInput`s, for agents that JAX cannot batch."""
 
 
 class HostAgent(Protocol):
-    """Interface of an ego outside JAX. It plays B tasks in parallel and keeps its own memory."""
+    """Interface of an ego outside JAX, which plays B tasks in parallel and stores its memory itself."""
 
     def reset(self, batch: int) -> None:
-        """Clear the memory: a new set of `batch` tasks begins."""
+        """Clear the memory, because a new set of `batch` tasks begins."""
         ...
 
     def act(self, ego_input: EgoInput) -> np.ndarray:
@@ -60,15 +59,15 @@ class HostAgent(Protocol):
 def from_host(agent: HostAgent, channels: Channels = "own") -> Callable[[Layout], HostPolicy]:
     """Return the `make_ego` argument of `icrl4aht_baselines.evaluate.evaluate` for a `HostAgent`.
 
-    For each layout and teammate family `reset` is called once, then `act` once per step with all their tasks.
+    For each layout and teammate family, `reset` is called once and then `act` once per step, with all of its tasks.
 
     Args:
         agent: the ego.
-        channels: channels of the observations that it takes: "own", those of each layout, or "canonical", which all
-            layouts share.
+        channels: channels of the observations that the agent takes: "own" for those of each layout, or "canonical" for
+            those that all layouts share.
 
     Raises:
-        UnknownNameError: if there are no such channels.
+        UnknownNameError: if `channels` has another value.
         OptionError: if the agent has no `reset` or `act`; during evaluation, if `act` does not return B integers.
     """
     for name in ("reset", "act"):

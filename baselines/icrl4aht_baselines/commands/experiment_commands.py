@@ -1,4 +1,4 @@
-"""Commands of experiments: the positive control, headroom, best responses, adaptation, and what a release teaches."""
+"""Commands that run experiments: positive control, headroom, best responses, adaptation, and models of a release."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from icrl4aht_data.utils.progress import progress_bars
 from icrl4aht_data.utils.templates import card_file
 from icrl4aht_data.writing.proof import PROOF_FILE, proof_table
 
-_STEPS = 8_000_000  # of the training of an informed or episodic ego
+_STEPS = 8_000_000  # environment steps of the training of an informed or episodic ego
 
 
 def _job_options(out: str, card: str) -> tuple[Callable[[Any], Any], ...]:
@@ -38,7 +38,7 @@ def _job_options(out: str, card: str) -> tuple[Callable[[Any], Any], ...]:
 
 
 def _ego_options(out: str, card: str, *own: Callable[[Any], Any], **default_text: str) -> Callable[[Any], Any]:
-    """Return a decorator with the options of a command that trains egos; `own` are further options of the training."""
+    """Return a decorator that adds the options of a command that trains egos; `own` are further training options."""
     training = dataclass_options(ResponseOptions, "training", exclude=("learning_rate",), default_text=default_text)
     seeds = click.option("--seeds", type=COUNT, default=3, help="Trainings of each ego, with different seeds.")
     topics = topic("Tasks", *shared.tasks_options), topic("Training", *own, seeds, training)
@@ -46,11 +46,11 @@ def _ego_options(out: str, card: str, *own: Callable[[Any], Any], **default_text
 
 
 def _prepare_queue(queue: dict[str, Any]) -> QueueOptions:
-    """Return the options of a queue, and prepare this process for its jobs; call before JAX is first used."""
+    """Return the options of a job queue, and set this process up for its jobs. Must be called before JAX is used."""
     options = read_queue_options(queue)
     from icrl4aht_generation.learners.resume import limit_xla_threads
 
-    limit_xla_threads(1)  # of every job, so that it resumes in this process and in workers alike
+    limit_xla_threads(1)  # as in workers, so that a job may resume in either
     return options
 
 
@@ -62,14 +62,15 @@ def _run_queue(
     write: Callable[[Path], Path],
     table: Callable[[Path], str],
 ) -> None:
-    """Run jobs, even if some fail write what the finished ones measured, and print the table of the folder `out`.
+    """Run jobs, then write and print the results of those that finished, even if others failed.
 
     Args:
-        jobs, options: the jobs, and how to run them.
+        jobs: the jobs to run.
+        options: settings of the job queue.
         out: folder of the trainings.
-        bundle: whether to write the results into the package's cards, too.
-        write: writes the results into a folder, and returns the path of their file.
-        table: returns the table of the results in a folder.
+        bundle: whether to write the results into the package's cards as well.
+        write: function that writes the results into a folder, and returns the path of the file.
+        table: function that returns the table of the results in a folder.
     """
     from icrl4aht_generation.jobs.queue import run_jobs
     from rich.console import Console
@@ -88,8 +89,8 @@ def _run_queue(
 def control_command(out: Path) -> None:
     """Check that AD and DPT adapt in context.
 
-    Trains them on bandits and Dark Room (about 10 minutes), and prints the checks: they adapt there, and do not with
-    their context cut off. Exits with 1 if a check fails.
+    Trains AD and DPT on bandits and Dark Room (about 10 minutes), and checks that they adapt there, and that they do
+    not adapt with their context cut off. Exits with 1 if a check fails.
     """
     from icrl4aht_baselines.control.control import format_checks, run_control
     from icrl4aht_baselines.training.trainer import format_loss
@@ -118,26 +119,26 @@ def control_command(out: Path) -> None:
 def headroom_command(out: Path, protocol: tuple[str, ...], bundle: bool) -> None:
     """Measure the reference egos on every test task.
 
-    `stay` also plays the validation tasks, since scores are relative to it. Under seeded each task is played with the
-    seeds 0, 1 and 2. Writes their results into OUT, and OUT/headroom.json, OUT/headroom.md and OUT/stay.json from them,
-    and OUT/behaviours.json: which test teammates act alike.
+    The ego `stay` also plays the validation tasks, since scores are relative to its returns. Under the protocol seeded,
+    each task is played with the seeds 0, 1 and 2. Writes all results into OUT, their summaries into OUT/headroom.json,
+    OUT/headroom.md and OUT/stay.json, and groups of test teammates that behave the same into OUT/behaviours.json.
     """
-    from icrl4aht_baselines.headroom import HEADROOM_FILES, find_alike_tasks, measure_headroom, write_headroom_cards
+    from icrl4aht_baselines.headroom import HEADROOM_FILES, find_equal_teammates, measure_headroom, write_headroom_cards
 
     folders = [out, card_file("headroom.json").parent] if bundle else [out]
     for folder in folders:
         check_output(folder, overwrite=True, names=HEADROOM_FILES)
     with progress_bars(unit="episodes") as show:
         runs = measure_headroom(out, protocol, show)
-    alike = find_alike_tasks()
+    alike = find_equal_teammates()
     for path in (path for folder in folders for path in write_headroom_cards(runs, alike, folder)):
         click.echo(f"wrote {path}")
 
 
 def _model_returns() -> dict[str, dict[str, float]]:
-    """Return model -> task id -> mean return, of the stored results of models on test tasks.
+    """Return model -> task id -> mean return on test tasks, from the package's stored results.
 
-    Results of controls do not count, in which an ego's memory is cleared or another teammate plays.
+    Results of controls, in which an ego's memory is cleared or another teammate plays, are left out.
     """
     from icrl4aht_baselines.report.comparison import read_stored, results_file
     from icrl4aht_baselines.report.results import bundled_by_id, task_label
@@ -149,7 +150,7 @@ def _model_returns() -> dict[str, dict[str, float]]:
             for of in cells.values()
             for task, values in zip(of.tasks, of.mean, strict=True)
         }
-        for agent, cells in stored.with_other_ways(stored.returns()).items()
+        for agent, cells in stored.with_other_play_modes(stored.returns()).items()
     }
 
 
@@ -185,11 +186,11 @@ def best_response_command(
 ) -> None:
     """Train a best response to each teammate.
 
-    An ego with the benchmark's own view learns with one teammate alone, by PPO that imitates the oracle in its first
-    half. Teammates that act alike share one. Tasks in which the oracle earns no more than `stay` are left out. The
-    best training is chosen on other episodes than those reported; a stored model that earns more takes its place.
-    Writes OUT/best_responses.json and prints it; finished trainings are kept, stopped ones resume. Where the return
-    still rises in the last quarter, give more --steps.
+    An ego with the benchmark's view is trained with a single teammate, by PPO that imitates the oracle in the first
+    half of the steps. Teammates that behave the same share one best response. Tasks in which the oracle earns no more
+    than `stay` are left out. The best training is chosen on other episodes than the reported ones. A stored model that
+    earns more replaces the trained best response. Writes OUT/best_responses.json and prints a table. Finished
+    trainings are reused and stopped ones resume. Give more --steps if the return still rises in the last quarter.
     """
     options = _prepare_queue(queue)
     from icrl4aht_baselines.online.responses import (
@@ -202,7 +203,7 @@ def best_response_command(
 
     tasks = with_headroom(shared.chosen_tasks(**choice))
     if not tasks:
-        raise EmptySelectionError("none of these tasks has headroom; choose others")
+        raise EmptySelectionError("none of the chosen tasks has headroom; choose other tasks")
     behaviours = find_behaviours(tasks)
     click.echo(f"{len(tasks)} tasks with headroom, {len(behaviours)} behaviours")
     settings = [ResponseOptions(**training, init=None if init == "oracle" else init) for init in inits]
@@ -239,9 +240,10 @@ def adaptation_headroom_command(
 ) -> None:
     """Estimate what memory across episodes can earn.
 
-    Trains two egos on the tasks of each layout: one that is told in every step which task it plays, and one that has to
-    find out in each episode. Prints the difference of their returns with an interval over the seeds. Both learn for
-    --steps only, so it is an estimate. Writes OUT/adaptation.json; finished trainings are kept, stopped ones resume.
+    Trains two egos on the tasks of each layout. An informed ego observes the task's number in every step; an episodic
+    ego has to find out the teammate in each episode. Prints the difference of their returns, with an interval over the
+    seeds. The difference is an estimate, because both egos are trained for --steps only. Writes OUT/adaptation.json.
+    Finished trainings are reused and stopped ones resume.
     """
     options = _prepare_queue(queue)
     from icrl4aht_baselines.online.adaptation import adaptation_table, headroom_jobs, write_adaptation
@@ -275,7 +277,7 @@ def adaptation_headroom_command(
     help="ad, ad-expert or dpt-expert: the method, and expert labels if it learns them; repeat for several.",
     show_default="all three",
 )
-@click.option("--seeds", type=COUNT, default=3, help="Trainings of each, with different seeds.")
+@click.option("--seeds", type=COUNT, default=3, help="Trainings of each model, with different seeds.")
 @shared.add_options(*_job_options("runs/proof", PROOF_FILE))
 def proof_command(
     root: Any,
@@ -288,10 +290,10 @@ def proof_command(
 ) -> None:
     """Show what a release teaches.
 
-    Trains small models on the release alone, AD and DPT, and evaluates them on validation tasks: of the track
-    preference with their memory and with it cleared before each episode, and of the track teammate beside
-    rl2-reference. About 35 minutes each on one core. Writes OUT/proof.json, which the release's card shows; finished
-    trainings are kept, stopped ones resume.
+    Trains small AD and DPT models on the release only, and evaluates them on validation tasks. On the track preference
+    each model also plays with its memory cleared before each episode. On the track teammate the models are compared
+    with rl2-reference. A training takes about 35 minutes on one core. Writes OUT/proof.json, which the release's card
+    shows. Finished trainings are reused and stopped ones resume.
     """
     options = _prepare_queue(queue)
     from icrl4aht_baselines.proof import LEARNERS, ProofJob, ProofOptions, run_references, write_proof

@@ -1,4 +1,4 @@
-"""Commands about models that play: recording their histories, reference models, and the page of results."""
+"""Commands that record a model's histories, make reference models, and compare results on the page of results."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ from icrl4aht_data.utils.text import counted_noun
     "--swap",
     type=COUNT,
     metavar="N",
-    help="Change the teammate after every N episodes, without a sign, among those of its kind, layout and split.",
+    help="Change the teammate after every N episodes to another one of its kind, layout and split, unannounced.",
     show_default="never",
 )
 @shared.manifests_option
@@ -84,9 +84,9 @@ def collect_command(
 ) -> None:
     """Record histories of an agent with a release's teammates.
 
-    Writes a release of source agent: what the agent did, what it would have done without the noise (expert actions),
-    and what the scripted oracle would have done (oracle actions; not where it earns less than the histories' end, if
-    the release states what it earns). Validation teammates are played, too.
+    Writes a release of source agent: the agent's actions, its choices before noise as expert actions, and the scripted
+    oracle's choices as oracle actions. Oracle actions are left out where the release states that the oracle earns less
+    than the end of the histories. Histories with validation teammates are recorded as well.
     """
     from icrl4aht_generation.profiles.noise_config import NoiseConfig
 
@@ -125,18 +125,18 @@ def collect_command(
     required=True,
     help="Model, such as ad-reference; repeat.",
 )
-@click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only of teammate or layout.")
+@click.option("--track", type=TRACK, multiple=True, default=tuple(TRACKS), help="Only models of this track.")
 @click.option(
     "--teacher",
     type=shared.EGO_NAME,
-    help="Learn from histories of this agent, such as rl2-reference, not of a new one.",
+    help="Learn from histories of this agent, such as rl2-reference, not of a newly trained one.",
 )
 @click.option("--evaluate/--no-evaluate", "evaluates", default=True, help="Evaluate on validation and test tasks.")
 @click.option(
     "--bundle-as",
     "bundle",
     metavar="NAME",
-    help="Also bundle the model with the package, under this name; see `models`.",
+    help="Also add the model to the package's bundled models under this name; see `models`.",
 )
 @click.option("--out", type=Folder(), metavar="FOLDER", default="runs/reference", help="Write everything here.")
 def reference_command(
@@ -144,13 +144,13 @@ def reference_command(
 ) -> None:
     """Make reference models, with everything that they need.
 
-    Rebuilds a release of noise histories, trains, records histories of trained agents where a model learns from them,
-    and evaluates. One model for each track. The same command resumes a stopped one. rl2-reference learns by playing
-    with training teammates. ad-reference, dpt-reference: histories of rl2-reference, labelled with its choices.
-    ad-rising: those that begin at random, imitated with their noise.
+    Generates a release of noise histories, trains one model for each track, and evaluates it. Models that learn from
+    histories of a trained agent get these recorded first. The same command resumes a stopped run. rl2-reference learns
+    by playing with training teammates. ad-reference and dpt-reference learn from histories of rl2-reference, labelled
+    with its choices. ad-rising imitates histories of rl2-reference whose actions are random at first.
     """
     from icrl4aht_baselines.agents.bundled import bundle_run, check_bundle_name
-    from icrl4aht_baselines.reference import RECIPES, check_taught, make_reference, write_bundled_card
+    from icrl4aht_baselines.reference import RECIPES, check_learns_from_teacher, make_reference, write_bundled_card
 
     if bundle:
         try:
@@ -161,10 +161,10 @@ def reference_command(
             raise click.UsageError(
                 "--bundle-as: expected one --name of all tracks, evaluated: its card states its results"
             )
-    if teacher:  # before hours of work
+    if teacher:  # raises before hours of work
         find_ego("--teacher", teacher)
         for name in names:
-            check_taught(name)
+            check_learns_from_teacher(name)
     outcomes = []
     with progress_bars() as show:
         for name, of_track in product(names, track):
@@ -197,13 +197,13 @@ def _print_schema(context: click.Context, parameter: click.Parameter, wanted: bo
 )
 @click.argument("folders", nargs=-1, required=True, type=Folder(), metavar="FOLDER...")
 @click.option("--about", required=True, help="One sentence on how the agent was made.")
-@click.option("--data", required=True, help="Its training data in a few words; none if it was not trained.")
-@click.option("--labels", required=True, help="The targets of its training in a few words; none without any.")
+@click.option("--data", required=True, help="Training data of the agent in a few words; none if it was not trained.")
+@click.option("--labels", required=True, help="Training targets in a few words; none if there are none.")
 @click.option("--steps", default="", help="Length of the training, such as '4,000 updates'.")
-@click.option("--core-hours", type=click.FloatRange(min=0), help="Core-hours of the training and all it needs.")
+@click.option("--core-hours", type=click.FloatRange(min=0), help="Core-hours of the training and of making its data.")
 @click.option("--link", default="", help="Address of a paper or repository.")
 @click.option("--name", default="", help="Name of the agent in tables.", show_default="that in the results")
-@click.option("--update", is_flag=True, help="These are new results of an agent on the page, which they replace.")
+@click.option("--update", is_flag=True, help="Replace the agent's results that are already on the page.")
 @click.option(
     "--schema",
     is_flag=True,
@@ -219,11 +219,11 @@ def submit_command(
 ) -> None:
     """Make a file of results for the page of `results`.
 
-    Checks that FOLDERs of `evaluate` have all test tasks of a track, or of both, under protocol seeded with seeds 0, 1
-    and 2, and say what the agent was trained on. Several folders of one agent are its tracks, or its trainings with
-    different seeds. Results of `evaluate --controls` are included. Results of a model's other way of playing, such as
-    `evaluate --sampled`, in a folder of their own get rows of their own. A pull request that adds the file puts the
-    agent on the page; `icrl4aht-data results FILE` shows it there.
+    Each FOLDER was written by `evaluate`, under the protocol seeded with seeds 0, 1 and 2. Together the folders must
+    hold all test tasks of a track, or of both tracks, and state what the agent was trained on. Several folders hold the
+    agent's tracks, or its trainings with different seeds. Results of `evaluate --controls` are included. Results with
+    a model's other way of choosing actions, such as `evaluate --sampled`, are shown in separate rows. A pull request
+    that adds the file puts the agent on the page; `icrl4aht-data results FILE` shows a preview.
     """
     from icrl4aht_baselines.report import comparison, submission
 
@@ -248,9 +248,9 @@ def submit_command(
 def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: bool) -> None:
     """Compare models on the benchmark's tasks.
 
-    Writes a page with tables and a figure, results.md and results.png, and every number, results.csv and
-    results.parquet, from the package's stored results and those of FILEs that `submit` made. Every
-    agent needs a name of its own.
+    Compares the package's stored results with those of FILEs that `submit` made. Writes a page with tables and a
+    figure (results.md and results.png), and all numbers (results.csv and results.parquet). No two agents may have the
+    same name.
     """
     from icrl4aht_baselines.report import comparison
     from icrl4aht_baselines.report.submission import read_submission
@@ -271,9 +271,9 @@ def results_command(files: tuple[Path, ...], out: Path, store: bool, overwrite: 
 def models_command() -> None:
     """List the bundled models.
 
-    Their names are agents of `evaluate`, `watch` and `collect`. First what each is bundled for, its scores N on the
-    tracks and its memory control M, as on the page of results, and its date. Then a line for each track: method,
-    parameters, context, training layouts and sources, and whether it draws its actions unless --greedy is given.
+    The names of the models are accepted as agents by `evaluate`, `watch` and `collect`. The first line of a model
+    states its purpose, its score N on each track, its memory control M and its date. A line for each track states
+    method, parameters, context, training layouts and sources, and whether actions are sampled by default.
     """
     from icrl4aht_baselines.agents.bundled import bundled_models, describe_model
     from icrl4aht_baselines.report.comparison import describe_scores, read_stored, results_file

@@ -35,16 +35,16 @@ from icrl4aht_data.overcooked.layouts import get_layout
 
 
 def lazy_attribute(module: str, name: str) -> Callable[[], Any]:
-    """Return a function that imports a module and returns one of its attributes, since importing JAX takes seconds."""
+    """Return a function that imports a module when called, and returns one of the module's attributes."""
     return lambda: getattr(import_module(module), name)
 
 
 def find_ego(option: str, value: str, **mode: Any) -> Any:
-    """Return the ego that an option names, a `icrl4aht_baselines.agents.egos.NamedEgo`.
+    """Return the ego that is named by an option's value, as a `icrl4aht_baselines.agents.egos.NamedEgo`.
 
     Args:
         option: name of the option, for messages.
-        value: the ego's name or folder.
+        value: name or run folder of the ego.
         mode: further arguments of `icrl4aht_baselines.agents.egos.find_agent`.
 
     Raises:
@@ -68,14 +68,14 @@ protocol_option = click.option(
     "--protocol",
     type=PROTOCOL_NAME,
     default="seeded",
-    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers. swap: seeded, with "
-    "another teammate every 25 episodes.",
+    help="Teammates' noise: seeded, new in every episode, or published, as for the paper's numbers. The protocol swap "
+    "is seeded, with another teammate every 25 episodes.",
 )
 greedy_option = click.option(
     "--greedy/--sampled",
     default=None,
-    help="Take the most probable actions of a trained model, or draw its actions.",
-    show_default="greedy; a bundled model's own, see `models`",
+    help="Take a trained model's most probable actions, or sample its actions.",
+    show_default="greedy; for a bundled model see `models`",
 )
 _ONLY_LAYOUTS: Any = {"multiple": True, "help": "Only on this layout; repeat for several."}
 only_layouts_option = click.option("--layout", "layouts", type=LAYOUT, **_ONLY_LAYOUTS)
@@ -93,9 +93,9 @@ tasks_options = (
         type=Names("split", lazy_attribute("icrl4aht_baselines.evaluate.protocols", "EVALUATION_SPLITS")),
         multiple=True,
         default=("test",),
-        help="Which tasks: test, or validation and diverse, by which models are chosen; repeat for several.",
+        help="Tasks to play: test; or validation and diverse, to choose models by; repeat for several.",
     ),
-    # Names are checked when the manifest is read, because the release next to it may carry the layout.
+    # Names are checked only when the manifest is read, because the release next to it may define the layout.
     click.option("--layout", "layouts", type=RELEASE_LAYOUT, **_ONLY_LAYOUTS),
     click.option(
         "--family", "families", type=FAMILY, multiple=True, help="Only with teammates of this family; repeat."
@@ -119,16 +119,16 @@ def chosen_tasks(
     families: Sequence[str],
     manifest: Path | None,
 ) -> list[Task]:
-    """Return the tasks that `tasks_options` choose: those of a manifest, or of tracks and splits in the package.
+    """Return the tasks that the values of `tasks_options` choose, from a manifest or from the package.
 
     Raises:
-        EmptySelectionError: if there is none on these layouts with these families.
-        click.UsageError: for a manifest, whose tasks have splits of their own, together with a split.
+        EmptySelectionError: if no task has one of the chosen layouts and families.
+        click.UsageError: if both a manifest and a split are given, because a manifest states the split of its tasks.
     """
     from icrl4aht_baselines.evaluate.protocols import bundled_tasks
 
     if manifest:
-        check_alone("--manifest", "split")
+        check_conflicts("--manifest", "split")
     bundled = ((name, of_split) for of_split in split for name in track)
     own = read_tasks_and_layouts(manifest) if manifest else []
     given = own if manifest else [task for each in bundled for task in bundled_tasks(*each)]
@@ -146,7 +146,7 @@ def chosen_tasks(
 
 
 def add_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a decorator that adds options, which a command's help lists in this order."""
+    """Return a decorator that adds options to a command, in the order in which its help lists them."""
     return lambda command: functools.reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
@@ -155,7 +155,7 @@ manifests_option = click.option(
     "manifests",
     **_MANIFEST,
     multiple=True,
-    help="Also play with the teammates of this file's tasks, heuristics; repeat for several.",
+    help="Also play with the heuristic teammates of the tasks in this file; repeat for several.",
 )
 _PAPER_OR_CPU = "1024 as in the paper; on a CPU 16 of tiny, 8 of others"
 _BY_SIZE = dict.fromkeys(SIZES["tiny"].model | SIZES["tiny"].train, "the size's")
@@ -165,7 +165,7 @@ model_options = dataclass_options(ModelOptions, "model", default_text=_BY_SIZE)
 
 
 def training_summary(histories: dict[str, Any]) -> str:
-    """Return layouts, channels, labels and numbers of histories of a training run, from its histories' settings."""
+    """Return one line on a run's training data (layouts, channels, labels), from its `histories` settings."""
     shape, sizes, split = " x ".join(map(str, histories["obs_shape"])), histories["sizes"], histories["teammates_split"]
     held = [f"{sizes['histories']} with the same teammates"] if "histories" in sizes else []
     held += [f"{sizes['teammates']} with others (split {split})"] if split else []
@@ -180,7 +180,7 @@ def training_summary(histories: dict[str, Any]) -> str:
 
 
 def default_batch_size(size: str = "small") -> int:
-    """Return the paper's batch size, or on a CPU one that makes a step take a second or less."""
+    """Return the default batch size: the paper's, or on a CPU a smaller one, so that a step takes at most a second."""
     import jax
 
     return SIZES[size].cpu_batch if jax.default_backend() == "cpu" else TrainOptions.batch_size
@@ -195,14 +195,16 @@ def prepare_training(
     histories: HistoryOptions,
     manifests: Sequence[Path] = (),
 ) -> tuple[Any, str]:
-    """Return a training, a `icrl4aht_baselines.training.trainer.TrainingTask`, and text that describes it.
+    """Return a training as a `icrl4aht_baselines.training.trainer.TrainingTask`, and a text that describes it.
 
     Args:
-        method: its name.
-        size: name of the model's size; None for tiny on a CPU and small elsewhere. Not of a method that plays.
-        model, train, play: given values of `ModelOptions`, `TrainOptions` and `PlayOptions`.
-        histories: to train on, or with whose teammates to play.
-        manifests: files of tasks with whose teammates to play as well.
+        method: name of the method.
+        size: name of the model's size; None for tiny on a CPU and small elsewhere. Must be None for rl2.
+        model: values of `ModelOptions` that differ from the defaults.
+        train: values of `TrainOptions` that differ from the defaults.
+        play: values of `PlayOptions` that differ from the defaults.
+        histories: histories to train on; rl2 plays with the teammates of these histories.
+        manifests: files of tasks; rl2 also plays with the teammates of these tasks.
 
     Raises:
         click.UsageError: for options that the method does not have.
@@ -215,7 +217,7 @@ def prepare_training(
 
     if method in PLAYING:
         if unused := {"size"} if size else UNUSED_BY_RL2 & (train.keys() | model.keys()):
-            raise click.UsageError(f"{_flags(unused)}: not with {method}, which learns by playing")
+            raise click.UsageError(f"{_flags(unused)}: cannot be used with {method}, which learns by playing")
         sized = ModelOptions(**RL2_SETTINGS["model"] | model)
         options = TrainOptions(**RL2_SETTINGS["train"] | train)
         tasks = [task for manifest in manifests for task in read_tasks_and_layouts(manifest)]
@@ -229,7 +231,7 @@ def prepare_training(
         )
         return job, text
     if given := {*play, *(["manifest"] if manifests else [])}:
-        raise click.UsageError(f"{_flags(given)}: not with {method}, only with rl2, which learns by playing")
+        raise click.UsageError(f"{_flags(given)}: cannot be used with {method}, only with rl2, which plays")
     on_cpu = jax.default_backend() == "cpu"
     name = size or ("tiny" if on_cpu else "small")
     sized = ModelOptions(**SIZES[name].model | model)
@@ -244,15 +246,15 @@ def prepare_training(
     return job, text
 
 
-def check_alone(option: str, *others: str) -> None:
-    """Check that options whose values another option sets were not given as well.
+def check_conflicts(option: str, *others: str) -> None:
+    """Check that no option in `others` was given on the command line together with `option`, which sets its value.
 
     Raises:
-        click.UsageError: if one was; the message names all of these.
+        click.UsageError: if an option was given; the message names all such options.
     """
     source = click.get_current_context().get_parameter_source
     if given := [name for name in others if source(name) is ParameterSource.COMMANDLINE]:
-        raise click.UsageError(f"{option}: not with {_flags(given)}, which it sets; leave one of them out")
+        raise click.UsageError(f"{option}: cannot be used with {_flags(given)}; leave one of them out")
 
 
 def _flags(names: Iterable[str]) -> str:
@@ -265,14 +267,14 @@ process_options = topic(
     click.option("--processes", type=COUNT, default=1, help="With --coordinator: number of processes."),
     click.option("--process", type=COUNT_OR_NONE, default=0, help="With --coordinator: number of this process."),
 )
-"""The options of training on several machines; `join_processes` takes their values."""
+"""Options of a training on several machines; `join_processes` takes their values."""
 
 
 def join_processes(coordinator: str | None, processes: int, process: int) -> None:
-    """Connect this process with the others of a training; nothing to do without a coordinator.
+    """Connect this process to the other processes of a training, if a coordinator is given.
 
     Raises:
-        click.UsageError: if the options do not agree.
+        click.UsageError: if the options contradict each other.
     """
     import jax
 

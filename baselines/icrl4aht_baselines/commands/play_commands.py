@@ -1,4 +1,4 @@
-"""Command that serves a page to play on."""
+"""Command `icrl4aht-data play`, which serves a web page to play the game on."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _PARTNER = Names("partner", lambda: ["human", *shared.EGO_NAME.valid(), "H1/t0"]
     "partner",
     type=_PARTNER,
     default="H4/t0",
-    help="Partner: a test teammate, H1/t0 to H4/t4; an agent of `evaluate`, such as oracle or rl2-reference, or a run; "
-    "human, a second person at another browser.",
+    help="Partner: a test teammate, H1/t0 to H4/t4; an agent of `evaluate`, such as oracle or rl2-reference; a run "
+    "folder; or human, a second person with another browser.",
 )
 @click.option("--slot", type=click.Choice(list(_SLOTS)), default="ego", help="Agent that the first person plays.")
 @click.option("--episodes", type=COUNT, default=10, help="Episodes of the game.")
@@ -49,12 +49,12 @@ _PARTNER = Names("partner", lambda: ["human", *shared.EGO_NAME.valid(), "H1/t0"]
     "--record",
     type=Folder(),
     metavar="FOLDER",
-    help="Write the episodes here, as a release of source human; with a test teammate, playing the ego.",
+    help="Write the episodes here as a release of source human. Needs a test teammate and --slot ego.",
 )
 @click.option(
     "--seed",
     type=click.IntRange(0, 999_999),
-    help="Seed of the starts of the episodes, and number of the recorded task.",
+    help="Seed of the episodes' initial states, and number of the recorded task.",
     show_default="drawn at random",
 )
 @click.option("--port", type=click.IntRange(0, 65535), default=8000, help="Port of 127.0.0.1; 0: any free one.")
@@ -71,9 +71,9 @@ def play_command(
 ) -> None:
     """Play on a web page with a policy or a person.
 
-    Serves the page on this computer alone. It ends with the returns of the person, and of stay, rl2-reference and
-    oracle in the same episodes with the same partner. Recorded episodes are a history of a person, who has to agree and
-    chooses a pseudonym.
+    Serves the page on this computer only. The game ends with the returns of the person, and of stay, rl2-reference and
+    oracle in the same episodes with the same partner. With --record the episodes are stored as a history of the person,
+    who has to agree to the recording and chooses a pseudonym.
     """
     for module in ("starlette", "uvicorn", "websockets"):
         import_optional(module, "play")
@@ -89,7 +89,7 @@ def play_command(
     recorder, name = None, f"play {layout} {partner} {number}"
     if record is not None:
         if own != EGO:
-            raise OptionError("--record: a history is of the ego: leave out --slot teammate, or --record")
+            raise OptionError("--record: only the ego can be recorded: leave out --slot teammate, or --record")
         recorder = recording.GameRecorder(record, task := recording.human_task(found, number), ticks)
         name = task.task_id
     with server.open_port(port) as listener:
@@ -97,13 +97,13 @@ def play_command(
         players[own] = None
         game = Game(known, players, task_key(0, name), episodes, steps)
         if found.player:
-            game.with_players(players).step({})  # compiles the partner before anyone waits for it
+            game.with_players(players).step({})  # compiles the partner's policy before the game starts
         session = server.PlaySession(game, partner, ticks, recorder)
         who = "two browsers" if found.player is None else "a browser"
         click.echo(f"play at http://{server.HOST}:{listener.getsockname()[1]} in {who} on this computer; Ctrl+C stops")
         server.serve_session(session, listener)
     if recorder and game.returns:
-        if recorder.written < len(game.returns):  # the disk was full, for example
+        if recorder.written < len(game.returns):  # an earlier write failed, for example because of a full disk
             recorder.write(game)
         played = counted_noun(len(game.returns), "episode")
         click.echo(f"{record}: {played}; `icrl4aht-data show {record}` describes it")

@@ -42,7 +42,7 @@ from icrl4aht_data.utils.text import counted_noun
     "--acting",
     type=Names("acting", shared.lazy_attribute("icrl4aht_baselines.agents.egos", "ACTING")),
     default="cached",
-    help="Memory of a trained model: exact (the last K steps), or cached (the last 4/5 K to K steps) and faster.",
+    help="Memory of a trained model: exact (the last K steps), or cached, which is faster (the last 4/5 K to K steps).",
 )
 @shared.greedy_option
 @click.option("--forget", is_flag=True, help="Clear the agent's memory before each episode.")
@@ -50,16 +50,16 @@ from icrl4aht_data.utils.text import counted_noun
     "--controls",
     is_flag=True,
     help="Also play with the memory cleared before each episode, into OUT/cleared, and with another task's teammate in "
-    "all but the last 20 episodes, into OUT/swapped. Prints what memory (M) and the right partner (P) are worth.",
+    "all but the last 20 episodes, into OUT/swapped. Prints the gain by memory (M) and by knowing the partner (P).",
 )
 @shared.protocol_option
 @shared.add_options(*shared.tasks_options)
-@click.option("--tasks", type=COUNT, help="Most tasks of each cell, a layout with a teammate family: 2 are two a cell.")
+@click.option("--tasks", type=COUNT, help="At most this many tasks of each combination of layout and teammate family.")
 @click.option("--episodes", type=COUNT, help="Episodes of a task.", show_default="100")
 @shared.suite_option
 @click.option("--seeds", type=COUNT, default=1, help="Play every task with the seeds 0 to N - 1.")
 @click.option(
-    "--seed", "chosen_seeds", type=SEED, multiple=True, help="Play every task with this seed, not with --seeds; repeat."
+    "--seed", "chosen_seeds", type=SEED, multiple=True, help="Play every task with this seed, not --seeds; repeat."
 )
 @click.option("--out", type=Folder(), metavar="FOLDER", required=True, help="Write the results here.")
 def evaluate_command(
@@ -79,10 +79,10 @@ def evaluate_command(
 ) -> None:
     """Evaluate an agent on test tasks, or on validation tasks.
 
-    Plays 100 episodes of each task, writes one JSON file per task into OUT/tasks, and prints a summary of OUT. Finished
-    tasks are kept. Choose models by the validation tasks: their layouts are in training, their teammates are in neither
-    training nor test. Split diverse has validation tasks with more kinds of teammates than the published training
-    ranges.
+    Plays 100 episodes of each task, writes one JSON file per task into OUT/tasks, and prints a summary of OUT. Results
+    of finished tasks are reused. Choose models by the validation tasks: their layouts are training layouts, their
+    teammates are in neither training nor test. The split diverse has validation tasks with more diverse teammates than
+    the published training ranges.
     """
     from icrl4aht_baselines.evaluate.evaluator import evaluate, evaluate_controls
     from icrl4aht_baselines.evaluate.protocols import CONTROLS, get_protocol, hidden_recipe_note, limit_tasks
@@ -92,11 +92,11 @@ def evaluate_command(
     from icrl4aht_baselines.report.scores import control_lines
 
     if forget and controls:
-        raise click.UsageError("--controls: not with --forget, which is one of the controls; leave one of them out")
+        raise click.UsageError("--controls: cannot be used with --forget, which is one of them; leave out one")
     ego = find_ego("--agent", agent, acting=acting, greedy=greedy)
     chosen = limit_tasks(shared.chosen_tasks(**choice), tasks)
     if chosen_seeds:
-        shared.check_alone("--seed", "seeds")
+        shared.check_conflicts("--seed", "seeds")
     rules, seeds_of_tasks = get_protocol(protocol, episodes), chosen_seeds or range(seeds)
     if note := hidden_recipe_note(chosen):
         click.echo(note, err=True)
@@ -128,17 +128,17 @@ def evaluate_command(
     help="Also write one HTML page: the summary, curves, episodes, tables.",
 )
 @overwrite_option
-@click.option("--gifs/--no-gifs", default=True, help="The first and last episode with each family on the page.")
+@click.option("--gifs/--no-gifs", default=True, help="Show the first and last episode with each family on the page.")
 @shared.suite_option
 def report_command(
     runs: tuple[Path, ...], out: Path | None, html: Path | None, overwrite: bool, gifs: bool, suite: Path | None
 ) -> None:
     """Compare results with the paper's.
 
-    RESULTS are folders that `evaluate` made. Prints a summary of each agent, and a table for each agent and track with
-    the paper's numbers next to results of protocol published; marks scores with teammates or on layouts that were in
-    training. Writes them as report.md, and all numbers as report.csv. Results of one agent on different layouts are
-    merged.
+    RESULTS are folders that `evaluate` made. Prints a summary of each agent, and tables of returns. Results of protocol
+    published are shown next to the paper's numbers. Scores with teammates or on layouts that were in training are
+    marked. Writes the tables as report.md, and all numbers as report.csv. Results of one agent on different layouts
+    are merged.
     """
     from icrl4aht_baselines.report import page
     from icrl4aht_baselines.report.results import merge, read_run
@@ -162,7 +162,7 @@ def report_command(
 )
 @click.option("--layout", type=LAYOUT, required=True, help="Layout of the episode.")
 @click.option(
-    "--teammate", metavar="FAMILY/tN", default="H4/t0", help="A published teammate: its family, H1 to H4, and number."
+    "--teammate", metavar="FAMILY/tN", default="H4/t0", help="A published teammate by family, H1 to H4, and number."
 )
 @click.option(
     "--ego",
@@ -205,7 +205,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
         type=shared.TRAINING_LAYOUT,
         multiple=True,
         required=True,
-        help="Training layout, such as demo_wide; repeat for several, or all: those that the release has histories of.",
+        help="Training layout, such as demo_wide; repeat for several; all: every layout with histories in the release.",
     ),
     shared.root_option,
     dataclass_options(HistoryOptions, "histories"),
@@ -215,7 +215,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     click.option(
         "--size",
         type=Names("size", lambda: SIZES),
-        help="tiny, for a CPU, or the paper's small, medium or large: sets what has `the size's` as its default.",
+        help="tiny, for a CPU, or the paper's small, medium or large: sets the options with the default `the size's`.",
         show_default="tiny on a CPU, small elsewhere",
     ),
     shared.model_options,
@@ -225,7 +225,7 @@ def watch_command(layout: str, teammate: str, ego: str, protocol: str, seed: int
     click.option("--init", type=Folder(), metavar="RUN", help="Start from the parameters of this run."),
     shared.training_options,
 )
-@topic("Playing, of rl2 only", shared.play_options, shared.manifests_option)
+@topic("Playing (rl2 only)", shared.play_options, shared.manifests_option)
 @topic(
     "Run",
     click.option("--out", type=Folder(), metavar="FOLDER", help="Write the run here.", show_default="runs/METHOD"),
@@ -258,7 +258,8 @@ def train_command(
 
     METHOD is ad, dpt, hybrid_ad or amago_offline, or rl2, which learns by playing with the teammates of the histories.
     Writes settings, checkpoints, metrics.jsonl and, with the extra plot, curves.png into OUT; the same command resumes
-    from the last checkpoint. SIGTERM and Ctrl-C save one after the running step; a second Ctrl-C does not wait for it.
+    from the last checkpoint. SIGTERM and Ctrl-C save a checkpoint after the running step; a second Ctrl-C stops at
+    once.
     """
     shared.join_processes(**machines)
     from icrl4aht_baselines.methods.registry import PLAYING
@@ -286,9 +287,9 @@ def train_command(
 def demo_command(out: Path) -> None:
     """Demonstrate every step on the bundled release.
 
-    Loads, samples and verifies it, trains Hybrid-AD on histories of a script that finds out which dish its teammate
-    wants, evaluates it on validation tasks with its memory and with its memory cleared before each episode, draws the
-    return in each episode, and writes a report of one page. Says whether the return rises by what it remembers.
+    Loads, samples and verifies the release. Trains Hybrid-AD on histories of a script that finds out which dish its
+    teammate wants. Evaluates the model on validation tasks, also with its memory cleared before each episode. Draws the
+    return in each episode, writes a report of one page, and says whether the model's memory raises the return.
     """
     from rich.console import Console
 

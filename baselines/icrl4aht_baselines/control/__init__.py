@@ -1,1 +1,1 @@
-"""Positive control: small worlds in which the methods must adapt in context."""
+"""Positive control: small environments in which the methods must adapt in context."""

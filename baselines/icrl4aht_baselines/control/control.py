@@ -1,8 +1,8 @@
-"""The positive control: AD and DPT adapt in two small worlds where adaptation in context is possible.
+"""Positive control: AD and DPT must adapt in two small environments where adaptation in context is possible.
 
-Methods, tokens, trainer and acting are those of the benchmark. DPT is compared with Thompson sampling and AD with the
-algorithm that it distils on Bernoulli bandits; AD also plays Dark Room with goals that it was not trained on. Each
-model must fail with its context cut off, which shows that the world requires adaptation.
+The methods, tokenizers and trainer of the benchmark are used. On Bernoulli bandits, DPT is compared with Thompson
+sampling, and AD with the algorithm that it distils. AD also plays Dark Room with goals that are not in its training
+data. Each model must fail with its context cut off, which shows that the environment requires adaptation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from icrl4aht_baselines.agents.egos import PlayMode, learned
+from icrl4aht_baselines.agents.egos import PlayMode, trained_policy
 from icrl4aht_baselines.control import worlds
 from icrl4aht_baselines.methods.ad import ad
 from icrl4aht_baselines.methods.dpt import dpt
@@ -31,15 +31,15 @@ DARK_ROOM_MODEL = replace(BANDIT_MODEL, width=64, heads=4)
 
 @dataclass(frozen=True)
 class ControlSize:
-    """Size of a control; the defaults take about ten minutes on two cores.
+    """Sizes of the positive control; the defaults take about ten minutes on two cores.
 
     Attributes:
         bandit_steps: steps of a bandit task, and of a context.
         room_episodes: episodes of a Dark Room task.
-        rows: histories to train on, or tasks of DPT.
-        tasks: tasks to play.
-        updates: training steps of DPT on bandits, AD on bandits, AD in Dark Room.
-        learning_rates: learning rates of these three trainings.
+        rows: number of training histories of AD, and of training tasks of DPT.
+        tasks: number of tasks in the evaluation.
+        updates: training steps of DPT on bandits, AD on bandits, and AD in Dark Room.
+        learning_rates: learning rates of the same three trainings.
         batch_size: batch size of all three trainings.
     """
 
@@ -53,14 +53,15 @@ class ControlSize:
 
 
 class ControlCheck(NamedTuple):
-    """One check of the control.
+    """A measured value of the positive control, and the limit that it has to satisfy.
 
     Attributes:
-        world, method: the world, and the method trained in it.
-        quantity: what is measured, followed by "at least" or "at most", the direction of the limit.
-        value: measured.
-        limit: bound of the value.
-        note: values for comparison.
+        world: name of the environment.
+        method: name of the method.
+        quantity: name of the measured quantity, followed by "at least" or "at most", the direction of the limit.
+        value: the measured value.
+        limit: lower or upper limit of the value.
+        note: text with values for comparison.
     """
 
     world: str
@@ -72,18 +73,18 @@ class ControlCheck(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether the value satisfies the bound."""
+        """Whether the value satisfies the limit."""
         return self.value <= self.limit if self.quantity.endswith("at most") else self.value >= self.limit
 
 
 ControlProgress = Callable[[str, int, int, float | None], None]
-"""Called with (part, its updates, updates so far, the loss last logged or None)."""
+"""Called with (name of a training, its number of updates, updates so far, last logged loss or None)."""
 
 
 def run_control(
     folder: Path, size: ControlSize | None = None, done: ControlProgress = lambda name, of, step, loss: None
 ) -> list[ControlCheck]:
-    """Train and play all three parts, or resume a stopped run of the same size. Return the checks."""
+    """Train and evaluate all three models, or resume a stopped run of the same size. Return the checks."""
     size = size or ControlSize()
     parts = (dpt_on_bandits, ad_on_bandits, ad_in_dark_room)
     return [
@@ -94,7 +95,7 @@ def run_control(
 
 
 def format_checks(checks: list[ControlCheck]) -> str:
-    """Return text with one line per check."""
+    """Return the checks as text, one line for each."""
     lines = [f"{'':4}  {'world':9}  {'method':20}  {'quantity':24}  {'value':>6}  {'limit':>6}"]
     for check in checks:
         world, method, quantity, value, limit, note = check
@@ -104,7 +105,7 @@ def format_checks(checks: list[ControlCheck]) -> str:
 
 
 def dpt_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
-    """Compare DPT's regret with that of Thompson sampling, whose posterior it approximates (Lee et al. 2023)."""
+    """Compare the regret of DPT with that of Thompson sampling, which DPT approximates (Lee et al. 2023)."""
     rng, method = np.random.default_rng(0), dpt(BANDIT_MODEL, worlds.bandit().world, finished_episodes_only=False)
     rows = [worlds.dpt_rows(count, size.bandit_steps, rng) for count in (size.rows, 256)]
     state = _train(method, rows, size, 0, folder, done)
@@ -112,7 +113,7 @@ def dpt_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[
 
 
 def ad_on_bandits(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
-    """Compare AD's regret with that of its source, upper confidence bounds."""
+    """Compare the regret of AD with that of its source algorithm, upper confidence bounds."""
     rng, method, rows = np.random.default_rng(1), ad(BANDIT_MODEL, worlds.bandit().world), []
     for count in (size.rows, 256):
         played = worlds.play_bandits(worlds.ucb, rng.random((count, worlds.ARMS)), size.bandit_steps, rng)
@@ -136,7 +137,7 @@ def _bandit_checks(
         return float((means.max(axis=1, keepdims=True) - got).sum(axis=1).mean())
 
     def model_regret(context: int) -> float:
-        policy = learned(method, state.params, context, PlayMode(greedy=False))
+        policy = trained_policy(method, state.params, context, PlayMode(greedy=False))
         return regret(worlds.play_world(worlds.bandit(), policy, jnp.asarray(means), 0, size.bandit_steps)[0])
 
     rival_regret = regret(worlds.play_bandits(rival[1], means, size.bandit_steps, rng)[0])
@@ -150,10 +151,10 @@ def _bandit_checks(
 
 
 def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list[ControlCheck]:
-    """Measure AD's return over the episodes of a task, on goals held out from training."""
+    """Measure how AD's return rises over the episodes of a Dark Room task, on goals held out from training."""
     rng, small = np.random.default_rng(2), worlds.dark_room()
     goals = np.delete(np.arange(worlds.CELLS), worlds.MIDDLE)
-    held_out, known = goals[2::5], np.delete(goals, np.s_[2::5])  # every fifth cell, spread over the room
+    held_out, known = goals[2::5], np.delete(goals, np.s_[2::5])  # held-out goals are spread over the grid
     method = ad(DARK_ROOM_MODEL, small.world)
 
     def histories(count: int, some: np.ndarray) -> Any:
@@ -167,8 +168,8 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
     steps = size.room_episodes * small.episode
 
     def share_of_best(context: int) -> np.ndarray:
-        """Return the mean share of the best return in each episode, (episodes,)."""
-        policy = learned(method, state.params, context, PlayMode(greedy=False))
+        """Return the mean of return / best possible return in each episode, (episodes,)."""
+        policy = trained_policy(method, state.params, context, PlayMode(greedy=False))
         _, rewards = worlds.play_world(small, policy, jnp.asarray(tasks, jnp.int32), 0, steps)
         returns = np.asarray(rewards).reshape(len(tasks), -1, small.episode).sum(axis=-1)
         return (returns / best[:, None]).mean(axis=0)
@@ -188,7 +189,7 @@ def ad_in_dark_room(folder: Path, size: ControlSize, done: StepProgress) -> list
 def _train(
     method: Method, rows: list[Any], size: ControlSize, number: int, folder: Path, done: StepProgress
 ) -> TrainState:
-    """Train on the first set of rows and validate on the second; `number` is that of the training in `ControlSize`."""
+    """Train on the first set of rows and validate on the second; `number` is the index into `ControlSize.updates`."""
     updates = size.updates[number]
     options = TrainOptions(
         steps=updates,

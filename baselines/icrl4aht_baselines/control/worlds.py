@@ -1,7 +1,7 @@
-"""Two small worlds in which adaptation in context is known to be possible, with the algorithms that learn in them.
+"""Two small environments in which adaptation in context is known to be possible, and algorithms that learn in them.
 
-Bernoulli bandits: arms with unknown means, uniform in 0..1. Dark Room: a square grid with an unknown goal; the ego sees
-its own cell, not the goal, and is rewarded while it is on the goal (Laskin et al. 2022).
+Bernoulli bandits have arms with unknown means, uniform in 0..1. Dark Room is a square grid with an unknown goal: the
+ego observes its position but not the goal, and is rewarded while it is on the goal (Laskin et al. 2022).
 
 Shapes: `N` tasks or histories, `T` steps.
 """
@@ -28,26 +28,26 @@ from icrl4aht_data.sampling.draws import random_uint32, scale_to_range
 
 
 class FlatEncoder(nn.Module):
-    """One dense layer, for worlds whose observation is a short vector."""
+    """Encoder with one dense layer, for observations that are short vectors."""
 
     features: int
     dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, obs: Num[Array, "*B N"]) -> Float[Array, "*B F"]:
-        """Return features of observations, which are integers or float."""
+        """Return the features of integer or float observations."""
         return orthogonal_dense(self.features)(obs.astype(self.dtype))
 
 
 class SmallWorld(NamedTuple):
-    """Rules for one task, as pure functions. A task is an array, a state an integer.
+    """Rules of a small environment, as pure functions. A task is an array, a state an integer.
 
     Attributes:
-        world: for models.
+        world: description of the environment for models.
         episode: steps of an episode; 0 for a single episode without an end.
         start: int32 (), state at the start of an episode.
-        observe: state -> observation.
-        step: (task, state, action, key) -> (state, reward).
+        observe: function from a state to the observation.
+        step: function from (task, state, action, key) to (state, reward).
     """
 
     world: World
@@ -58,11 +58,11 @@ class SmallWorld(NamedTuple):
 
 
 ARMS = 5
-"""Arms of a bandit."""
+"""Number of arms of a bandit."""
 
 
 def bandit() -> SmallWorld:
-    """Return Bernoulli bandits: a task is the arms' means, float32 (5,); a reward is 1 or 0."""
+    """Return the environment of Bernoulli bandits: a task is the arms' means, float32 (5,); a reward is 1 or 0."""
 
     def step(means: Array, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
         return state, 1.0 * (jax.random.uniform(key) < means[action])
@@ -74,23 +74,23 @@ def bandit() -> SmallWorld:
 SIDE, MOVES = 5, np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [0, 0]])
 CELLS = SIDE * SIDE
 MIDDLE = CELLS // 2
-"""Cell where episodes of Dark Room start."""
+"""Number of the grid cell where episodes of Dark Room start."""
 
 ROOM_STEPS = 10
-"""Steps of an episode of Dark Room."""
+"""Number of steps of an episode of Dark Room."""
 
 _ROWS, _COLUMNS = np.divmod(np.arange(CELLS), SIDE)
 CELL_OBS = np.concatenate([np.tri(SIDE, SIDE - 1, -1, dtype=np.uint8)[line] for line in (_ROWS, _COLUMNS)], axis=1)
-"""Observation of each cell, uint8 (cells, 2 * (SIDE - 1)): row r as r ones, then column c as c ones."""
+"""Observation in each grid cell, uint8 (cells, 2 * (SIDE - 1)): r ones for row r, then c ones for column c."""
 
 
 _TO = np.clip(np.stack([_ROWS, _COLUMNS], axis=-1)[:, None] + MOVES, 0, SIDE - 1)
 NEXT_CELLS = (_TO[..., 0] * SIDE + _TO[..., 1]).astype(np.int32)
-"""Cell after each move, int32 (cells, moves)."""
+"""Number of the grid cell that each move leads to, int32 (cells, moves)."""
 
 
 def dark_room() -> SmallWorld:
-    """Return Dark Room: a task is the goal's cell, int32 (); the reward is 1 after a step that ends on it."""
+    """Return Dark Room: a task is the number of the goal's grid cell, int32 (); a step that ends on it earns 1."""
     next_cells = jnp.asarray(NEXT_CELLS)
 
     def step(goal: Array, cell: Array, action: Array, key: Array) -> tuple[Array, Array]:
@@ -102,14 +102,14 @@ def dark_room() -> SmallWorld:
 
 
 def best_return(goal: np.ndarray) -> np.ndarray:
-    """Return the return of an episode that walks straight to the goal, float (N,)."""
+    """Return the highest possible return of a Dark Room episode: an agent walks straight to the goal, float (N,)."""
     return ROOM_STEPS + 1.0 - np.maximum(_distance(goal, np.asarray(MIDDLE)), 1)
 
 
 def play_world(
     small: SmallWorld, policy: Policy, tasks: Array, seed: int, steps: int
 ) -> tuple[Int[Array, "N T"], Float[Array, "N T"]]:
-    """Return an ego's actions and rewards in every task; its memory lasts for the task."""
+    """Play tasks with an ego that keeps its memory for a complete task. Return its actions and rewards."""
 
     def play_task(task: Array, key: Array) -> tuple[Array, Array]:
         def step(carry: Any, t: Array) -> tuple[Any, Any]:
@@ -130,18 +130,18 @@ def play_world(
 
 
 class RowSampler:
-    """Sampler for the trainer that draws from a fixed set of rows; batch i is a function of (seed, i)."""
+    """Sampler for the trainer that samples from fixed rows; batch i is a function of (seed, i)."""
 
     def __init__(self, rows: ADBatch | DPTBatch, batch_size: int, seed: int = 0) -> None:
         self.rows, self.batch_size, self.seed = rows, batch_size, seed
 
     def batch(self, i: int, out: Any = None) -> Any:
-        """Return batch i."""
+        """Return batch number i."""
         chosen = scale_to_range(random_uint32(self.seed, i, 1, self.batch_size)[0], len(self.rows[0]))
         return jax.tree.map(lambda array: array[chosen], self.rows)
 
     def empty(self) -> Any:
-        """Return a batch with the shapes and dtypes of all batches."""
+        """Return a batch as a template for the shapes and dtypes of all batches."""
         return self.batch(0)
 
 
@@ -150,12 +150,12 @@ BanditAlgorithm = Callable[[np.ndarray, np.ndarray, int, np.random.Generator], n
 
 
 def thompson(wins: np.ndarray, losses: np.ndarray, t: int, rng: np.random.Generator) -> np.ndarray:
-    """Return arms by Thompson sampling under the prior that the tasks are drawn from."""
+    """Choose arms by Thompson sampling, with the distribution of the tasks as the prior."""
     return rng.beta(1 + wins, 1 + losses).argmax(axis=1)
 
 
 def ucb(wins: np.ndarray, losses: np.ndarray, t: int, rng: np.random.Generator) -> np.ndarray:
-    """Return arms by upper confidence bounds, half as wide as UCB1's; ties are broken at random."""
+    """Choose arms by upper confidence bounds half as wide as those of UCB1; ties are broken at random."""
     pulls = wins + losses
     bound = wins / np.maximum(pulls, 1) + np.sqrt(0.5 * np.log(t + 1) / np.maximum(pulls, 1))
     return (np.where(pulls > 0, bound, 9.0) + 1e-6 * rng.random(bound.shape)).argmax(axis=1)
@@ -164,7 +164,7 @@ def ucb(wins: np.ndarray, losses: np.ndarray, t: int, rng: np.random.Generator) 
 def play_bandits(
     choose: BanditAlgorithm, means: np.ndarray, steps: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return actions int32 (N, T) and rewards float32 (N, T) of an algorithm on bandits with means (N, arms)."""
+    """Play bandits with means (N, arms). Return actions, int32 (N, T), and rewards, float32 (N, T)."""
     wins, losses = np.zeros_like(means), np.zeros_like(means)
     row, actions, rewards = np.arange(len(means)), [], []
     for t in range(steps):
@@ -178,12 +178,11 @@ def play_bandits(
 
 
 def search(goals: np.ndarray, episodes: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return histories of a model-based learner in Dark Rooms: cells and actions int32, rewards float32 (N, T).
+    """Return Dark Room histories of a learner that searches the goal: positions, actions (int32), rewards (float32).
 
-    The learner knows how it moves but not where the goal is. It walks from one random cell to the next until it is
-    rewarded, and from then on straight to the cell of that reward. Half of its moves are random at first, linearly
-    fewer later, and 3 in 100 from 0.6 of the history on, so that histories show good behaviour after few rewards as
-    well as after many.
+    The arrays have shape (N, T). The learner walks between random grid cells until it is rewarded, and from then on
+    straight to the cell of that reward. Half of its moves are random at first. The share of random moves falls linearly
+    to 3 in 100 after 60 % of the history, so that histories show good behaviour after few rewards and after many.
     """
     target = rng.integers(0, CELLS, len(goals))
     cell, known = target, np.zeros(len(goals), bool)
@@ -206,12 +205,12 @@ def search(goals: np.ndarray, episodes: int, rng: np.random.Generator) -> tuple[
 
 
 def _distance(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Return the number of moves between cells."""
+    """Return the number of moves between two grid cells."""
     return np.abs(_ROWS[one] - _ROWS[two]) + np.abs(_COLUMNS[one] - _COLUMNS[two])
 
 
 def ad_rows(obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, episode: int) -> ADBatch:
-    """Return complete histories (N, T, ..) as an AD batch of windows."""
+    """Return complete histories (N, T, ..) as the windows of an AD batch."""
     t = np.arange(actions.shape[1])
     dones = np.broadcast_to((t + 1) % episode == 0 if episode else t < 0, actions.shape)
     before = [np.pad(array[:, :-1], ((0, 0), (1, 0))) for array in (actions, rewards)]
@@ -219,9 +218,9 @@ def ad_rows(obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, episode: 
 
 
 def dpt_rows(tasks: int, context: int, rng: np.random.Generator) -> DPTBatch:
-    """Return bandits with contexts by diverse players, as DPT is trained on (Lee et al. 2023), and the best arm.
+    """Return DPT's training batch on bandits: contexts of diverse policies, and the best arms (Lee et al. 2023).
 
-    A player draws from a mixture of a random policy and one fixed arm; the arm's share is drawn from 0, 0.1, .., 1.
+    A policy is a mixture of a random policy and one fixed arm; the arm's share is sampled from 0, 0.1, .., 1.
     """
     means = rng.random((tasks, ARMS))
     share = rng.integers(0, 11, (tasks, 1)) / 10

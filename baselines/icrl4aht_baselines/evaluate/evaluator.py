@@ -1,8 +1,8 @@
 """Evaluation of an ego on tasks under a named protocol (paper, Sec. 4.3).
 
-A task is 100 episodes of 100 steps in sequence. The ego's memory lasts for the task, the teammate's for an episode. An
-episode's key is a function of (seed, task_id, episode) alone, so a task's result does not depend on what else is
-evaluated in the same batch or process. The controls of memory and partner show how much an ego earns by remembering its
+A task is a sequence of 100 episodes of 100 steps. The ego's memory lasts for the task, the teammate's for an episode.
+The random key of an episode is a function of (seed, task_id, episode), so a task's result does not depend on the other
+tasks of the same batch or process. Two controls, of memory and of partner, show how much an ego earns by remembering
 earlier episodes with the same teammate.
 """
 
@@ -76,30 +76,30 @@ def evaluate(
 ) -> list[Result]:
     """Evaluate an ego and return one result per task, in the order of `tasks`.
 
-    Shows progress, unless `played` is given: a bar, or a line a minute where stderr is no terminal.
+    Progress is shown unless `played` is given: as a bar, or as one line per minute if stderr is not a terminal.
 
     Args:
         agent: name of the ego in results and reports.
-        make_ego: layout -> ego, such as `icrl4aht_baselines.from_host(my_agent)`.
+        make_ego: function from a layout to the ego, such as `icrl4aht_baselines.from_host(my_agent)`.
         tasks: the tasks, such as `icrl4aht_baselines.test_tasks("teammate")`.
-        protocol: rules of the evaluation, one of `PROTOCOLS`, or with fewer episodes those of `get_protocol`.
+        protocol: rules of the evaluation: a name in `PROTOCOLS`, or a `Protocol`, such as one with fewer episodes.
         seeds: seeds of the episodes, such as (0, 1, 2); the ego plays every task once with each of them.
         suite: folder with the checkpoints of learned teammates, if tasks have any.
-        control: plays a control of the ego, one of `CONTROLS`. Its results have a name of their own, such as
-            "mine (cleared)". `evaluate_controls` plays the ego and all controls.
-        out: folder for one JSON file per task. Results found there under the same settings are not computed again.
-        details: further settings that the results depend on, as JSON; stored and compared with the results.
-            `trained_on` among them states the training data, which reports compare with the tasks: see
+        control: one of `CONTROLS`, to play a control instead of the ego. The control is added to the agent's name in
+            results, such as "mine (cleared)". `evaluate_controls` plays the ego and all controls.
+        out: folder for one JSON file per task. Stored results with the same settings are not computed again.
+        details: further settings that the results depend on, as JSON; stored with the results. The entry `trained_on`
+            states the training data, which reports compare with the tasks: see
             `icrl4aht_baselines.training.seen.read_trained_on`.
-        played: called with the number of episodes played since the last call, or found in `out`, for progress; by
-            several threads.
-        programs: compiled programs of earlier evaluations of the ego, to which new ones are added.
+        played: function for progress, called by several threads with the number of episodes played or found in `out`
+            since the last call.
+        programs: compiled programs of earlier evaluations of the ego; new programs are added.
 
     Raises:
-        OptionError: if `out` has results of other settings or other files, seeds are not different integers from 0,
-            the ego's actions are not integers in 0..5, or a task has no partner for the control or the protocol.
-        UnknownNameError: if there is no such protocol or control.
-        TaskFormatError: if a teammate's parameters are impossible; names the task.
+        OptionError: if `out` has results of other settings or other files, seeds are negative or repeated, the ego's
+            actions are not integers in 0..5, or a task has no partner for the control or the protocol.
+        UnknownNameError: if the protocol or the control is unknown.
+        TaskFormatError: if a teammate's parameters are invalid; the message names the task.
     """
     rules = protocol if isinstance(protocol, Protocol) else get_protocol(protocol)
     seeds = _checked_seeds(seeds)
@@ -140,13 +140,13 @@ def _checked_seeds(seeds: Sequence[int]) -> list[int]:
         raise OptionError(f"seeds = {seeds!r}: expected a sequence of integers, such as (0, 1, 2)")
     found = [check_int("seeds", seed, 0) for seed in seeds]
     if len(set(found)) < len(found):
-        raise OptionError(f"seeds = {found}: expected different ones; with equal seeds the ego plays equal episodes")
+        raise OptionError(f"seeds = {found}: expected different seeds; with equal seeds the ego plays equal episodes")
     return found
 
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """What all groups of tasks of an evaluation share."""
+    """Settings that all groups of tasks of an evaluation share."""
 
     make_ego: MakeEgo
     protocol: Protocol
@@ -157,19 +157,19 @@ class _Evaluation:
     programs: Programs
 
     def play(self, planned: Sequence[PlannedTask], played: Callable[[int], None]) -> Iterator[list[Result]]:
-        """Yield the results of groups of tasks that share compiled programs, in the order in which they finish."""
+        """Yield the results of each group of tasks that share compiled programs, as soon as the group is finished."""
         layouts = dict.fromkeys(task.layout for plan in planned for task in plan.played)
         egos = {layout: self.make_ego(layout) for layout in layouts}
         groups: dict[Any, list[PlannedTask]] = defaultdict(list)
         for plan in planned:
-            groups[tuple(_program(task, egos[task.layout], self.make_ego) for task in plan.played)].append(plan)
+            groups[tuple(_program_key(task, egos[task.layout], self.make_ego) for task in plan.played)].append(plan)
         stopped, make = Event(), self.make_ego if self.make_ego in SCRIPTED else egos.__getitem__
 
         def run(group: list[PlannedTask]) -> list[Result]:
             return self._play_group(group, make, stopped, played)
 
-        # Groups run at the same time: one compiles while another plays, and one alone does not use all cores. An ego
-        # outside JAX gets a single thread, since its `reset` must come right before its episodes.
+        # Groups run in parallel: one compiles while another plays, and a single group does not use all cores. An ego
+        # outside JAX needs a single thread, because the episodes of a group must directly follow its `reset`.
         outside = any(isinstance(ego, HostPolicy) for ego in egos.values())
         with ThreadPoolExecutor(1 if outside else min(4, usable_cores())) as pool:
             try:
@@ -182,9 +182,9 @@ class _Evaluation:
     def _play_group(
         self, group: list[PlannedTask], make_ego: MakeEgo, stopped: Event, played: Callable[[int], None]
     ) -> list[Result]:
-        """Return the results of tasks that share compiled programs; none if it was stopped."""
+        """Return the results of a group of tasks that share compiled programs; an empty list if `stopped` is set."""
         returns, count = [], len(group) * len(self.seeds)
-        for episode in self._episodes(group, make_ego):
+        for episode in self._play_segments(group, make_ego):
             if stopped.is_set():
                 return []
             ego = episode.actions[..., EGO]
@@ -200,8 +200,8 @@ class _Evaluation:
             for plan, rows in zip(group, per_task, strict=True)
         ]
 
-    def _episodes(self, group: list[PlannedTask], make_ego: MakeEgo) -> Iterator[EpisodeBatch]:
-        """Play all segments of tasks that share compiled programs; the egos keep their memory."""
+    def _play_segments(self, group: list[PlannedTask], make_ego: MakeEgo) -> Iterator[EpisodeBatch]:
+        """Play all segments of a group of tasks. The egos keep their memory from one segment to the next."""
         lengths, prepared = segment_lengths(self.protocol, self.control), None
         for number, episodes in enumerate(lengths):
             tasks = [plan.played[number] for plan in group]
@@ -212,14 +212,14 @@ class _Evaluation:
             prepared = prepared._replace(state=state)
 
 
-def _program(task: Task, ego: Policy | HostPolicy, make_ego: MakeEgo) -> tuple[Any, ...]:
-    """Return what tasks share that one compiled program plays: all that it is made of but tables and parameters."""
+def _program_key(task: Task, ego: Policy | HostPolicy, make_ego: MakeEgo) -> tuple[Any, ...]:
+    """Return the key of the compiled program that plays a task; tasks with equal keys are played together."""
     kind, heuristic = task.teammate_kind, task.teammate["kind"] == "heuristic"
     if make_ego in SCRIPTED and heuristic:
         return kind, make_ego
     if isinstance(ego, HostPolicy) or ego.sees in ("state", "observation") or not heuristic:
         return kind, task.layout
-    # A model of own channels takes the observations of layouts whose channels have equal names.
+    # A model trained on a layout's own channels can play every layout that has channels of the same names.
     names = channel_names(task.layout) if ego.sees == "ego_input" else None
     return kind, names, ego.init, ego.act, id(ego.params)
 
@@ -238,12 +238,12 @@ def _check_teammate(task: Task, suite: Path | None) -> None:
 
 
 class PreparedRollout(NamedTuple):
-    """Tasks that share a compiled program, ready to play.
+    """A group of tasks with the compiled program that plays them.
 
     Attributes:
-        rollout: the rollout of all tasks.
+        rollout: the rollout of all tasks of the group.
         state: the state before the first episode.
-        episode: compiled `EvaluationRollout.episode`.
+        episode: the compiled `EvaluationRollout.episode`.
     """
 
     rollout: EvaluationRollout
@@ -268,9 +268,9 @@ def prepare_rollout(
 
     Args:
         make_ego, tasks, protocol, seeds, suite: see `evaluate`.
-        programs: compiled programs, to use and to add to.
-        earlier: the rollout of the same tasks in the episodes before, with other teammates; the new one continues from
-            its state. None for the first episodes.
+        programs: compiled programs to reuse; new programs are added.
+        earlier: rollout of the same tasks with other teammates, from whose state the new rollout continues; None for
+            the first episodes.
 
     Raises:
         OptionError: if the ego's action is not one integer for each observation.
@@ -292,7 +292,7 @@ def prepare_rollout(
     else:
         before = earlier.rollout
         is_same = rollout.layout == before.layout and np.array_equal(rollout.numbers, before.numbers)  # type: ignore[arg-type]
-        state = earlier.state if is_same else jax.jit(rollout.enter)(earlier.state)
+        state = earlier.state if is_same else jax.jit(rollout.move_to_layouts)(earlier.state)
     programs = Programs() if programs is None else programs
     return PreparedRollout(rollout, state, programs.episode(rollout, state))
 
@@ -315,12 +315,12 @@ def play_tasks(
         One `EpisodeBatch` after another with B = tasks x seeds; seeds vary fastest.
 
     Raises:
-        OptionError: if the protocol changes teammates in these episodes, which `evaluate` alone can play.
+        OptionError: if the protocol changes teammates within these episodes, which only `evaluate` supports.
     """
     if len(segment_lengths(protocol)) > 1:
         raise OptionError(
-            f"protocol {protocol.name}: the teammate changes every {protocol.swap_every} episodes; expected at most as "
-            f"many here, found {protocol.episodes}"
+            f"protocol {protocol.name}: the teammate changes every {protocol.swap_every} episodes; expected no more "
+            f"episodes here, found {protocol.episodes}"
         )
     yield from play_episodes(prepare_rollout(make_ego, tasks, protocol, seeds, suite), forget=forget)
 
@@ -331,8 +331,8 @@ def play_episodes(
     """Play episodes of prepared tasks.
 
     Args:
-        prepared: the tasks.
-        episodes: number of episodes; by default those of the protocol.
+        prepared: the tasks, see `prepare_rollout`.
+        episodes: number of episodes; by default that of the protocol.
         forget: whether the egos' memory is cleared before each episode.
 
     Yields:
@@ -347,24 +347,24 @@ def play_episodes(
     rollout, state, episode = prepared
     clear = rollout.clear_memory if isinstance(rollout.ego, HostPolicy) else jax.jit(rollout.clear_memory)
     for _ in range(rollout.protocol.episodes if episodes is None else episodes):
-        if forget and state.env.episode.any():  # before a task's first episode there is nothing to clear
+        if forget and state.env.episode.any():  # the memory is empty before the first episode
             state = clear(state)
         try:
             state, played = jax.block_until_ready(episode(rollout.ego.params, rollout.teammate_params, state))
-        except jax.errors.JaxRuntimeError as error:  # an exception of an agent outside JAX arrives wrapped
+        except jax.errors.JaxRuntimeError as error:  # JAX wraps exceptions of agents outside JAX
             raise OptionError(f"the ego failed on {rollout.layout}: {error}") from error
         yield played
     return state
 
 
 class ControlledResults(NamedTuple):
-    """Results of an ego and of its controls: U tasks with S seeds, equal episodes with equal random keys.
+    """Results of an ego and of its controls on U tasks with S seeds; equal episodes have equal random keys.
 
     Attributes:
-        plain: results of the ego.
-        cleared: those with its memory cleared before each episode.
-        swapped: those in which another task's teammate plays all episodes but the last ones.
-        last: number of these last episodes.
+        plain: results of the ego without a control.
+        cleared: results with the ego's memory cleared before each episode.
+        swapped: results with another task's teammate in all episodes but the last ones.
+        last: number of the last episodes that the task's teammate plays under the control `swapped`.
     """
 
     plain: list[Result]
@@ -374,16 +374,16 @@ class ControlledResults(NamedTuple):
 
     @property
     def memory(self) -> Float[np.ndarray, "U S"]:
-        """M: return minus return with the memory cleared before each episode, mean over all episodes."""
-        return (_returns(self.plain) - _returns(self.cleared)).mean(axis=-1)
+        """M: return minus the return with the memory cleared before each episode, as the mean over all episodes."""
+        return (_return_array(self.plain) - _return_array(self.cleared)).mean(axis=-1)
 
     @property
     def partner(self) -> Float[np.ndarray, "U S"]:
-        """P: return in the last episodes minus return in them after episodes with another teammate."""
-        return (_returns(self.plain) - _returns(self.swapped))[..., -self.last :].mean(axis=-1)
+        """P: return in the last episodes minus the return in the same episodes after episodes with another teammate."""
+        return (_return_array(self.plain) - _return_array(self.swapped))[..., -self.last :].mean(axis=-1)
 
 
-def _returns(results: Sequence[Result]) -> Float[np.ndarray, "U S E"]:
+def _return_array(results: Sequence[Result]) -> Float[np.ndarray, "U S E"]:
     return np.array([result.returns for result in results], np.float64)
 
 
@@ -401,16 +401,16 @@ def evaluate_controls(
 
     Args:
         agent, make_ego, tasks, protocol, programs: see `evaluate`.
-        out: folder of the ego's results; those of the controls are in its folders `cleared` and `swapped`.
-        options: `seeds`, `suite` and `details` of `evaluate`.
+        out: folder of the ego's results; results of the controls are in its subfolders `cleared` and `swapped`.
+        options: further arguments of `evaluate`: `seeds`, `suite` and `details`.
 
     Raises:
-        OptionError: as `evaluate`; if a task has no partner, if there are less than 2 episodes, or if the protocol
-            swaps teammates.
+        OptionError: for the reasons of `evaluate`, if the protocol swaps teammates or has fewer than 2 episodes, or if
+            a task has no partner.
     """
     rules = protocol if isinstance(protocol, Protocol) else get_protocol(protocol)
-    plan_tasks(tasks, rules, "swapped")  # fails before hours of work
-    # Equal egos share compiled programs, and an adapter makes new functions each time it is called.
+    plan_tasks(tasks, rules, "swapped")  # raises before hours of work
+    # Only equal functions share compiled programs, and some `make_ego` return new functions in each call.
     make = make_ego if make_ego in SCRIPTED else cache(make_ego)
     options["programs"] = Programs() if programs is None else programs
     results = {

@@ -1,8 +1,8 @@
-"""Evaluation protocols, smaller versions of the benchmark, and segments of an evaluation.
+"""Protocols of evaluations, choice of tasks, controls, and the segments that a task is played in.
 
-A segment is a number of episodes in a row in which no task changes its teammate. An ego keeps its memory from one
-segment to the next and gets no sign of the change. The keys of episodes are those of the task whoever plays, so the
-last episodes of a control differ from those of the plain evaluation in nothing but the ego's memory.
+A segment is a sequence of episodes with the same teammate. An ego keeps its memory from one segment to the next and
+does not observe the change. The random keys of episodes depend on the task but not on the teammate, so the last
+episodes of a control differ from those of the evaluation without it only in the ego's memory.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Protocol:
         name: name of the protocol, one of `PROTOCOLS`.
         noise: source of the randomness of heuristic teammates, "fixed" or "seeded", see
             `icrl4aht_generation.policy.Noise`.
-        four_recipes: whether the layouts of the layout track draw from four recipes, as for the published numbers, and
-            not from their own two.
+        four_recipes: whether layouts of the layout track sample from four recipes, as for the published numbers,
+            instead of two.
         episodes: number of episodes of each task.
         steps: number of steps of each episode.
         swap_every: number of episodes after which another teammate plays; None if a task keeps its teammate.
@@ -44,27 +44,28 @@ class Protocol:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings that results store; they name `swap_every` only if teammates change."""
+        """The protocol's fields as stored with results; `swap_every` is left out if the teammate never changes."""
         fields = asdict(self)
         return fields if self.swap_every else {name: fields[name] for name in fields if name != "swap_every"}
 
     @property
     def last_episodes(self) -> int:
-        """Number of episodes at the end of a task that show what the ego has learned in it: half if they are few."""
+        """Number of episodes at the end of a task that show what the ego has learned: 20, or half of all if fewer."""
         return max(1, min(LAST_EPISODES, self.episodes // 2))
 
 
 LAST_EPISODES = 20
-"""Most episodes that count as the last ones of a task (paper, App. F)."""
+"""Largest number of episodes that count as the last ones of a task (paper, App. F)."""
 
 
 EVALUATION_SPLITS = ("test", "validation", "diverse")
-"""Tasks in the package: the published test tasks, and two sets of validation tasks, by which models are chosen. Their
-teammates are of the published training ranges, or diverse, see `icrl4aht_generation.teammates.draws`."""
+"""Splits of the package's tasks: the published test tasks, and two sets of validation tasks to choose models by.
+Teammates of `validation` have parameters of the published training ranges, those of `diverse` vary more, see
+`icrl4aht_generation.teammates.draws`."""
 
 
 def test_tasks(track: str, layout: str | None = None, family: str | None = None) -> list[Task]:
-    """Return the benchmark's test tasks of a track, perhaps only those on a layout or with a teammate family.
+    """Return the benchmark's test tasks of a track, optionally only those on one layout or with one teammate family.
 
     Args:
         track: "teammate" or "layout".
@@ -73,7 +74,7 @@ def test_tasks(track: str, layout: str | None = None, family: str | None = None)
 
     Raises:
         UnknownNameError: for an unknown track or layout.
-        EmptySelectionError: if the track has no such test task.
+        EmptySelectionError: if the track has no test task on the layout with the family.
     """
     name = None if layout is None else get_layout(layout).name
     every = bundled_tasks(track, "test")
@@ -88,10 +89,10 @@ def test_tasks(track: str, layout: str | None = None, family: str | None = None)
 
 
 def bundled_tasks(track: str, split: str) -> list[Task]:
-    """Return the tasks of a track that are in the package.
+    """Return the package's tasks of a track and a split.
 
     Args:
-        track: the track.
+        track: name of the track.
         split: one of `EVALUATION_SPLITS`.
 
     Raises:
@@ -108,15 +109,15 @@ PROTOCOLS = {
     "seeded": Protocol("seeded", noise="seeded", four_recipes=False),
     "swap": Protocol("swap", noise="seeded", four_recipes=False, swap_every=25),
 }
-"""Protocols by name: `published`, to compare with the paper's numbers; `seeded`, the default, to report; `swap`, the
-same with another teammate every 25 episodes, without a sign."""
+"""Protocols by name: `published` to compare with the paper's numbers, `seeded` (the default) to report results, and
+`swap`, which is `seeded` with an unannounced change of the teammate every 25 episodes."""
 
 
 def get_protocol(name: str, episodes: int | None = None) -> Protocol:
-    """Return the protocol called `name`; `episodes`, if given, replaces its number of episodes per task.
+    """Return a protocol by its name, optionally with another number of episodes per task.
 
     Raises:
-        UnknownNameError: if there is no such protocol; lists the valid names and the nearest.
+        UnknownNameError: if the name is unknown; the message lists the valid names.
         OptionError: if the number of episodes is not positive.
     """
     if name not in PROTOCOLS:
@@ -129,9 +130,9 @@ def get_protocol(name: str, episodes: int | None = None) -> Protocol:
 
 
 def hidden_recipe_note(tasks: Sequence[Task]) -> str:
-    """Return a sentence that names the layouts on which no observation shows the ego the wanted dish; empty if none.
+    """Return a sentence that names the layouts whose observations do not show the ordered dish; empty without any.
 
-    Layouts with a single recipe do not count, unless the tasks fix one of several.
+    Layouts with a single recipe are not named, unless their tasks have a fixed dish, which is one of several.
     """
     hidden = [task for task in tasks if not task.layout.shows_recipe]
     hidden = [task for task in hidden if len(task.layout.recipes) > 1 or task.recipes is not None]
@@ -143,9 +144,9 @@ def hidden_recipe_note(tasks: Sequence[Task]) -> str:
 
 
 def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
-    """Return the first `count` tasks of each cell, a layout with a teammate kind, in order; all tasks for None.
+    """Return the first `count` tasks of each combination of layout and teammate kind; all tasks if `count` is None.
 
-    A count of 2 chooses up to 2 tasks in each of the cells, not 2 tasks in all.
+    A count of 2 chooses up to 2 tasks of each combination, not 2 tasks in all.
 
     Raises:
         OptionError: if `count` is not positive.
@@ -153,7 +154,7 @@ def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
     if count is None:
         return list(tasks)
     if count < 1:
-        raise OptionError(f"tasks = {count}: expected at least 1 of each family and layout")
+        raise OptionError(f"tasks = {count}: expected at least 1 task of each family and layout")
     taken: dict[tuple[str, str], int] = defaultdict(int)
     chosen = []
     for task in tasks:
@@ -166,22 +167,22 @@ def limit_tasks(tasks: Sequence[Task], count: int | None) -> list[Task]:
 
 Control = Literal["cleared", "swapped"]
 CONTROLS: dict[Control, str] = {"cleared": "forget", "swapped": "swapped"}
-"""Control of an evaluation -> its mark in the details of results. `cleared`: the ego's memory is cleared before each
-episode. `swapped`: the teammate of another task plays all episodes but the last ones, see `Protocol.last_episodes`."""
+"""Name of a control -> key that marks its results in their `details`. `cleared`: the ego's memory is cleared before
+each episode. `swapped`: another task's teammate plays all episodes but the last, see `Protocol.last_episodes`."""
 
 
 def controlled_name(agent: str, control: Control) -> str:
-    """Return the name that the results of an agent's control have, such as "mine (cleared)"."""
+    """Return an agent's name in the results of a control, such as "mine (cleared)"."""
     return f"{agent} ({control})"
 
 
 class PlannedTask(NamedTuple):
-    """A task with what is played in each segment.
+    """A task with the teammates that play its segments.
 
     Attributes:
-        task: the task.
-        played: one task per segment: with the id of `task`, and the teammate and the recipes of a partner.
-        partners: ids of the partners, one per segment; empty if there is one segment.
+        task: the evaluated task.
+        played: for each segment, `task` with the teammate and the recipes of its partner task.
+        partners: ids of the partner tasks, one per segment; empty if there is only one segment.
     """
 
     task: Task
@@ -190,10 +191,10 @@ class PlannedTask(NamedTuple):
 
 
 def segment_lengths(protocol: Protocol, control: Control | None = None) -> tuple[int, ...]:
-    """Return the number of episodes of each segment.
+    """Return the number of episodes of each segment of a task.
 
     Raises:
-        OptionError: if teammates are to be swapped in a task of one episode, or under a protocol that swaps them, too.
+        OptionError: for the control `swapped`, if tasks have one episode or the protocol already swaps teammates.
     """
     if control == "swapped":
         if protocol.swap_every or protocol.episodes < 2:
@@ -207,15 +208,15 @@ def segment_lengths(protocol: Protocol, control: Control | None = None) -> tuple
 
 
 def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | None = None) -> list[PlannedTask]:
-    """Return what tasks play in each segment.
+    """Return the tasks with the teammate of each segment, which is that of the task or of a partner task.
 
-    A task's partner is of the next other family on its layout, in the order of `tasks` and in turn: the first task of a
-    family has the first one of the next family, and so on; if all are of one family, it is the next task with another
-    teammate. Under the control `swapped` the partner's teammate plays first. Under a protocol that swaps teammates, the
-    task's own is followed by that of its partner, of the partner's partner, and so on.
+    The partner task is on the same layout and of the next teammate family, in the order of `tasks`: the first task of a
+    family gets the first task of the next family, and so on. If all tasks are of one family, the partner is the next
+    task with another teammate. Under the control `swapped`, the partner's teammate plays first. Under a protocol that
+    swaps teammates, the task's teammate plays first, then that of its partner, then that of the partner's partner.
 
     Raises:
-        OptionError: if a task has no partner; names the task. See also `segment_lengths`.
+        OptionError: if a task has no partner (the message names the task), or see `segment_lengths`.
     """
     segments = len(segment_lengths(protocol, control))
     if segments == 1:
@@ -223,30 +224,30 @@ def plan_tasks(tasks: Sequence[Task], protocol: Protocol, control: Control | Non
     by_layout: dict[str, list[Task]] = defaultdict(list)
     for task in tasks:
         by_layout[task.layout.name].append(task)
-    partner = {task.task_id: _partner(task, by_layout[task.layout.name]) for task in tasks}
+    partner = {task.task_id: _swap_partner(task, by_layout[task.layout.name]) for task in tasks}
     planned = []
     for task in tasks:
         chain = [task]
         for _ in range(segments - 1):
             chain.append(partner[chain[-1].task_id])
         chain = chain[::-1] if control == "swapped" else chain
-        # The id stays, so that keys of episodes do, and the last episodes start as those of the plain evaluation.
+        # The task id is kept, so that the keys and initial states of episodes are those of the evaluated task.
         played = tuple(replace(task, teammate=one.teammate, recipes=one.recipes) for one in chain)
         planned.append(PlannedTask(task, played, tuple(one.task_id for one in chain)))
     return planned
 
 
-def _partner(task: Task, on_layout: Sequence[Task]) -> Task:
-    def other_dish(other: Task) -> bool:
-        # A task with recipes of its own hides them from the ego, so that its partner has to want others, too.
+def _swap_partner(task: Task, on_layout: Sequence[Task]) -> Task:
+    def has_other_dish(other: Task) -> bool:
+        # If a task fixes the dish, the ego does not see it, so the partner has to want another dish as well.
         return task.recipes is None or other.recipes != task.recipes
 
     ids = [other.task_id for other in on_layout]
     following = [*on_layout[ids.index(task.task_id) + 1 :], *on_layout[: ids.index(task.task_id)]]
-    families = [other.teammate_family for other in following if other_dish(other)]
+    families = [other.teammate_family for other in following if has_other_dish(other)]
     if other_families := [family for family in families if family != task.teammate_family]:
-        # Of the next family the task of the same number, so that the tasks of a cell have different partners.
-        partners = [one for one in on_layout if one.teammate_family == other_families[0] and other_dish(one)]
+        # The partner has the same number in the next family, so that tasks of a family get different partners.
+        partners = [one for one in on_layout if one.teammate_family == other_families[0] and has_other_dish(one)]
         own = [one.task_id for one in on_layout if one.teammate_family == task.teammate_family]
         return partners[own.index(task.task_id) % len(partners)]
     behaviour = teammate_id(task.teammate), task.recipes
@@ -254,6 +255,6 @@ def _partner(task: Task, on_layout: Sequence[Task]) -> Task:
         if (teammate_id(other.teammate), other.recipes) != behaviour:
             return other
     raise OptionError(
-        f"task {task.task_id}: needs a task on {task.layout.name} with another teammate to swap with, found none among "
-        f"the {len(on_layout)} given ones on it: give more tasks, of several families if possible"
+        f"task {task.task_id}: expected another task on {task.layout.name} with another teammate to swap with, found "
+        f"none among {len(on_layout)} tasks: give more tasks, of several families if possible"
     )

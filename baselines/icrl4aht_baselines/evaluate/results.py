@@ -1,4 +1,4 @@
-"""Results of evaluation: one JSON file per task, with the settings that it was made under."""
+"""Results of an evaluation: one JSON file per task, which also holds the settings of the evaluation."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Result:
 
     Attributes:
         task_id: id of the task.
-        settings: agent, seeds, protocol, version and details that the result depends on.
-        returns: return of the team in each episode: one list per seed with one number per episode.
-        partners: ids of the tasks that the teammates of each segment come from, see `evaluate.protocols`; empty if the
-            task's own teammate played all episodes.
+        settings: agent, seeds, protocol, code version and further details that the result depends on.
+        returns: return of the team in each episode, as one list per seed with one number per episode.
+        partners: for each segment, id of the task that the teammate comes from, see `evaluate.protocols`; empty if the
+            task's teammate played all episodes.
     """
 
     task_id: str
@@ -33,13 +33,13 @@ class Result:
     partners: list[str] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the result's JSON file; `partners` only if there are some."""
+        """Return the content of the result's JSON file, without `partners` if the list is empty."""
         content = {"settings_hash": json_hash(self.settings), **asdict(self)}
         return content if self.partners else {name: content[name] for name in content if name != "partners"}
 
 
 RESULTS = "tasks"
-"""Name of the folder with the JSON files, in a folder of results."""
+"""Name of the subfolder with the JSON files, in a folder of results."""
 
 
 def result_path(out: Path, task_id: str) -> Path:
@@ -53,17 +53,17 @@ def find_results(
     settings: dict[str, Any],
     partners: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> dict[str, Result]:
-    """Return the results of tasks that a folder of results has, by task id.
+    """Return task id -> stored result, for those tasks that a folder of results has.
 
     Args:
-        out: the folder.
-        tasks: the tasks.
-        settings: the settings of the results.
-        partners: task id -> `Result.partners`; none by default.
+        out: folder of results.
+        tasks: tasks to find results of.
+        settings: settings that the results must have.
+        partners: task id -> `Result.partners` that its result must have; empty by default.
 
     Raises:
-        OptionError: if a result was made under other settings or with other partners, or its file is damaged, or if the
-            folder is no folder of results and has other files.
+        OptionError: if a result has other settings or partners, a file is damaged, or the folder has other files and no
+            results.
     """
     if not (out / RESULTS).is_dir():
         check_folder_content(out, (), "results of `evaluate`")
@@ -81,7 +81,7 @@ def find_results(
 
 
 def read_result(path: Path) -> Result:
-    """Return the result in a file.
+    """Return the result that is stored in a JSON file.
 
     Raises:
         OptionError: if the file is not a result, or its settings do not match their hash.

@@ -1,4 +1,4 @@
-"""Evaluation episodes of an ego and teammates, as pure JAX functions, and their compiled programs.
+"""Evaluation episodes of an ego and its teammates, as pure JAX functions and as compiled programs.
 
 Shapes: `B` tasks (times seeds) of one teammate family, `T` steps of an episode, `S` bytes of a state record.
 """
@@ -27,7 +27,7 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import EGO, TEAMMATE
 from icrl4aht_data.overcooked.layouts import LAYOUTS, Layout, with_recipes
 
-EGO_STEPS, TEAMMATE_STEPS = 2, 3  # key streams within an episode, distinct from those of the agent slots
+EGO_STEPS, TEAMMATE_STEPS = 2, 3  # numbers of random key streams; 0 and 1 are those of the agents' memories
 
 
 class RolloutState(NamedTuple):
@@ -36,7 +36,7 @@ class RolloutState(NamedTuple):
     Attributes:
         env: states of the B environments.
         ego: memories of the egos, a pytree of arrays (B, ...).
-        before: outcome of the previous step, arrays (B,); its `obs` is not used.
+        before: outcome of the previous step, arrays (B,); the field `obs` is not used.
     """
 
     env: EnvState
@@ -62,17 +62,17 @@ class EpisodeBatch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EvaluationRollout:
-    """Episodes of B tasks that share a teammate family, on one layout or on several.
+    """Rollout of B tasks that share a teammate family, on one layout or on several.
 
-    On several layouts the ego and the teammates are policies that see a `Situation`, or egos of the canonical channels
-    or of the layouts' own channels, if these are the same.
+    On several layouts, every policy must take an input of the same form on all of them: a `Situation`, observations
+    with the canonical channels, or observations with the layouts' own channels if these are equal.
 
     Attributes:
-        layout: the layout of all tasks, or several.
+        layout: the layout of all tasks, or a sequence of layouts.
         ego: the ego, which plays all tasks.
         teammates: the B teammates, policies of one family.
         protocol: rules of the evaluation.
-        numbers: int (B,), number of each task's layout; None for one layout.
+        numbers: int (B,), index of each task's layout in `layout`; None for one layout.
     """
 
     layout: Layout | Sequence[Layout]
@@ -83,10 +83,10 @@ class EvaluationRollout:
 
     @cached_property
     def env(self) -> Environment:
-        """The environment of the layouts under the protocol."""
+        """Environment of all layouts, with the recipes and the episode length of the protocol."""
         if isinstance(self.layout, Layout):
-            return Environment(_played(self.layout, self.protocol), self.protocol.steps)
-        return Environment([_played(one, self.protocol) for one in self.layout], self.protocol.steps)
+            return Environment(_protocol_layout(self.layout, self.protocol), self.protocol.steps)
+        return Environment([_protocol_layout(one, self.protocol) for one in self.layout], self.protocol.steps)
 
     @cached_property
     def teammate_params(self) -> Any:
@@ -94,17 +94,17 @@ class EvaluationRollout:
         return stacked(mate.params for mate in self.teammates)
 
     def start(self, keys: jax.Array) -> RolloutState:
-        """Return the state before the first episode from task keys (B,)."""
+        """Return the state before the first episode, from the random keys of the tasks (B,)."""
         return RolloutState(self.env.init(keys, self._layout_numbers()), self._begin(keys), no_outcome(keys.shape[0]))
 
     def clear_memory(self, state: RolloutState) -> RolloutState:
-        """Return a state between two episodes with the egos' memory as before a task's first episode."""
+        """Return a state between two episodes in which the egos' memories are reset to those of a new task."""
         return state._replace(ego=self._begin(state.env.key), before=no_outcome(state.env.key.shape[0]))
 
-    def enter(self, state: RolloutState) -> RolloutState:
-        """Return a state between two episodes of another rollout of the same tasks, to continue on this one's layouts.
+    def move_to_layouts(self, state: RolloutState) -> RolloutState:
+        """Return another rollout's state between two episodes, moved to the layouts of this rollout.
 
-        Keys and the number of the episode remain, and so do the egos' memories.
+        Both rollouts are of the same tasks. Random keys, the number of the episode and the egos' memories are kept.
         """
         numbers = self._layout_numbers()
         record = self.env.first_record(state.env.key, state.env.episode, numbers)
@@ -112,7 +112,7 @@ class EvaluationRollout:
 
     def _begin(self, keys: jax.Array) -> Any:
         """Return the egos' memories before the first episode."""
-        ego_keys = _fold_all(keys, EGO)
+        ego_keys = _fold_keys(keys, EGO)
         if isinstance(self.ego, HostPolicy):
             return self.ego.init(self.ego.params, ego_keys)
         return jax.vmap(self.ego.init, in_axes=(None, 0))(self.ego.params, ego_keys)
@@ -121,7 +121,7 @@ class EvaluationRollout:
         return None if self.numbers is None else jnp.asarray(self.numbers, jnp.int32)
 
     def ego_actions(self, params: Any, state: RolloutState, keys: jax.Array) -> tuple[Int[Array, " B"], Any]:
-        """Return the egos' actions in the next step, and their memories after it."""
+        """Return the egos' actions in the next step, and their memories after the step."""
         if self.ego.sees not in ("ego_input", "canonical_input"):
             return self.env.act(self.ego, params, state.ego, state.env, EGO, keys, own=False)
         view = state.before._replace(obs=self.env.observe_one(state.env, EGO, self.ego.sees == "canonical_input"))
@@ -130,19 +130,19 @@ class EvaluationRollout:
         return jax.vmap(self.ego.act, in_axes=(None, 0, 0, 0))(params, state.ego, view, keys)
 
     def episode(self, ego_params: Any, mate_params: Any, state: RolloutState) -> tuple[RolloutState, EpisodeBatch]:
-        """Return the state after one episode of every task, and the episode. To be jitted by the caller."""
+        """Play one episode of every task. Return the state after it, and the episode. Callers compile this method."""
         mate = self.teammates[0]
-        # Teammates restart in each episode from its key; egos keep their memory and get new keys.
+        # In each episode teammates start with a new memory, while egos keep theirs.
         keys = self.env.episode_key(state.env)
-        memories = jax.vmap(mate.init)(mate_params, _fold_all(keys, TEAMMATE))
-        ego_keys, mate_keys = _fold_all(keys, EGO_STEPS), _fold_all(keys, TEAMMATE_STEPS)
+        memories = jax.vmap(mate.init)(mate_params, _fold_keys(keys, TEAMMATE))
+        ego_keys, mate_keys = _fold_keys(keys, EGO_STEPS), _fold_keys(keys, TEAMMATE_STEPS)
 
         def step(carry: Any, t: Array) -> tuple[Any, Any]:
             state, memories, _ = carry
             now = state.env
-            mine, egos = self.ego_actions(ego_params, state, _fold_all(ego_keys, t))
+            mine, egos = self.ego_actions(ego_params, state, _fold_keys(ego_keys, t))
             theirs, memories = self.env.act(
-                mate, mate_params, memories, now, TEAMMATE, _fold_all(mate_keys, t), own=True
+                mate, mate_params, memories, now, TEAMMATE, _fold_keys(mate_keys, t), own=True
             )
             after = self.env.step(now, jnp.stack([mine, theirs], axis=-1))
             before = state.before._replace(
@@ -158,8 +158,8 @@ class EvaluationRollout:
 
 
 @lru_cache(maxsize=64)
-def _played(layout: Layout, protocol: Protocol) -> Layout:
-    """Return a layout with the recipes that the protocol draws from; recipes of a task's own remain."""
+def _protocol_layout(layout: Layout, protocol: Protocol) -> Layout:
+    """Return a layout with the recipes of the protocol, unless the task fixes the recipes."""
     published = LAYOUTS.get(layout.name)
     four = protocol.four_recipes and any(layout.name in names for names in TRACKS["layout"].values())
     if not four or published is None or layout.recipes != published.recipes:
@@ -168,29 +168,29 @@ def _played(layout: Layout, protocol: Protocol) -> Layout:
 
 
 def no_outcome(batch: int) -> EgoInput:
-    """Return the outcome of the previous step before the first step of B tasks."""
+    """Return the outcome of the previous step for the first step of B tasks, which consists of zeros."""
     zero = jnp.zeros(batch, jnp.int32)
     return EgoInput(jnp.zeros((batch, 0)), zero, jnp.zeros(batch), zero, jnp.zeros(batch, bool))
 
 
-def _fold_all(keys: jax.Array, data: Any) -> jax.Array:
+def _fold_keys(keys: jax.Array, data: Any) -> jax.Array:
     return jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, data)
 
 
 def task_key(seed: int, task_id: str) -> jax.Array:
-    """Return the key from which all randomness of a task's episodes is derived."""
+    """Return the random key of a task, from which the keys of all of its episodes are derived."""
     digest = hashlib.sha256(task_id.encode()).digest()
     return jax.random.fold_in(jax.random.key(seed), int.from_bytes(digest[:4], "big"))
 
 
 EpisodeProgram = Callable[..., tuple[RolloutState, EpisodeBatch]]
-"""Compiled `EvaluationRollout.episode`."""
+"""Type of a compiled `EvaluationRollout.episode`."""
 
 
 class Programs:
-    """Compiled episodes of one or several evaluations of an ego; `len` is their number.
+    """Cache of compiled episodes that several evaluations of an ego can share; `len` is the number of programs.
 
-    Threads may share it: each program is compiled once.
+    The cache is thread-safe: each program is compiled once.
     """
 
     def __init__(self) -> None:
@@ -201,11 +201,11 @@ class Programs:
         return len(self._found)
 
     def episode(self, rollout: EvaluationRollout, state: RolloutState) -> EpisodeProgram:
-        """Return the compiled episode of a rollout.
+        """Return the compiled program for an episode of a rollout, from the cache if possible.
 
         Args:
             rollout: the rollout.
-            state: a state between two of its episodes.
+            state: a state of the rollout between two episodes.
 
         Raises:
             OptionError: if the ego's action is not one integer for each observation.
@@ -215,7 +215,7 @@ class Programs:
         policies = [(policy.init, policy.act, policy.sees) for policy in (rollout.ego, rollout.teammates[0])]
         layouts = rollout.layout if isinstance(rollout.layout, Layout) else tuple(rollout.layout)
         shapes = tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
-        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # others are in states and policies
+        rules = rollout.protocol.steps, rollout.protocol.four_recipes  # further rules are part of states and policies
         key = layouts, rules, *policies, structure, shapes
         mine = Future[EpisodeProgram]()
         with self._lock:
@@ -235,7 +235,7 @@ def _compile(rollout: EvaluationRollout, arguments: tuple[Any, Any, RolloutState
 
 
 def _check_actions(rollout: EvaluationRollout, state: RolloutState) -> None:
-    """Trace one step of the egos, which yields shape and dtype of their actions without computing any."""
+    """Check shape and dtype of the egos' actions by tracing one step, which computes nothing."""
     keys = state.env.key
     actions, _ = jax.eval_shape(rollout.ego_actions, rollout.ego.params, state, keys)
     if actions.shape != keys.shape or not jnp.issubdtype(actions.dtype, jnp.integer):

@@ -1,4 +1,4 @@
-"""Algorithm Distillation (paper, App. E.2): predict the source algorithm's next action from everything before it.
+"""Algorithm Distillation (paper, App. E.2): predict the source algorithm's next action from the history before it.
 
 Shapes: `B` batch size, `L` length of a window, `D` width, `N` entries of an observation.
 """
@@ -35,8 +35,8 @@ class StepOutput(NamedTuple):
     """Output of a `StepModel`.
 
     Attributes:
-        head: the head's output, float (B, L, ..).
-        next_obs: float (B, L, N), predicted observation after taking the action; None without +next_obs.
+        head: output of the model's head, float (B, L, ..).
+        next_obs: float (B, L, N), predicted observation after the action; None without +next_obs.
     """
 
     head: Any
@@ -47,9 +47,9 @@ class WindowMemory(NamedTuple):
     """Memory of an acting ego: the steps of its window, and the trunk's memory of these steps.
 
     Attributes:
-        tokens: float32 (K, D), the window's steps in order, at the front.
+        tokens: float32 (K, D), tokens of the window's steps, followed by unused rows.
         steps: int32 (), number of steps in the window.
-        trunk: the trunk's memory of these steps; None if every step computes the complete window.
+        trunk: the trunk's memory of these steps; None if the complete window is computed in every step.
     """
 
     tokens: Float[Array, "K D"]
@@ -58,11 +58,11 @@ class WindowMemory(NamedTuple):
 
 
 class StepModel(nn.Module):
-    """Model of AD, Hybrid-AD and AMAGO-Offline: steps to tokens, a trunk, a head.
+    """Model of AD, Hybrid-AD and AMAGO-Offline: a tokenizer of steps, a trunk, and a head.
 
-    A trunk takes complete sequences of tokens (B, L, D), and one token at a time through `start(context)` or
-    `start_after(tokens, context)` and `advance(token, memory)`. Its features at a position depend on the tokens up to
-    there, so padding, which comes last, needs no mask before the loss.
+    A trunk takes complete sequences of tokens (B, L, D), or one token at a time by `advance(token, memory)`, with a
+    memory from `start(context)` or `start_after(tokens, context)`. A trunk is causal, and padding is at the end of
+    sequences, so padding needs no mask except in the loss.
     """
 
     tokens: StepTokens
@@ -73,7 +73,7 @@ class StepModel(nn.Module):
     def __call__(
         self, steps: StepInput, actions: Int[Array, "B L"] | None = None, deterministic: bool = True
     ) -> StepOutput:
-        """Return the output for windows of steps, with the auxiliary prediction if actions are given."""
+        """Return the output for windows of steps, with predicted observations if actions are given."""
         trunk: Any = self.trunk
         tokens_BxLxD = self.tokens(steps, deterministic)
         features_BxLxD = trunk(tokens_BxLxD, deterministic=deterministic)
@@ -87,9 +87,9 @@ class StepModel(nn.Module):
         return WindowMemory(jnp.zeros((context, self.tokens.width)), jnp.int32(0), states)
 
     def act(self, step: StepInput, done: Bool[Array, ""], memory: WindowMemory) -> tuple[Any, WindowMemory]:
-        """Return the head's output for one step of an ego, and the memory with the step."""
+        """Return the head's output for one step of an acting ego, and the memory that includes this step."""
         trunk: Any = self.trunk
-        tokens, steps, states = self._with_room(memory)
+        tokens, steps, states = self._drop_if_full(memory)
         token = self.tokens(step)
         tokens = tokens.at[steps].set(token)
         if states is None:
@@ -98,11 +98,10 @@ class StepModel(nn.Module):
             feature, states = trunk.advance(token, states)
         return self.head(feature), WindowMemory(tokens, steps + 1, states)
 
-    def _with_room(self, memory: WindowMemory) -> WindowMemory:
-        """Return the memory, dropping the oldest steps of a full window and recomputing the trunk's memory, if any.
+    def _drop_if_full(self, memory: WindowMemory) -> WindowMemory:
+        """Return the memory with space for a step: a full window loses its oldest steps.
 
-        A kept step's keys and values were computed when it could still see the steps that go, so all are computed
-        again, as if the kept steps were all that ever happened.
+        The trunk's memory is then computed again from the remaining steps, because it depends on the dropped steps.
         """
         trunk, variables = self.trunk.unbind()
         context = len(memory.tokens)
@@ -119,20 +118,20 @@ class StepModel(nn.Module):
 
 
 def dropped_steps(context: int) -> int:
-    """Return how many steps a full window of `context` steps loses at once in cached acting: a fifth.
+    """Return the number of steps that a full window of `context` steps loses at once in cached acting: a fifth.
 
-    So the window has 4/5 of the context or more, and 4 tokens are computed again for every step.
+    A full window then has at least 4/5 of the context, and on average 4 tokens are computed again for each step.
     """
     return max(1, context // 5)
 
 
 def make_step_model(options: ModelOptions, world: World, trunk: nn.Module, head: nn.Module) -> StepModel:
-    """Return a model of steps with the given trunk and head."""
+    """Return a `StepModel` with the given trunk and head."""
     return StepModel(make_tokens(StepTokens, options, world), trunk, head, make_next_obs_head(options, world))
 
 
 def step_method(name: str, label: str, model: StepModel, loss: Loss, world: World, **settings: Any) -> Method:
-    """Return a method that learns from AD's batches; `settings` are further fields of `Method`."""
+    """Return a method that is trained on AD batches; `settings` are further fields of `Method`."""
     example = example_step(world)
     return Method(
         name=name, label=label, data="ad", model=model, example=(example, example.prev_action), loss=loss, **settings
@@ -140,31 +139,31 @@ def step_method(name: str, label: str, model: StepModel, loss: Loss, world: Worl
 
 
 def example_step(world: World) -> StepInput:
-    """Return a step of zeros, (1, 1)."""
+    """Return a `StepInput` of zeros with shape (1, 1), to initialise parameters with."""
     zero = jnp.zeros((1, 1), jnp.int32)
     return StepInput(jnp.zeros((1, 1, *world.obs_shape)), zero, jnp.zeros((1, 1)), zero)
 
 
 def auxiliary_losses(output: StepOutput, steps: StepInput, batch: ADBatch, world: World) -> dict[str, Array]:
-    """Return the loss of the model's prediction of the next observation, by name; empty if there is none."""
+    """Return name -> loss of the predicted next observations; empty for a model without +next_obs."""
     if output.next_obs is None:
         return {}
-    # The loss is over the steps whose next step is in the window and in the same episode.
+    # A prediction has a target only if the next step is in the same window and the same episode.
     errors = squared_error(output.next_obs[:, :-1], world.observations(steps.obs)[:, 1:])
     valid = jnp.asarray(batch.attention_mask)[:, 1:] & ~jnp.asarray(batch.dones)[:, :-1]
     return {"next_obs_loss": mean_of_rows(errors, valid)}
 
 
 def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
-    """Return AD's loss: cross-entropy of the target actions, over valid positions (paper, App. E.2).
+    """Return AD's loss function: cross-entropy of the target actions over valid positions (paper, App. E.2).
 
-    The targets are the actions taken, or labels.
+    The target actions are the actions of the history, or its labels.
     """
 
     def loss(params: Any, slow: Any, batch: ADBatch, key: Any) -> tuple[Array, dict[str, Array]]:
         steps, mask = batch_steps(batch, world.view), jnp.asarray(batch.attention_mask)
         targets = jnp.asarray(batch.target_actions)
-        # The action taken is the next step's previous action; the last step has none and is not predicted.
+        # The next step states the action of a step; the last step has no next one, and is not used by the loss.
         taken = jnp.roll(steps.prev_action, -1, axis=1)
         output: StepOutput = run_model(model, options, params, key, steps, taken)
         errors = cross_entropy(output.head, targets, options.label_smoothing)
@@ -182,7 +181,7 @@ def action_loss(model: StepModel, options: ModelOptions, world: World) -> Loss:
 def action_method(
     name: str, label: str, make_trunk: Callable[[ModelOptions], nn.Module]
 ) -> Callable[[ModelOptions, World], Method]:
-    """Return the maker of Algorithm Distillation on a trunk."""
+    """Return a function from (ModelOptions, World) to Algorithm Distillation with the given kind of trunk."""
 
     def make(options: ModelOptions, world: World) -> Method:
         model = make_step_model(options, world, make_trunk(options), nn.Dense(world.actions))
@@ -193,4 +192,4 @@ def action_method(
 
 
 ad = action_method("ad", "AD", make_transformer)
-"""Maker of AD; 3,283,870 parameters at C = 40 channels."""
+"""Function that makes AD; the model has 3,283,870 parameters for C = 40 channels."""

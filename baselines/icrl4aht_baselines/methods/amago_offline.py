@@ -1,10 +1,10 @@
-"""AMAGO-Offline (paper, Sec. 5.4): an actor-critic on the sequence encoder that maximises return, offline.
+"""AMAGO-Offline (paper, Sec. 5.4): an offline actor-critic on the sequence encoder.
 
-As in AMAGO (Grigsby et al. 2024), actor and critics share the encoder and exist once for each of several discount
-factors; the ego acts by the longest. Returns continue over episodes, as an in-context learner's do, so that what an
-episode reveals is worth what later episodes gain by it. The actor's loss imitates the actions whose estimated advantage
-is positive (filtered behaviour cloning) and raises the expected value of its own actions (the Q term). The critics
-learn by one-step bootstrapping from a slow copy of the parameters. No input says how far training had come.
+As in AMAGO (Grigsby et al. 2024), actor and critics share the encoder, and there is one policy and one value for each
+of several discount factors; the ego acts by the last one. Returns continue over episodes, so exploration that helps in
+later episodes is rewarded. The actor imitates the actions whose estimated advantage is positive (filtered behaviour
+cloning), and maximises the expected value of its policy (Q term). The critics learn by one-step bootstrapping from a
+slow copy of the parameters. The model does not observe how far the source algorithm's training had progressed.
 
 Shapes: `B` batch size, `L` length of a window, `G` discount factors, `A` actions, `D` width.
 """
@@ -26,17 +26,17 @@ from icrl4aht_baselines.methods.tokens import batch_steps
 from icrl4aht_data.sampling.ad import ADBatch
 
 CRITICS = 2
-"""Number of critics; the lowest estimate counts (clipped double Q)."""
+"""Number of critics, of whose estimates the minimum is used (clipped double Q-learning)."""
 
 REWARD_SCALE = 0.05
-"""Scale of rewards: values are in deliveries, which earn 20 points each."""
+"""Factor of the rewards: a delivery earns 20 points, so values count deliveries."""
 
 Q_WEIGHT, CRITIC_WEIGHT, SLOW = 0.1, 1.0, 0.005
-"""Weights of the Q term and of the critics' loss; share of the parameters that enters the slow copy each step."""
+"""Weight of the Q term, weight of the critics' loss, and step size of the slow copy of the parameters."""
 
 
 class ActorCriticOutput(NamedTuple):
-    """Policies and action values, one for each of G discount factors.
+    """Policy logits and action values for each of G discount factors.
 
     Attributes:
         logits: float32 (*B, G, A).
@@ -48,7 +48,7 @@ class ActorCriticOutput(NamedTuple):
 
 
 class ActorCriticHead(nn.Module):
-    """Actor and critics on shared features, each with one hidden layer."""
+    """Actor and critics with one hidden layer each, on shared features."""
 
     width: int
     discounts: int
@@ -65,7 +65,7 @@ class ActorCriticHead(nn.Module):
 
 
 def amago_offline(options: ModelOptions, world: World) -> Method:
-    """Return an offline actor-critic on AD's tokens and transformer."""
+    """Return the method AMAGO-Offline, with AD's tokenizer and transformer."""
     head = ActorCriticHead(options.width, len(options.discounts), world.actions)
     model = make_step_model(options, world, make_transformer(options), head)
     discounts_G = jnp.asarray(options.discounts)
@@ -79,14 +79,14 @@ def amago_offline(options: ModelOptions, world: World) -> Method:
         policy_BxLxGxA = jax.nn.softmax(online.logits)
         taken_BxLx1xA = jax.nn.one_hot(actions, world.actions)[:, :, None]
 
-        # Critics: r + discount * E[Q_slow(next)] under the policy; a step's reward is an input of the step after it.
+        # Critics' target: r + discount * E[Q_slow(next)] under the policy. The next step's input states the reward.
         next_value = jnp.sum(jax.lax.stop_gradient(policy_BxLxGxA) * target.values.min(axis=0), axis=-1)[:, 1:]
         reward = REWARD_SCALE * jnp.asarray(batch.prev_rewards)[:, 1:, None]
         bootstrap = jax.lax.stop_gradient(reward + discounts_G * next_value)  # (B, L - 1, G)
         error = jnp.square(jnp.sum(online.values * taken_BxLx1xA, axis=-1)[:, :, :-1] - bootstrap)
         critic = mean_of_rows(error.mean(axis=(0, -1)), mask[:, 1:])
 
-        # Actor: imitate what the critics estimate to be better than the policy's mean, and raise that mean.
+        # Actor: imitate actions with a value above the policy's expected value, and maximise that expected value.
         values_BxLxGxA = jax.lax.stop_gradient(online.values.min(axis=0))
         baseline_BxLxG = jnp.sum(policy_BxLxGxA * values_BxLxGxA, axis=-1)
         better = jnp.sum(values_BxLxGxA * taken_BxLx1xA, axis=-1) > jax.lax.stop_gradient(baseline_BxLxG)

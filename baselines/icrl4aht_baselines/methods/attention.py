@@ -1,9 +1,9 @@
-"""Attention in training, for sequences of a context and of queries about it.
+"""Causal attention in training, optionally with queries that attend to a context.
 
 Shapes: `B` batch size, `N` tokens, `K` tokens of a context, `H` heads, `Dh` width of a head, `R` rows of a block.
-Queries are computed a block of rows at a time. In short sequences a block has `SHORT_ROWS` rows and leaves out the keys
-that none of its rows sees. In longer ones a block has `LONG_ROWS` rows and is computed again in the backward pass:
-memory grows with LONG_ROWS x N instead of N x N.
+Queries are computed in blocks of rows. For short sequences, a block has `SHORT_ROWS` rows and skips the keys that none
+of its rows may attend to. For longer sequences, a block has `LONG_ROWS` rows and is computed again in the backward
+pass, so memory grows with LONG_ROWS x N instead of N x N.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 SHORT_ROWS, LONG_ROWS = 64, 512
-"""Query rows computed at once; sequences of up to `LONG_ROWS` tokens, such as the paper's 500, are short."""
+"""Number of query rows in a block, for short and for long sequences; short ones have up to `LONG_ROWS` tokens."""
 
 
 def causal_attention(q: Array, k: Array, v: Array, *own: Array) -> Float[Array, "B N H Dh"]:
-    """Return attention in which each token sees those up to itself.
+    """Return causal attention: each token attends to itself and the tokens before it.
 
     Args:
         q: queries (B, N, H, Dh).
-        k, v: keys and values of the same tokens; or (B, K, H, Dh) of a context, if there are `own` ones.
-        own: key and value of each query (B, N, H, Dh), which is then no token of the context: query j sees the first j
-            tokens and itself.
+        k, v: keys and values of the same tokens (B, N, H, Dh); with `own`, those of a context (B, K, H, Dh).
+        own: if given, key and value of each query (B, N, H, Dh). Query j then attends to the first j tokens of the
+            context and to itself.
     """
     seen_by_first = 0 if own else 1
     q, k, v = (x.swapaxes(1, 2) for x in (q / q.shape[-1] ** 0.5, k, v))
@@ -42,12 +42,12 @@ def causal_attention(q: Array, k: Array, v: Array, *own: Array) -> Float[Array, 
 
 
 def _map_long_blocks(seen_by_first: int, k: Array, v: Array, *rows: Array) -> Array:
-    """Attend with `LONG_ROWS` rows at a time, arrays (B, H, N, Dh)."""
+    """Return causal attention of arrays (B, H, N, Dh), computed in blocks of `LONG_ROWS` rows."""
     batch, heads, length, width = rows[0].shape
     blocks = -(-length // LONG_ROWS)
     padding = ((0, 0), (0, 0), (0, blocks * LONG_ROWS - length), (0, 0))
     split = [jnp.moveaxis(jnp.pad(x, padding).reshape(batch, heads, blocks, LONG_ROWS, width), 2, 0) for x in rows]
-    # The checkpoint keeps a block's weights, R x N, out of what the backward pass stores.
+    # `jax.checkpoint` avoids storing the attention weights of all blocks for the backward pass.
     attend = jax.checkpoint(lambda seen, *block: _attend(seen, k, v, *block))
     found = jax.lax.map(lambda block: attend(*block), (seen_by_first + LONG_ROWS * jnp.arange(blocks), *split))
     return jnp.moveaxis(found, 0, 2).reshape(batch, heads, -1, width)[:, :, :length]
@@ -60,9 +60,9 @@ def _attend(
     q_BxHxRxDh: Float[Array, "B H R Dh"],
     *own_BxHxRxDh: Float[Array, "B H R Dh"],
 ) -> Float[Array, "B H R Dh"]:
-    """Return the attention of a block of rows: row i sees the first `seen` + i keys.
+    """Return the attention of a block of rows: row i attends to the first `seen` + i keys.
 
-    Weights are divided by their sum after they were applied, to (R, Dh) instead of (R, N) numbers.
+    The softmax is normalised after the product with the values: R x Dh divisions instead of R x N.
     """
     dtype = q_BxHxRxDh.dtype
     product: Any = partial(

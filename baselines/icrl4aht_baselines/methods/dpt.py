@@ -1,9 +1,9 @@
-"""Decision-Pretrained Transformer (paper, App. E.3): the expert's action at a query, from a context of transitions.
+"""Decision-Pretrained Transformer (paper, App. E.3): predict an expert's action from a context of transitions.
 
-The query follows its context, [c_1 .. c_K, q]. Its answer, read at the last position, has seen all of the context, and
-an acting ego computes the context once for many queries. The loss with prior poses the query after every part of the
-context, c_1 .. c_j for j = 0..K, as K + 1 copies of the query that each see their part and themselves. Several queries
-of one context are posed in turn: query j mod Q after the first j transitions.
+The query observation follows its context, [c_1 .. c_K, q], and the model's output at the query is the predicted action.
+An acting ego therefore computes the context once for many queries. The loss has a prediction after every prefix of the
+context, c_1 .. c_j for j = 0..K: the sequence has K + 1 copies of the query, and copy j attends to the first j
+transitions and to itself. With several queries per context, copy j is of query j mod Q.
 
 Shapes: `B` batch size, `Q` queries of a context, `K` transitions of a context, `D` width, `A` actions, `N` entries of
 an observation.
@@ -40,8 +40,8 @@ class DPTOutput(NamedTuple):
     """Output of `DPT`.
 
     Attributes:
-        logits: float (B, K + 1, A), the policy after the first j transitions, j = 0..K.
-        next_obs: float (B, K - 1, N), predictions for transitions 2..K from those before each; None without +next_obs.
+        logits: float (B, K + 1, A), logits of the policy after the first j transitions, j = 0..K.
+        next_obs: float (B, K - 1, N), predicted next observations of transitions 2..K; None without +next_obs.
     """
 
     logits: Float[Array, "B K+1 A"]
@@ -49,18 +49,17 @@ class DPTOutput(NamedTuple):
 
 
 class DPTMemory(NamedTuple):
-    """Memory of an acting ego: its transitions, as a ring of S = K + KEPT_STEPS slots.
+    """Memory of an acting ego: its latest transitions, in a ring buffer of S = K + KEPT_STEPS slots.
 
-    The transitions of the running episode are stored, but not visible before the episode ends.
+    Transitions of the running episode are stored, but the model does not use them before the episode ends.
 
     Attributes:
         tokens: float32 (S, D), tokens of the transitions; transition i is in slot i % S.
-        written: int32 (), transitions so far.
-        complete: int32 (), transitions of finished episodes.
-        context: the transformer's memory of the last K transitions of finished episodes, with one slot more, for the
-            query.
+        written: int32 (), number of transitions so far.
+        complete: int32 (), number of transitions in finished episodes.
+        context: the transformer's memory of the last K transitions of finished episodes, and one slot for the query.
         last_obs: float32, observation before the last action.
-        started: bool (), whether a step was taken.
+        started: bool (), whether the ego has taken a step.
     """
 
     tokens: Float[Array, "S D"]
@@ -72,9 +71,10 @@ class DPTMemory(NamedTuple):
 
 
 class DPT(nn.Module):
-    """Model that maps a context of transitions and a query to a policy.
+    """Model that maps a context of transitions and a query observation to a policy.
 
-    `finished_episodes_only`: an acting ego's context grows by complete episodes, as in the paper; otherwise by steps.
+    With `finished_episodes_only`, an acting ego's context grows by complete episodes, as in the paper; otherwise by
+    single steps.
     """
 
     tokens: TransitionTokens
@@ -85,40 +85,39 @@ class DPT(nn.Module):
     finished_episodes_only: bool = True
 
     def __call__(self, context: Transition, query: Any, deterministic: bool = True) -> DPTOutput:
-        """Return the answers to one query (B, ..) or several (B, Q, ..) after every part of a context (B, K)."""
+        """Return the predictions after every prefix of a context (B, K), for queries (B, ..) or (B, Q, ..)."""
         tokens_BxKxD, obs_features = self.tokens.context(context, deterministic)
         batch, length, width = tokens_BxKxD.shape
         queries_BxQxD = self.tokens.query(query, deterministic).reshape(batch, -1, width)
-        sequence = jnp.concatenate([tokens_BxKxD, _in_turn(queries_BxQxD, length)], axis=1)
+        sequence = jnp.concatenate([tokens_BxKxD, _repeat_in_turn(queries_BxQxD, length)], axis=1)
         features = self.trunk(sequence, context=length, deterministic=deterministic)
         features, answers = features[:, :length], features[:, length:]
         predicted = None
         if self.next_obs is not None:
-            # A transition's token holds its outcome, so the prediction reads the features before it, and its first
-            # observation by itself.
+            # A transition's token includes the next observation, so the prediction uses the features of the transition
+            # before it and the encoding of its first observation.
             known = jnp.concatenate([features[:, :-1], obs_features[:, 1:]], axis=-1)
             predicted = self.next_obs(known, context.action[:, 1:])
         return DPTOutput(self.head(answers), predicted)
 
     def start(self, context: int, cached: bool) -> DPTMemory:
-        """Return the memory of an ego before its first step: room for K transitions and a running episode.
+        """Return the memory of an ego before its first step, for K transitions and a running episode.
 
-        The context is computed when it changes, which is exact, so `cached` has no effect.
+        `cached` has no effect, because the context is computed again whenever it changes, which is exact.
         """
         tokens, zero = jnp.zeros((context + KEPT_STEPS, self.tokens.width)), jnp.int32(0)
         return DPTMemory(tokens, zero, zero, self.trunk.start(context + 1), jnp.zeros(self.obs_shape), jnp.bool_(False))
 
     def act(self, step: StepInput, done: Bool[Array, ""], memory: DPTMemory) -> tuple[Float[Array, " A"], DPTMemory]:
-        """Return the policy for one step of an ego, and the memory with the outcome of the step before.
+        """Return the policy for one step of an acting ego, and the memory that includes the previous transition.
 
-        An episode's last transition is left out: its successor in that episode is never shown, and the first
-        observation of the next episode is not its successor.
+        The last transition of an episode is left out, because its next observation is never shown to the ego.
         """
         obs = step.obs.astype(jnp.float32)
         both = jnp.stack([memory.last_obs, obs])
         transition = Transition(both, step.prev_action, step.prev_reward, step.prev_teammate_action)
         token, query = self.tokens.context(transition)[0], self.tokens.query(obs)
-        # Without a new transition `written` stays, and the next step overwrites the token added here.
+        # If there is no new transition, `written` does not change, and the next step overwrites this token.
         tokens = memory.tokens.at[memory.written % len(memory.tokens)].set(token)
         written = memory.written + (memory.started & ~done)
         complete = jnp.where(done, written, memory.complete) if self.finished_episodes_only else written
@@ -133,18 +132,18 @@ class DPT(nn.Module):
 
         changed = done if self.finished_episodes_only else jnp.bool_(True)
         seen = change_if(changed, compute, (variables, tokens, complete), memory.context)
-        # The query follows the valid transitions, and the next query takes its slot.
+        # The query takes the slot after the last transition, where the next query will overwrite it.
         feature, seen = self.trunk.advance(query, seen._replace(written=jnp.minimum(complete, context)))
         return self.head(feature), DPTMemory(tokens, written, complete, seen, obs, jnp.bool_(True))
 
 
-def _in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Array, "B K+1 ..."]:
-    """Return one value for every part of a context of K = `length` transitions: value j mod Q after the first j."""
+def _repeat_in_turn(values: Shaped[Array, "B Q ..."], length: int) -> Shaped[Array, "B K+1 ..."]:
+    """Return one of Q values for each of the K + 1 prefixes of a context, K = `length`: value j mod Q for prefix j."""
     return values[:, jnp.arange(length + 1) % values.shape[1]]
 
 
 def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True) -> Method:
-    """Return the Decision-Pretrained Transformer; 3,285,022 parameters at C = 40 channels."""
+    """Return the method DPT; its model has 3,285,022 parameters for C = 40 channels."""
     tokens = make_tokens(TransitionTokens, options, world)
     head, next_obs = nn.Dense(world.actions), make_next_obs_head(options, world)
     model = DPT(tokens, make_transformer(options), head, world.obs_shape, next_obs, finished_episodes_only)
@@ -153,7 +152,7 @@ def dpt(options: ModelOptions, world: World, finished_episodes_only: bool = True
         context, query = batch_transitions(batch, world.view)
         output: DPTOutput = run_model(model, options, params, key, context, query)
         batch_size, answers = output.logits.shape[:2]
-        target = _in_turn(jnp.asarray(batch.query_target).reshape(batch_size, -1), answers - 1)
+        target = _repeat_in_turn(jnp.asarray(batch.query_target).reshape(batch_size, -1), answers - 1)
         total = cross_entropy(output.logits, target, options.label_smoothing).mean()
         hits = output.logits.argmax(axis=-1) == target
         log = {"action_loss": total, "accuracy": hits[:, -1].mean(), "prior_accuracy": hits[:, 0].mean()}

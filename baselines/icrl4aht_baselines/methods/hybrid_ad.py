@@ -1,6 +1,6 @@
-"""Hybrid-AD (paper, Sec. 5.3, "Recurrent Architecture Variant"): AD's loss on a recurrent state tracker.
+"""Hybrid-AD (paper, Sec. 5.3, "Recurrent Architecture Variant"): AD with GRU layers instead of a transformer.
 
-Shapes: `B` batch size, `N` tokens of a sequence, `D` width, `S` numbers of the state: layers x D.
+Shapes: `B` batch size, `N` tokens of a sequence, `D` width, `S` size of the recurrent state: layers x D.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from icrl4aht_baselines.methods.ad import action_method
 
 
 class RecurrentTrunk(nn.Module):
-    """GRU layers, each a scan over time, and a last layer norm, with the interface of `Transformer`.
+    """GRU layers followed by a layer norm, with the interface of `Transformer`.
 
-    The state starts from zero at a window's first step and continues over episodes, as a transformer's context does.
+    The recurrent state is zero at a window's first step, and is not reset at the end of an episode.
     """
 
     layers: int = 2
@@ -33,7 +33,7 @@ class RecurrentTrunk(nn.Module):
         return jnp.swapaxes(self.follow(jnp.swapaxes(x, 0, 1), zeros, deterministic)[0], 0, 1)
 
     def start(self, context: int) -> Float[Array, " S"]:
-        """Return the state before the first token, whatever the context's length."""
+        """Return the state before the first token; `context` has no effect."""
         return jnp.zeros(self.layers * self.width)
 
     def start_after(self, x: Float[Array, "N D"], context: int) -> Float[Array, " S"]:
@@ -43,14 +43,14 @@ class RecurrentTrunk(nn.Module):
     def advance(
         self, x: Float[Array, " D"], state: Float[Array, " S"]
     ) -> tuple[Float[Array, " D"], Float[Array, " S"]]:
-        """Return the features of one more token, and the state after it."""
+        """Return the features of the next token, and the state after this token."""
         features, state = self.follow(x[None, None], state[None])
         return features[0, 0], state[0]
 
     def follow(
         self, x: Float[Array, "N B D"], state: Float[Array, "B S"], deterministic: bool = True
     ) -> tuple[Float[Array, "N B D"], Float[Array, "B S"]]:
-        """Return the features of B sequences with time on the first axis, and the state after them."""
+        """Return the features of B sequences, with time on the first axis, and the states after the sequences."""
         no_reset, last_states = jnp.zeros(x.shape[:2], bool), []
         for gru, layer in zip(self.grus, jnp.split(state, self.layers, axis=-1), strict=True):
             layer, x = gru(layer, x, no_reset)
@@ -62,4 +62,4 @@ class RecurrentTrunk(nn.Module):
 hybrid_ad = action_method(
     "hybrid_ad", "Hybrid-AD", lambda options: RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
 )
-"""Maker of Hybrid-AD; 913,310 parameters at C = 40 channels."""
+"""Function that makes Hybrid-AD; the model has 913,310 parameters for C = 40 channels."""

@@ -1,4 +1,4 @@
-"""Parts that all methods share: `World`, the interface `Method` for trainer and egos, and losses.
+"""Parts that all methods share: the environment's description `World`, the interface `Method`, and losses.
 
 Shapes: `B` batch size, `L` length of a window, `K` length of a context, `A` number of actions, `N` entries of an
 observation, `F` features.
@@ -24,22 +24,22 @@ from icrl4aht_baselines.methods.transformer import Transformer
 from icrl4aht_data.overcooked.actions import ACTIONS
 
 Loss = Callable[[Any, Any, Any, Any], tuple[Array, dict[str, Array]]]
-"""(parameters, slow parameters or None, batch, dropout key or None) -> what to minimise, and numbers to log."""
+"""Function from (parameters, slow parameters or None, batch, dropout key or None) to the loss and numbers to log."""
 
 TokensType = TypeVar("TokensType", bound=Tokens)
 Changed = TypeVar("Changed")
 
 
 class World(NamedTuple):
-    """Description of the world that a model acts in.
+    """Description of the environment that a model acts in.
 
     Attributes:
-        encoder: dtype -> module from observations, or what `view` makes of a batch, to features.
+        encoder: function from a dtype to the encoder, a module from observations or the output of `view` to features.
         obs_shape: shape of one observation.
         view: function that returns the encoder's input for a batch.
         actions: number of actions.
         observations: function from the encoder's input (*B, ..) back to observations.
-        partners: number of teammates, if the ego is told in every step which one it plays with; otherwise 0.
+        partners: number of teammates, if the ego observes in every step which one it plays with; otherwise 0.
     """
 
     encoder: Callable[[Any], nn.Module]
@@ -52,18 +52,18 @@ class World(NamedTuple):
 
 @dataclass(frozen=True)
 class Method:
-    """A method of training: its model, data and loss; a function of (ModelOptions, World) makes it.
+    """A training method: model, data and loss. A function of (ModelOptions, World) makes each method.
 
     Attributes:
-        name: as in `registry.METHODS`.
+        name: name in `registry.METHODS`.
         label: name in reports.
-        data: what it is trained on: batches of the sampler "ad" or "dpt", or "tasks" that it plays.
+        data: training data: batches of the sampler "ad" or "dpt", or "tasks" for a method that learns by playing.
         model: module with the methods `start` and `act`.
-        example: arguments that the model's parameters are made for.
-        loss: see `Loss`.
-        logits: the policy's logits (*B, A) in the model's output.
-        slow: share of the parameters that enters the slow copy each step; 0 for a method without a slow copy.
-        takes_labels: whether it can learn labels, actions that others would have taken; DPT needs them.
+        example: example arguments of the model, to initialise its parameters with.
+        loss: loss function, see `Loss`.
+        logits: function from the model's output to the policy's logits (*B, A).
+        slow: step size of the slow copy of the parameters; 0 for a method without a slow copy.
+        takes_labels: whether the method can learn labels, such as expert actions, instead of the histories' actions.
     """
 
     name: str
@@ -77,37 +77,37 @@ class Method:
     takes_labels: bool = True
 
     def init(self, key: Array) -> Any:
-        """Return initial parameters, float32."""
+        """Return randomly initialised parameters, float32."""
         return jax.jit(self.model.init)(key, *self.example)["params"]
 
     def start(self, context: int, cached: bool) -> Any:
         """Return the memory of an ego before its first step.
 
         Args:
-            context: K, the steps or transitions that it remembers; older ones do not influence its actions.
-            cached: whether the memory keeps what was computed for each step; otherwise it keeps tokens, and each step
-                computes the complete context. See `agents.egos.ACTING`.
+            context: K, number of steps or transitions in the memory; older ones do not influence the actions.
+            cached: whether the memory stores the results of earlier computations; otherwise the complete context is
+                computed in each step. See `agents.egos.ACTING`.
         """
         return self.model.apply({}, context, cached, method="start")
 
     def act(self, params: Any, step: StepInput, done: Bool[Array, ""], memory: Any) -> tuple[Float[Array, " A"], Any]:
-        """Return policy logits, float32, and the memory after one step; `done`: the step before ended an episode."""
+        """Return policy logits, float32, and the new memory; `done`: whether the previous step ended an episode."""
         output, memory = self.model.apply({"params": params}, step, done, memory, method="act")  # type: ignore[misc]
         return self.logits(output).astype(jnp.float32), memory
 
 
 def compute_dtype(options: ModelOptions) -> Any:
-    """Return the dtype of activations."""
+    """Return the dtype of a model's activations."""
     return jnp.bfloat16 if options.bfloat16 else jnp.float32
 
 
 def make_transformer(options: ModelOptions) -> Transformer:
-    """Return the transformer of these options."""
+    """Return the transformer with the architecture that the options state."""
     return Transformer(options.layers, options.width, options.heads, options.dropout, options.positions, options.remat)
 
 
 def make_tokens(kind: type[TokensType], options: ModelOptions, world: World, **own: Any) -> TokensType:
-    """Return a tokenizer of the given class for a world, with further arguments of that class."""
+    """Return a tokenizer of the class `kind`; `own` are further arguments of this class."""
     dtype = compute_dtype(options)
     return kind(
         encoder=world.encoder(dtype),
@@ -122,7 +122,7 @@ def make_tokens(kind: type[TokensType], options: ModelOptions, world: World, **o
 
 
 class NextObsHead(nn.Module):
-    """Prediction of the next observation, flat, from features and the action (paper, App. F, "Auxiliary Loss")."""
+    """Head that predicts the flat next observation from features and action (paper, App. F, "Auxiliary Loss")."""
 
     width: int
     actions: int
@@ -136,32 +136,32 @@ class NextObsHead(nn.Module):
 
 
 def make_next_obs_head(options: ModelOptions, world: World) -> NextObsHead | None:
-    """Return the head of the auxiliary loss, or None without +next_obs."""
+    """Return the head that predicts the next observation; None for models without +next_obs."""
     return NextObsHead(options.width, world.actions, int(np.prod(world.obs_shape))) if options.next_obs else None
 
 
 def squared_error(predicted: Float[Array, "*B N"], obs: Num[Array, "*B ..."]) -> Float[Array, "*B"]:
-    """Return the squared error of predicted observations, mean over an observation's entries."""
+    """Return the mean squared error of each predicted observation."""
     target = obs.astype(jnp.float32).reshape(predicted.shape)
     return jnp.square(predicted.astype(jnp.float32) - target).mean(axis=-1)
 
 
 def cross_entropy(logits: Float[Array, "*B A"], action: Int[Array, "*B"], smoothing: float) -> Float[Array, "*B"]:
-    """Return the cross-entropy of actions against a policy, with label smoothing."""
+    """Return the cross-entropy between actions and a policy's logits, with label smoothing."""
     target = optax.smooth_labels(jax.nn.one_hot(action, logits.shape[-1]), smoothing)
     return optax.softmax_cross_entropy(logits.astype(jnp.float32), target)
 
 
 def mean_of_rows(values: Float[Array, "B L"], mask: Bool[Array, "B L"]) -> Float[Array, ""]:
-    """Return the mean over rows of the mean over each row's valid positions (the paper's 1/|M|).
+    """Return the mean over rows of the mean over the row's valid positions (1/|M| in the paper).
 
-    Rows weigh the same whatever their padding, so the loss of a batch is the mean of the losses of its parts.
+    All rows have the same weight, so the loss of a batch is the mean of the losses of its parts.
     """
     return (jnp.where(mask, values, 0.0).sum(axis=1) / jnp.maximum(mask.sum(axis=1), 1)).mean()
 
 
 def run_model(model: nn.Module, options: ModelOptions, params: Any, key: Any, *inputs: Any, **named: Any) -> Any:
-    """Return the model's output, computed in the dtype of the options; with dropout if there is a key."""
+    """Return the model's output, computed in the dtype of the options, with dropout if `key` is not None."""
     dtype = compute_dtype(options)
     params = jax.tree.map(lambda leaf: leaf.astype(dtype), params)
     rngs = {} if key is None else {"dropout": key}
@@ -171,14 +171,14 @@ def run_model(model: nn.Module, options: ModelOptions, params: Any, key: Any, *i
 def change_if(
     condition: Bool[Array, ""], change: Callable[[Any, Changed], Changed], params: Any, memory: Changed
 ) -> Changed:
-    """Return `change(params, memory)` if the condition holds, otherwise the memory.
+    """Return `change(params, memory)` if the condition holds, otherwise `memory`.
 
-    `jax.vmap` turns `jax.lax.cond` into a selection, which computes both branches in every step. Here the change is
-    computed only in steps in which the condition holds for at least one row of the batch.
+    `jax.vmap` turns `jax.lax.cond` into a selection, which always computes both branches. This function, however,
+    computes the change only if the condition holds for at least one row of the batch.
 
     Args:
         condition: bool ().
-        change: pure function that uses no other arrays than its arguments, and keeps shapes and dtypes of the memory.
+        change: pure function of its arguments alone; the result has the shapes and dtypes of `memory`.
         params: pytree of arrays.
         memory: pytree of arrays.
     """

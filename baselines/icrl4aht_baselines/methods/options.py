@@ -1,4 +1,4 @@
-"""Hyper-parameters of the models, without JAX, so that the command line can show them."""
+"""Hyper-parameters of the models; imports no JAX, so that the help of commands is printed quickly."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Positions = Literal["none", "rope"]
 
 
 class ModelSize(NamedTuple):
-    """Values of `ModelOptions` and `TrainOptions` of a named model size.
+    """Values of `ModelOptions` and `TrainOptions` for a named model size.
 
     Attributes:
-        steps: training steps.
+        steps: number of training steps.
         context: K, steps of a window or transitions of a context.
-        cpu_batch: rows of a batch on a CPU.
+        cpu_batch: default batch size on a CPU.
         layers, width, heads, positions, encoder: see `ModelOptions`.
     """
 
@@ -36,12 +36,12 @@ class ModelSize(NamedTuple):
 
     @property
     def model(self) -> dict[str, Any]:
-        """Values of `ModelOptions`."""
+        """Values of `ModelOptions` for this size."""
         return {name: getattr(self, name) for name in ("layers", "width", "heads", "positions", "encoder")}
 
     @property
     def train(self) -> dict[str, Any]:
-        """Values of `TrainOptions`, without the batch size, which depends on the device."""
+        """Values of `TrainOptions` for this size, without the batch size, which depends on the device."""
         return {"steps": self.steps, "context": self.context}
 
 
@@ -51,7 +51,7 @@ SIZES = {
     "medium": ModelSize(8, 512, 50_000),
     "large": ModelSize(12, 768, 100_000),
 }
-"""Sizes by name: one for two cores of a CPU, and the paper's (Sec. 5.3, "Model Scale and Training Budget")."""
+"""Model sizes by name: `tiny` for two CPU cores, and the paper's (Sec. 5.3, "Model Scale and Training Budget")."""
 
 RL2_SETTINGS: dict[str, dict[str, Any]] = {
     "model": {
@@ -72,7 +72,7 @@ RL2_SETTINGS: dict[str, dict[str, Any]] = {
         "save_every": 200,
     },
 }
-"""Defaults of RL^2: values of `ModelOptions` and of `TrainOptions`, for two cores of a CPU."""
+"""Default values of `ModelOptions` and of `TrainOptions` for RL^2 on two CPU cores."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class ModelOptions:
     """Architecture of a model; the defaults are the paper's (App. E.5).
 
     Raises:
-        OptionError: if a value is out of bounds, or the width is not a multiple of twice the heads.
+        OptionError: if a value is out of bounds, or the width is not a multiple of twice the number of heads.
     """
 
     layers: Annotated[Count, Option("Layers of the transformer.")] = 4
@@ -116,4 +116,4 @@ UNUSED_BY_RL2 = {
     *("layers", "heads", "positions", "remat", "discounts", "dropout", "next_obs", "label_smoothing", "bfloat16"),
     *("context", "accumulate", "weight_decay", "validate_every", "validation_batches"),
 }
-"""Options of models and of trainings that RL^2 does not use."""
+"""Names of the options of models and trainings that RL^2 does not use."""

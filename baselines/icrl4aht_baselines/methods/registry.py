@@ -1,4 +1,4 @@
-"""Methods by name, and OvercookedV2 as the world they act in."""
+"""Methods by name, and the description of OvercookedV2 that models are made for."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ METHODS: dict[str, Callable[[ModelOptions, World], Method]] = {
     "amago_offline": amago_offline,
     "rl2": rl2,
 }
-"""Methods: name -> function from (ModelOptions, World) to the method. Scripts may add theirs."""
+"""Name -> function from (ModelOptions, World) to the method. Scripts may add methods."""
 
 METHOD_PLUGINS = Plugins(METHOD_GROUP, METHODS)
-"""Methods of other installed packages, which are trained on histories."""
+"""Methods that other installed packages register; they must learn from histories."""
 
 PLAYING = ("rl2",)
-"""Methods that are trained by playing."""
+"""Names of the methods that are trained by playing, not on histories."""
 
 
 def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
     """Return the function that makes a method from (ModelOptions, World).
 
     Raises:
-        UnknownNameError: if there is no such method; lists the valid names and the nearest.
-        PluginError: if a registered method cannot be used; also raised by the returned function.
+        UnknownNameError: if the name is unknown; the message lists the valid names.
+        PluginError: if another package's method cannot be used; the returned function may raise it as well.
     """
     if name in METHODS:
         return METHODS[name]
@@ -65,7 +65,7 @@ def get_method(name: str) -> Callable[[ModelOptions, World], Method]:
 
 
 def all_methods() -> list[str]:
-    """Return the names of all methods, those of other packages last."""
+    """Return the names of all methods, with those of other packages at the end."""
     return [*METHODS, *METHOD_PLUGINS.names]
 
 
@@ -76,13 +76,13 @@ def overcooked_world(
     canonical: bool = False,
     partners: int = 0,
 ) -> World:
-    """Return the world of OvercookedV2 on layouts with observations of one shape.
+    """Return OvercookedV2 on some layouts, all with observations of one shape, as a `World`.
 
     Args:
-        layouts: the layouts in batches.
+        layouts: layouts of the batches.
         encoder: kind of the encoder, see `EncoderKind`.
-        view: function that returns the observations of a batch; by default the batches hold state records, of which the
-            encoder's compact input is made.
+        view: function that returns the encoder's input for a batch; by default batches hold state records, which are
+            converted to the encoder's compact input.
         canonical: whether observations have the canonical channels, which all layouts share, or the layouts' own.
         partners: see `World`.
     """

@@ -1,6 +1,6 @@
-"""RL^2 (Duan et al. 2016): a recurrent policy whose state lives through all episodes of a task, trained by PPO.
+"""RL^2 (Duan et al. 2016): a recurrent policy trained by PPO, with a state that lasts for all episodes of a task.
 
-The model reads AD's tokens and acts as all other models do. `icrl4aht_baselines.online.rl2` trains it by playing.
+The model has AD's tokenizer and the interface of the other models. `icrl4aht_baselines.online.rl2` trains it.
 
 Shapes: `B` batch size, `T` steps, `A` actions, `D` width, `S` size of the recurrent state.
 """
@@ -22,11 +22,11 @@ from icrl4aht_baselines.methods.tokens import StepInput, StepTokens
 
 
 class PolicyValue(NamedTuple):
-    """Output of the model.
+    """Output of the RL^2 model.
 
     Attributes:
-        logits: float32 (*B, A), of the policy.
-        value: float32 (*B,), estimated discounted reward to come, in the unit of the training's rewards.
+        logits: float32 (*B, A), logits of the policy.
+        value: float32 (*B,), estimated discounted sum of future rewards, which are scaled as in training.
     """
 
     logits: Float[Array, "*B A"]
@@ -34,7 +34,7 @@ class PolicyValue(NamedTuple):
 
 
 class PolicyValueHead(nn.Module):
-    """Actor and critic on shared features, each with one hidden layer."""
+    """Actor and critic with one hidden layer each, on shared features."""
 
     width: int
     actions: int
@@ -48,35 +48,35 @@ class PolicyValueHead(nn.Module):
 
 
 class RL2Model(nn.Module):
-    """Tokens of steps, GRU layers, and the head. The state is one array of S = layers x D numbers."""
+    """Model of RL^2: tokenizer of steps, GRU layers, and head. The recurrent state has S = layers x D numbers."""
 
     tokens: StepTokens
     trunk: RecurrentTrunk
     head: PolicyValueHead
 
     def __call__(self, steps: StepInput, state: Float[Array, "B S"]) -> tuple[PolicyValue, Float[Array, "B S"]]:
-        """Return the output at T steps of B tasks, inputs (T, B, ..), and the state after the last one."""
+        """Return the output for T steps of B tasks, inputs (T, B, ..), and the state after the last step."""
         features, state = self.trunk.follow(self.tokens(steps), state)
         return self.head(features), state
 
     def start(self, context: int, cached: bool) -> Float[Array, " S"]:
-        """Return the state before a task; both arguments have no effect, since a recurrent state has no window."""
+        """Return the state before a task. The arguments have no effect, since a recurrent state has no window."""
         return self.trunk.start(context)
 
     def act(
         self, step: StepInput, done: Bool[Array, ""], state: Float[Array, " S"]
     ) -> tuple[PolicyValue, Float[Array, " S"]]:
-        """Return the output for one step of one task, and the state after it."""
+        """Return the output for one step of one task, and the state after this step."""
         feature, state = self.trunk.advance(self.tokens(step), state)
         return self.head(feature), state
 
 
-def _no_batches(params: Any, slow: Any, batch: Any, key: Any) -> tuple[Array, dict[str, Array]]:
-    raise TypeError("rl2 has no loss of batches: it is trained by playing, see icrl4aht_baselines.online.rl2")
+def _raise_no_batch_loss(params: Any, slow: Any, batch: Any, key: Any) -> tuple[Array, dict[str, Array]]:
+    raise TypeError("rl2 has no loss on batches: it is trained by playing, see icrl4aht_baselines.online.rl2")
 
 
 def rl2(options: ModelOptions, world: World) -> Method:
-    """Return the recurrent policy of RL^2."""
+    """Return the method RL^2."""
     trunk = RecurrentTrunk(options.recurrent_layers, options.width, options.dropout)
     tokens = make_tokens(StepTokens, options, world, partners=world.partners)
     model = RL2Model(tokens, trunk, PolicyValueHead(options.width, world.actions))
@@ -89,7 +89,7 @@ def rl2(options: ModelOptions, world: World) -> Method:
         data="tasks",
         model=model,
         example=example,
-        loss=_no_batches,
+        loss=_raise_no_batch_loss,
         logits=lambda output: output.logits,
         takes_labels=False,
     )

@@ -1,6 +1,6 @@
-"""Histories as tokens, for training and acting alike (paper, App. E.2 and E.3).
+"""Tokenizers of histories, for training and for acting (paper, App. E.2 and E.3).
 
-AD's tokens are made of `StepInput`s, DPT's context of `Transition`s. Shapes: `*B` any leading axes (batch and time in
+AD has one token per `StepInput`, DPT has one token per `Transition`. Shapes: `*B` any leading axes (batch and time in
 training, none when acting), `D` width of a token, `K` length of a context.
 """
 
@@ -20,21 +20,21 @@ from icrl4aht_data.sampling.ad import ADBatch
 from icrl4aht_data.sampling.dpt import DPTBatch
 
 FEATURES = 64
-"""Width of an encoded observation and of an embedded action (the paper's d_emb)."""
+"""Number of features of an encoded observation and of an embedded action (d_emb in the paper)."""
 
 BatchView = Callable[[Any, Any], Any]
-"""Function (observations or state records of a batch, `layouts` of the batch or None) -> input of the encoder."""
+"""Function from a batch's observations or state records, and its `layouts` or None, to the input of the encoder."""
 
 
 class StepInput(NamedTuple):
     """Input of an ego before an action. Before a history's first step all `prev_*` fields are zero (paper, App. E.2).
 
     Attributes:
-        obs: (*B, ..), the ego's observation, uint8 or float, or another input of the encoder made of it.
+        obs: (*B, ..), the ego's observation, uint8 or float, or another form of it that the encoder takes.
         prev_action: int32 (*B,), the ego's action in the previous step.
         prev_reward: float32 (*B,), the team's reward in the previous step, unscaled.
         prev_teammate_action: int32 (*B,), the teammate's action in the previous step; None without +TA.
-        partner: int32 (*B,), number of the teammate, for egos that are told whom they play with; None for others.
+        partner: int32 (*B,), number of the teammate for informed egos; None for egos that do not observe it.
     """
 
     obs: Any
@@ -48,7 +48,7 @@ class Transition(NamedTuple):
     """An action and its outcome, within one episode.
 
     Attributes:
-        obs: (*B, 2, ..), the ego's observations before and after the action, or another input of the encoder.
+        obs: (*B, 2, ..), the ego's observations before and after the action, or another form that the encoder takes.
         action: int32 (*B,), the ego's action.
         reward: float32 (*B,), the team's reward, unscaled.
         teammate_action: int32 (*B,), the teammate's action in the same step; None without +TA.
@@ -61,23 +61,23 @@ class Transition(NamedTuple):
 
 
 def plain_view(obs: Array, layouts: Array | None) -> Array:
-    """Return the observations of batches that hold observations."""
+    """Return the input unchanged: a `BatchView` for batches of observations."""
     return obs
 
 
 def batch_steps(batch: ADBatch, view: BatchView) -> StepInput:
-    """Return the steps (B, L) of an AD batch."""
+    """Return an AD batch as a `StepInput` of arrays (B, L, ..)."""
     obs = group_equal(view(batch.obs, batch.layouts))
     return StepInput(obs, batch.prev_actions, batch.prev_rewards, batch.prev_teammate_actions)  # type: ignore[arg-type]
 
 
 def input_step(ego_input: Any) -> StepInput:
-    """Return the input of an acting ego, converted from an `agents.EgoInput`."""
+    """Convert the input of an acting ego from `agents.EgoInput` to `StepInput`."""
     return StepInput(ego_input.obs, ego_input.prev_action, ego_input.prev_reward, ego_input.prev_teammate_action)
 
 
 def batch_transitions(batch: DPTBatch, view: BatchView) -> tuple[Transition, Any]:
-    """Return the context's transitions (B, K) and the queries' observations, (B, ..) or (B, Q, ..), of a DPT batch."""
+    """Return a DPT batch as context transitions (B, K, ..) and query observations, (B, ..) or (B, Q, ..)."""
     both = jnp.stack([jnp.asarray(batch.context_obs), jnp.asarray(batch.context_next_obs)], axis=2)
     obs, query = group_equal(view(both, batch.layouts)), view(batch.query_obs, batch.layouts)
     mate: Any = batch.context_teammate_actions
@@ -92,8 +92,8 @@ class Tokens(nn.Module):
         width: width of a token.
         actions: number of actions.
         teammate_actions: whether tokens hold the teammate's actions (+TA).
-        dropout: rate in training.
-        dtype: of the tokens.
+        dropout: dropout rate in training.
+        dtype: dtype of the tokens.
         reward_scale: factor of the rewards in tokens.
     """
 
@@ -107,17 +107,17 @@ class Tokens(nn.Module):
 
 
 class StepTokens(Tokens):
-    """Tokens of steps: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2).
+    """Tokenizer of steps: [Emb(a'); Emb(teammate's a') with +TA; r'; Enc(o)], projected (paper, App. E.2).
 
     Args:
-        partners: number of teammates that the ego is told apart by `StepInput.partner`; 0 for none.
+        partners: number of different values of `StepInput.partner`; 0 if the teammate's number is no input.
     """
 
     partners: int = 0
 
     @nn.compact
     def __call__(self, step: StepInput, deterministic: bool = True) -> Float[Array, "*B D"]:
-        """Return one token per step."""
+        """Return one token for each step."""
         parts = [nn.Embed(self.actions, FEATURES, name="action")(step.prev_action)]
         if self.teammate_actions:
             parts.append(nn.Embed(self.actions, FEATURES, name="teammate_action")(step.prev_teammate_action))
@@ -129,16 +129,16 @@ class StepTokens(Tokens):
 
 
 class TransitionTokens(Tokens):
-    """Tokens of transitions: [Enc(o); OneHot(a); OneHot(teammate's a) with +TA; Enc(o'); r], projected.
+    """Tokenizer of transitions: [Enc(o); OneHot(a); OneHot(teammate's a) with +TA; Enc(o'); r], projected.
 
-    A query is [Enc(o); zeros] through the same projection (paper, App. E.3).
+    A query observation becomes [Enc(o); zeros] with the same projection (paper, App. E.3).
     """
 
     def setup(self) -> None:
         self.project, self.drop = nn.Dense(self.width), nn.Dropout(self.dropout)
 
     def context(self, transition: Transition, deterministic: bool = True) -> tuple[Array, Float[Array, "*B F"]]:
-        """Return one token (*B, D) per transition, and the encoded observations before the actions."""
+        """Return one token (*B, D) for each transition, and the encoded observations before the actions."""
         seen = self.encoder(transition.obs)
         before, after = seen[..., 0, :], seen[..., 1, :]
         parts = [before, jax.nn.one_hot(transition.action, self.actions)]
@@ -147,7 +147,7 @@ class TransitionTokens(Tokens):
         return self._token([*parts, after, self.reward_scale * transition.reward[..., None]], deterministic), before
 
     def query(self, obs: Any, deterministic: bool = True) -> Float[Array, "*B D"]:
-        """Return one token per observation for which an action is predicted."""
+        """Return one token for each observation for which an action is to be predicted."""
         seen = self.encoder(obs)
         rest = self.actions * (1 + self.teammate_actions) + seen.shape[-1] + 1
         return self._token([seen, jnp.zeros((*seen.shape[:-1], rest))], deterministic)

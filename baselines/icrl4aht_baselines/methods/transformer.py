@@ -1,4 +1,4 @@
-"""Decoder-only, pre-norm transformer (paper, App. E.1): complete sequences in training, one token when acting.
+"""Decoder-only pre-norm transformer (paper, App. E.1), for complete sequences or for one token at a time.
 
 Shapes: `B` batch size, `N` tokens of a sequence, `D` width, `H` heads, `Dh` width of a head (D / H), `S` slots of a
 cache.
@@ -21,7 +21,7 @@ class AttentionCache(NamedTuple):
     """Keys and values of earlier tokens in one layer, one slot per token.
 
     Attributes:
-        keys: float32 (H, S, Dh); one head's slots are contiguous, which a matrix product per head reads fastest.
+        keys: float32 (H, S, Dh); the slots of a head are contiguous, because products per head are fastest so.
         values: float32 (H, S, Dh).
     """
 
@@ -30,11 +30,11 @@ class AttentionCache(NamedTuple):
 
 
 class TransformerMemory(NamedTuple):
-    """Memory of an acting ego for up to S tokens.
+    """Transformer memory of an acting ego for up to S tokens.
 
     Attributes:
-        caches: one cache per layer.
-        written: int32 (), number of tokens; token i is in slot i.
+        caches: one attention cache per layer.
+        written: int32 (), number of stored tokens; token i is in slot i.
     """
 
     caches: tuple[AttentionCache, ...]
@@ -42,10 +42,10 @@ class TransformerMemory(NamedTuple):
 
 
 class TransformerBlock(nn.Module):
-    """Attention, then a feed-forward layer of width 4 D with GELU, each behind a layer norm and added to its input.
+    """Residual block: attention, then a feed-forward layer of width 4 D with GELU, each after a layer norm.
 
-    Dropout is where the paper has it, with one exception: it is applied to the outputs of the heads, not to the weights
-    of attention.
+    Dropout is applied as in the paper, except that it is applied to the outputs of the heads instead of the attention
+    weights.
     """
 
     width: int
@@ -66,7 +66,7 @@ class TransformerBlock(nn.Module):
         context: int,
         deterministic: bool,
     ) -> Float[Array, "B N D"]:
-        """Return features of complete sequences; see `Transformer.__call__` for the arguments."""
+        """Return the features of complete sequences; arguments as in `Transformer.__call__`."""
         q, k, v = self._project(x_BxNxD, positions_N)  # each (B, N, H, Dh)
         attended = causal_attention(q[:, :context], k[:, :context], v[:, :context])
         if context < x_BxNxD.shape[1]:
@@ -78,7 +78,7 @@ class TransformerBlock(nn.Module):
     def step(
         self, x_D: Float[Array, " D"], cache: AttentionCache, number: Int[Array, ""]
     ) -> tuple[Float[Array, " D"], AttentionCache]:
-        """Return the features of a token, and the cache with it; see `Transformer.advance`."""
+        """Return the features of a token, and the cache that includes this token."""
         q, k, v = (projected[0, 0] for projected in self._project(x_D[None, None], number[None]))  # each (H, Dh)
         cache = AttentionCache(cache.keys.at[:, number].set(k), cache.values.at[:, number].set(v))
         # `jax.nn.dot_product_attention` takes ten times as long for one token on a CPU.
@@ -90,13 +90,13 @@ class TransformerBlock(nn.Module):
     def cache(
         self, x_NxD: Float[Array, "N D"], positions_N: Int[Array, " N"]
     ) -> tuple[Float[Array, "N D"], AttentionCache]:
-        """Return the features of one sequence without padding, and its keys and values, N slots."""
+        """Return the features of one sequence without padding, and a cache of its N keys and values."""
         q, k, v = self._project(x_NxD[None], positions_N)  # each (1, N, H, Dh)
         features = self._add_residuals(x_NxD[None], causal_attention(q, k, v), True)[0]
         return features, AttentionCache(*(part[0].swapaxes(0, 1) for part in (k, v)))
 
     def _project(self, x_BxNxD: Array, positions_N: Int[Array, " N"]) -> list[Float[Array, "B N H Dh"]]:
-        """Return queries, keys and values."""
+        """Return the queries, keys and values of tokens."""
         qkv_BxNx3xHxDh = self.qkv(self.attention_norm(x_BxNxD)).reshape(*x_BxNxD.shape[:2], 3, self.heads, -1)
         q, k, v = (qkv_BxNx3xHxDh[:, :, i] for i in range(3))
         return [_rotate(q, positions_N), _rotate(k, positions_N), v] if self.rope else [q, k, v]
@@ -110,7 +110,7 @@ class TransformerBlock(nn.Module):
 
 
 def _rotate(x_BxNxHxDh: Float[Array, "B N H Dh"], positions_N: Int[Array, " N"]) -> Float[Array, "B N H Dh"]:
-    """Rotate each pair of features by an angle in proportion to the position (Su et al. 2021)."""
+    """Apply rotary position embedding: rotate feature pairs by angles proportional to the position (Su et al. 2021)."""
     half = x_BxNxHxDh.shape[-1] // 2
     angle_NxF = positions_N[:, None] * 10_000.0 ** (-jnp.arange(half) / half)
     cos, sin = (f(angle_NxF)[:, None, :].astype(x_BxNxHxDh.dtype) for f in (jnp.cos, jnp.sin))
@@ -119,13 +119,15 @@ def _rotate(x_BxNxHxDh: Float[Array, "B N H Dh"], positions_N: Int[Array, " N"])
 
 
 class Transformer(nn.Module):
-    """Blocks and a last layer norm: tokens to features.
+    """Transformer blocks followed by a layer norm, from tokens to features.
 
     Args:
-        layers, width, heads: size of the model.
-        dropout: rate in training.
-        positions: see `options.Positions`.
-        remat: recompute the inside of a block in the backward pass instead of storing it.
+        layers: number of blocks.
+        width: number of features of a token.
+        heads: number of attention heads.
+        dropout: dropout rate in training.
+        positions: kind of position embedding, see `options.Positions`.
+        remat: whether the activations in a block are recomputed in the backward pass instead of stored.
     """
 
     layers: int = 4
@@ -150,13 +152,13 @@ class Transformer(nn.Module):
         context: int | None = None,
         deterministic: bool = True,
     ) -> Float[Array, "B N D"]:
-        """Return features of complete sequences, in which every token sees those up to itself.
+        """Return the features of complete sequences, in which each token attends to itself and the tokens before it.
 
         Args:
             x: tokens.
-            context: if given, the first `context` tokens are a context and the `context + 1` tokens behind it are
-                queries: query j sees the first j tokens and itself, as if it followed them directly.
-            deterministic: False for dropout, under the rng `dropout`.
+            context: if given, the first `context` tokens are a context, followed by `context + 1` queries: query j
+                attends to the first j tokens and to itself, with the position after these tokens.
+            deterministic: whether dropout is off; otherwise the rng `dropout` is used.
         """
         length = x.shape[1]
         context = length if context is None else context
@@ -166,14 +168,14 @@ class Transformer(nn.Module):
         return self.norm(x)
 
     def start(self, context: int) -> TransformerMemory:
-        """Return an empty memory for `context` tokens."""
+        """Return an empty memory with `context` slots."""
         zeros = jnp.zeros((self.heads, context, self.width // self.heads))
         return TransformerMemory((AttentionCache(zeros, zeros),) * self.layers, jnp.int32(0))
 
     def start_after(self, x_NxD: Float[Array, "N D"], context: int) -> TransformerMemory:
-        """Return a memory for `context` tokens that holds a sequence."""
+        """Return a memory with `context` slots that stores a sequence of tokens."""
         length, caches = len(x_NxD), []
-        if not length:  # DPT without a context
+        if not length:  # DPT with context = 0
             return self.start(context)
         for block in self.blocks:
             x_NxD, cache = block.cache(x_NxD, jnp.arange(length))
@@ -184,7 +186,7 @@ class Transformer(nn.Module):
     def advance(
         self, x_D: Float[Array, " D"], memory: TransformerMemory
     ) -> tuple[Float[Array, " D"], TransformerMemory]:
-        """Return the features of one more token, and the memory with it, which must not be full before."""
+        """Return the features of the next token, and the memory that includes it. The memory must not be full."""
         caches = []
         for block, cache in zip(self.blocks, memory.caches, strict=True):
             x_D, cache = block.step(x_D, cache, memory.written)

@@ -1,10 +1,8 @@
-"""Changes of what an ego sees, the same in all steps of a task: mirrored windows, and hidden recipe indicators.
+"""Changes of an ego's observations for a complete task: mirrored observations, and hidden recipe indicators.
 
-Batches state the mirroring of their rows with the numbers of their layouts, see `changed_view`.
-
-The game has no preferred direction, so a mirrored task is another task of the same kind, played on the mirrored layout.
-Models that are tested on other layouts than they are trained on learn from mirrored tasks, too. A hidden recipe
-indicator looks like a counter, as on layouts without an indicator.
+The game has no preferred direction, so a mirrored task is equal to a task on the mirrored layout. For models that are
+tested on new layouts, mirroring is data augmentation. A hidden recipe indicator looks like a counter, as on layouts
+without an indicator. In a batch, the layout number of a row also states the row's mirroring, see `changed_view`.
 
 `B` denotes any leading axes. Observations have the canonical channels.
 """
@@ -36,16 +34,16 @@ _MIRRORED_ACTIONS = np.array(
         (DOWN, UP, RIGHT, LEFT, STAY, INTERACT),
     ]
 )
-"""Number of the mirroring, see `changed_view` -> action in the mirrored view for each action."""
+"""Table [number of the mirroring, see `changed_view`; action in the environment] -> action in the mirrored view."""
 
 
 class ViewChange(NamedTuple):
-    """Changes of the view in B tasks or windows.
+    """Changes of the observations in B tasks or windows.
 
     Attributes:
         hidden: bool (*B,), whether recipe indicators look like counters.
-        upside_down: bool (*B,), whether up and down are exchanged.
-        sideways: bool (*B,), whether left and right are exchanged.
+        upside_down: bool (*B,), whether the view is mirrored so that up and down are exchanged.
+        sideways: bool (*B,), whether the view is mirrored so that left and right are exchanged.
     """
 
     hidden: Bool[Array, "*B"]
@@ -53,28 +51,28 @@ class ViewChange(NamedTuple):
     sideways: Bool[Array, "*B"]
 
     def observations(self, obs: Num[Array, "*B 5 5 46"]) -> Num[Array, "*B 5 5 46"]:
-        """Return the observations as the ego sees them."""
+        """Return the changed observations, which the ego sees, for those of the environment."""
         hidden, rows, columns = (flag[..., None, None, None] for flag in self)
-        # `.at[..., _WALL].max` would be a scatter, which takes several times as long as all else here.
+        # `.at[..., _WALL].max` would be a scatter, which is several times slower than the rest of this function.
         walls = jnp.maximum(obs, obs[..., _INDICATOR, None])
         counters = jnp.where(_RECIPE, 0, jnp.where(_IS_WALL, walls, obs))
         obs = jnp.where(hidden, counters, obs)
-        obs = jnp.where(rows, _exchanged(jnp.flip(obs, _ROWS), "up", "down"), obs)
-        return jnp.where(columns, _exchanged(jnp.flip(obs, _COLUMNS), "left", "right"), obs)
+        obs = jnp.where(rows, _exchange_directions(jnp.flip(obs, _ROWS), "up", "down"), obs)
+        return jnp.where(columns, _exchange_directions(jnp.flip(obs, _COLUMNS), "left", "right"), obs)
 
     def actions(self, actions: Int[Array, "*B"]) -> Int[Array, "*B"]:
-        """Return actions in the ego's view for actions in the environment, and the other way round."""
+        """Convert actions from the environment to the ego's view, or from the ego's view to the environment."""
         return jnp.asarray(_MIRRORED_ACTIONS, actions.dtype)[self.upside_down + 2 * self.sideways, actions]
 
-    def at_each_step(self, steps: int, axis: int) -> ViewChange:
-        """Return the changes with an axis of steps inserted."""
+    def repeat_for_steps(self, steps: int, axis: int) -> ViewChange:
+        """Return the changes repeated along a new axis of steps."""
         return ViewChange(*(jnp.repeat(jnp.expand_dims(flag, axis), steps, axis) for flag in self))
 
 
-def _exchanged(obs: Array, one: str, other: str) -> Array:
-    """Return observations in which agents face one direction where they faced the other.
+def _exchange_directions(obs: Array, one: str, other: str) -> Array:
+    """Return observations with two directions, in which agents face, exchanged.
 
-    Slices are much faster than a gather of all channels.
+    The channels are copied in slices, which is much faster than a gather of all channels.
     """
     exchanged = {
         f"{who}_facing_{here}": f"{who}_facing_{there}"
@@ -87,30 +85,30 @@ def _exchanged(obs: Array, one: str, other: str) -> Array:
 
 
 def mirrored_action(actions: np.ndarray, mirroring: np.ndarray) -> np.ndarray:
-    """Return the actions of mirrored rows.
+    """Return the actions of batch rows as seen in the mirrored view.
 
     Args:
         actions: int (B, ..).
-        mirroring: int (B,), as in `changed_view`.
+        mirroring: int (B,), number of each row's mirroring, see `changed_view`.
     """
     return _MIRRORED_ACTIONS.astype(actions.dtype)[mirroring.reshape(-1, *(1,) * (actions.ndim - 1)), actions]
 
 
 def no_change(*shape: int) -> ViewChange:
-    """Return changes of shape (*B,) that change nothing."""
+    """Return a `ViewChange` of shape (*B,) that leaves observations and actions unchanged."""
     no: Any = jnp.zeros(shape, bool)
     return ViewChange(no, no, no)
 
 
 def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> BatchView:
-    """Return the view of batches of state records whose ego sees hidden recipe indicators, or a mirrored game.
+    """Return a function from a batch of state records to observations that are mirrored or have hidden indicators.
 
-    The number of a row's layout in a batch says both: number n of N layouts, and N times the number of the mirroring, 0
-    for none, 1 for upside down, 2 for sideways, 3 for both.
+    The layout number of a batch row is n + N * m, for layout n of N layouts and mirroring m: 0 for none, 1 for upside
+    down, 2 for sideways, 3 for both.
 
     Args:
         layouts: the N layouts.
-        hidden: names of those whose recipe indicators look like counters.
+        hidden: names of the layouts whose recipe indicators look like counters.
     """
     compact = CompactView("paper", tuple(layouts), canonical=True)
     hides = jnp.asarray([layout.name in hidden for layout in layouts])
@@ -127,12 +125,12 @@ def changed_view(layouts: Sequence[Layout], hidden: Collection[str] = ()) -> Bat
 
 
 class NumberedBatches:
-    """Batches of state records from a sampler, with renumbered layouts, optionally mirrored at random.
+    """Sampler of state records that renumbers the layouts of another sampler's batches, and may mirror rows at random.
 
     Args:
-        sampler: of histories on some of the layouts.
+        sampler: sampler of histories.
         numbers: int32, new number of each layout of `sampler.layouts`.
-        layouts: number of all layouts, to mirror each row at random, see `changed_view`; 0 mirrors none.
+        layouts: total number of layouts, if rows are to be mirrored at random, see `changed_view`; otherwise 0.
     """
 
     def __init__(self, sampler: Any, numbers: np.ndarray, layouts: int = 0) -> None:
@@ -145,14 +143,14 @@ class NumberedBatches:
         return self.batch(i)
 
     def batch(self, i: int, out: Any = None) -> Any:
-        """Return batch i, written into `out` if it is given."""
+        """Return batch number i, written into `out` if given."""
         batch = self._sampler.batch(i, out)
         rows = len(batch.obs if hasattr(batch, "obs") else batch.query_obs)
-        # A sampler of one layout does not number it.
+        # The batches of a sampler with one layout have no layout numbers.
         numbers = self._numbers[np.zeros(rows, np.int32) if batch.layouts is None else batch.layouts]
         if not self._layouts:
             return batch._replace(layouts=numbers)
-        # The mirroring is a function of the batch's number and process, as the batch itself is.
+        # Like the batch, its mirroring is a function of the batch number and the process.
         drawn = np.random.default_rng((self._sampler.seed, i, self._sampler.process_index))
         mirroring = drawn.integers(4, size=rows, dtype=np.int32)
         actions = {
@@ -160,14 +158,14 @@ class NumberedBatches:
             for name, values in batch._asdict().items()
             if values is not None and (name.endswith("actions") or name == "query_target")
         }
-        if hasattr(batch, "is_first"):  # no step precedes: the fillers stay 0, as they are when a model acts
+        if hasattr(batch, "is_first"):  # fillers before a task's first step stay 0, as in acting
             filler = batch.is_first | ~batch.attention_mask
             actions |= {name: np.where(filler, 0, actions[name]) for name in actions if name.startswith("prev_")}
         return batch._replace(**actions, layouts=numbers + self._layouts * mirroring)
 
 
 def number_layouts(sampler: Any, layouts: Sequence[Layout], mirror: bool = False) -> Any:
-    """Return the sampler with its layouts numbered as in `layouts`; its histories may be on some of these only."""
+    """Return a sampler whose batches number the layouts by their position in `layouts`."""
     numbers = np.array([layouts.index(layout) for layout in sampler.layouts], np.int32)
     if mirror:
         return NumberedBatches(sampler, numbers, len(layouts))

@@ -1,9 +1,9 @@
-"""Adaptation headroom: what knowing the teammate from the start is worth to an ego.
+"""Adaptation headroom: how much more an ego earns if it knows the teammate from the start.
 
-Two recurrent egos are trained on the same tasks with the same budget, both with their memory cleared before each
-episode: the *informed* one is told in every step which task it plays, the *episodic* one has to find out within the
-episode. The return of the first minus that of the second estimates what memory across episodes can earn: both would
-earn more after a longer training, the informed one of many tasks above all.
+Two recurrent egos are trained on the same tasks with the same budget, and both have their memory cleared before each
+episode. The *informed* ego observes the task's number in every step; the *episodic* ego has to find out within the
+episode which teammate it plays with. The informed ego's return minus the episodic ego's return estimates how much
+memory across episodes can earn. It is an estimate, because a longer training would raise both returns.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ EgoKind = Literal["informed", "episodic"]
 EGO_KINDS: tuple[EgoKind, ...] = ("informed", "episodic")
 
 MEASURED_EPISODES = 100
-"""Episodes of each running task over which the return of a trained ego is measured."""
+"""Number of episodes of each task over which the mean return of a trained ego is measured."""
 
 _MEASURE_SEED = 1_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeadroomJob(TrainingJob):
-    """The training of an informed or episodic ego on a set of tasks, at most as many as are played at once.
+    """Job that trains an informed or episodic ego on a set of tasks, and measures its returns.
 
     Attributes:
         title: name of the set of tasks.
-        kind: "informed" or "episodic".
+        kind: kind of the ego, "informed" or "episodic".
 
     Raises:
-        OptionError: if there are more tasks than are played at once.
+        OptionError: if the set has more tasks than are played in parallel.
     """
 
     title: str
@@ -54,33 +54,33 @@ class HeadroomJob(TrainingJob):
     def __post_init__(self) -> None:
         if len(self.tasks) > self.options.tasks:
             raise OptionError(
-                f"tasks = {self.options.tasks}: {self.title} has {len(self.tasks)} tasks, and each is to be played; "
+                f"tasks = {self.options.tasks}: {self.title} has {len(self.tasks)} tasks, and all must be played; "
                 f"give --tasks {len(self.tasks)} or more"
             )
 
     @property
     def name(self) -> str:
-        """Set of tasks, kind, width and seed."""
-        return f"{self.title}-{self.kind}-{self.ending}"
+        """Name of the job's folder: set of tasks, kind of ego, width and seed."""
+        return f"{self.title}-{self.kind}-{self.name_suffix}"
 
     @property
     def label(self) -> str:
-        """Name for people."""
+        """Name of the job in progress displays."""
         return f"{self.title}, {self.kind}, seed {self.seed}"
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the result depends on."""
+        """All settings that the result depends on, as JSON."""
         tasks = json_hash([task.task_id for task in self.tasks])
         return {"tasks_hash": tasks, "kind": self.kind, **super().settings}
 
     def returns(self) -> dict[str, float]:
-        """Return task id -> mean return, of a finished training."""
+        """Return task id -> mean return of the trained ego, from the result of a finished job."""
         return self.result()["returns"]
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the ego, and return its mean return in each task, of drawn actions in new episodes."""
-        groups, numbers = self._groups()
+        """Train the ego, and measure its mean return in each task with sampled actions in new episodes."""
+        groups, numbers = self._task_groups()
         layouts = list(dict.fromkeys(task.layout for task in self.tasks))
         told = len(self.tasks) if self.kind == "informed" else 0
         trainer, params = self.train(layouts, groups, on_update, told=told)
@@ -92,8 +92,8 @@ class HeadroomJob(TrainingJob):
                 by_task[number].append(float(own))
         return {"returns": {task.task_id: round(float(np.mean(by_task[k])), 3) for k, task in enumerate(self.tasks)}}
 
-    def _groups(self) -> tuple[list[TaskGroup], dict[str, list[int]]]:
-        """Return the groups of tasks that are played at once, and the number of the task of each, by group's name."""
+    def _task_groups(self) -> tuple[list[TaskGroup], dict[str, list[int]]]:
+        """Return the groups of tasks that are played in parallel, and name of a group -> numbers of its tasks."""
         numbers: dict[str, list[int]] = defaultdict(list)
         for played in range(self.options.tasks):
             number = played % len(self.tasks)
@@ -112,7 +112,7 @@ class HeadroomJob(TrainingJob):
 def headroom_jobs(
     sets: Mapping[str, Sequence[Task]], seeds: int, options: ResponseOptions, out: Path
 ) -> list[HeadroomJob]:
-    """Return the jobs that measure sets of tasks, by name, with all kinds of egos; first those of the first seed."""
+    """Return a job for each seed, set of tasks (name -> tasks) and kind of ego, in this order."""
     return [
         HeadroomJob(tuple(tasks), seed, options, out, title=title, kind=kind)
         for seed in range(seeds)
@@ -122,10 +122,10 @@ def headroom_jobs(
 
 
 def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | None:
-    """Return the entry of a set of tasks in cards/adaptation.json; None before both egos of a seed are trained.
+    """Return the entry of a set of tasks for cards/adaptation.json; None if no seed has both egos trained.
 
-    It has the steps and the network's width of the trainings, and the mean return of each kind of ego by seed, and on
-    each layout, mean over these seeds.
+    An entry has the steps and the network's width of the trainings, the mean return of each kind of ego for each seed,
+    and the mean return on each layout over these seeds.
     """
     own = [job for job in jobs if job.title == title and job.is_finished()]
     seeds = sorted(set.intersection(*({job.seed for job in own if job.kind == kind} for kind in EGO_KINDS)))
@@ -149,13 +149,13 @@ def headroom_entry(title: str, jobs: Sequence[HeadroomJob]) -> dict[str, Any] | 
 
 
 ADAPTATION = "adaptation.json"
-"""Name of the file of measured sets of tasks, in a folder of trainings and among the package's cards."""
+"""Name of the file of measured returns, in a folder of trainings and among the package's cards."""
 
 
 def write_adaptation(jobs: Sequence[HeadroomJob], folder: Path) -> Path:
-    """Add the measurements of finished jobs to a folder's `ADAPTATION`.
+    """Add the measurements of finished jobs to a folder's file `ADAPTATION`. Return its path.
 
-    They replace those of the same sets, unless these have more seeds.
+    The entry of a set of tasks is replaced, unless the stored entry has more seeds.
     """
     path = folder / ADAPTATION
     known = {entry["tasks"]: entry for entry in read_adaptation(folder)}
@@ -169,15 +169,15 @@ def write_adaptation(jobs: Sequence[HeadroomJob], folder: Path) -> Path:
 
 
 def read_adaptation(folder: Path) -> list[dict[str, Any]]:
-    """Return the measured sets of tasks of a folder; none if there is no such file."""
+    """Return the entries of a folder's file `ADAPTATION`; an empty list if the file does not exist."""
     path = folder / ADAPTATION
     return parse_json(read_text(path)) if path.is_file() else []
 
 
 def adaptation_table(folder: Path, layouts: bool = True) -> str:
-    """Return a Markdown table of the measured sets: returns of both egos, and their difference with its 95 % interval.
+    """Return a Markdown table of measured sets of tasks: returns of both egos, and their difference.
 
-    The interval is a Student's t interval over the training seeds; with one seed there is none. A set of several
+    The difference has a 95 % Student's t interval over the training seeds if there are several. A set of several
     layouts also gets a row for each layout, unless `layouts` is False.
     """
     rows = []

@@ -1,12 +1,12 @@
-"""Histories of the source `agent`: a trained agent plays with the teammates of a release, and the oracle labels it.
+"""Recording of histories of source `agent`: a trained agent plays with a release's teammates and is labelled.
 
-The agent's memory lasts for a history, as it does in a test. A chance of a random action may fall over a history's
-episodes, as in noise distillation (Zisman et al. 2024); with a chance of 0 the histories show what the agent itself
-visits. `expert_actions` are the agent's own choices, before the noise, or those of another trained agent, which sees
-the same history. Labels on what an agent visits are those of on-policy imitation (DAgger, Ross et al. 2011). The
-teammate may change within a history, as under the protocol `swap`.
+The agent's memory lasts for a history, as it lasts for a task in an evaluation. The probability of a random action may
+fall over a history's episodes, as in noise distillation (Zisman et al. 2024). `expert_actions` are the agent's choices
+before the noise, or those of another trained agent that observes the same history, as in on-policy imitation (DAgger,
+Ross et al. 2011). `oracle_actions` are those of the scripted oracle. The teammate may change within a history, as under
+the protocol `swap`.
 
-Shapes: `B` histories that are played at once, `E` episodes, `T` steps of an episode, `S` bytes of a state record.
+Shapes: `B` histories that are played in parallel, `E` episodes, `T` steps of an episode, `S` bytes of a state record.
 """
 
 from __future__ import annotations
@@ -56,19 +56,19 @@ from icrl4aht_data.writing.release_folder import check_target
 SOURCE = "agent"
 
 FIRST_SEED = 3_000_000
-"""Seed of the first agent task; those of other sources are below."""
+"""Seed of the first task of source `agent`; tasks of other sources have smaller seeds."""
 
 _SEEDS = 100_000
-"""Agent tasks of one collection have seeds from a range of this size."""
+"""Size of the range of task seeds that is reserved for one collection."""
 
 
 class NoisyMemory(NamedTuple):
-    """Memory of an agent whose actions are replaced by random ones with a chance.
+    """Memory of an agent whose actions are sometimes replaced by random ones.
 
     Attributes:
-        own: the agent's memory.
-        chance: float32 (), of a random action, in this episode.
-        steps: int32 (), steps so far.
+        own: memory of the agent without noise.
+        chance: float32 (), probability of a random action in this episode.
+        steps: int32 (), number of steps so far.
         labels: int8 (T,), the labeller's choices in the last T steps.
         labeller: the labeller's memory; None if the agent labels its own histories.
     """
@@ -81,12 +81,13 @@ class NoisyMemory(NamedTuple):
 
 
 def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> Policy:
-    """Return an agent that sometimes acts at random, and remembers labels of the steps.
+    """Return an agent that sometimes acts at random, and whose memory holds the labels of its last steps.
 
     Args:
         policy: the agent.
-        length: T, steps of an episode.
-        labeller: another agent with the same inputs; by default the labels are the agent's actions without noise.
+        length: T, number of steps of an episode.
+        labeller: another agent with the same inputs, whose actions become the labels; by default the labels are the
+            agent's actions without noise.
 
     Raises:
         OptionError: if the labeller takes other inputs than the agent.
@@ -115,13 +116,13 @@ def with_noise(policy: Policy, length: int, labeller: Policy | None = None) -> P
 
 
 class RecordedHistories(NamedTuple):
-    """Histories of some tasks; NumPy.
+    """Recorded histories of some tasks, as NumPy arrays.
 
     Attributes:
         state: uint8 (B, E * T, S), state records before each step.
-        actions: int8 (B, E * T), the agent's.
-        teammate_actions: int8 (B, E * T).
-        rewards: int8 (B, E * T).
+        actions: int8 (B, E * T), the agent's actions.
+        teammate_actions: int8 (B, E * T), the teammate's actions.
+        rewards: int8 (B, E * T), rewards of the team.
         expert_actions: int8 (B, E * T), the labels.
         episode_end_state: uint8 (B, E, S), state records after each episode.
     """
@@ -143,31 +144,31 @@ def record_histories(
     make_labeller: Callable[[Layout], Policy] | None = None,
     swaps: Mapping[str, TeammateSwaps] = MappingProxyType({}),
 ) -> RecordedHistories:
-    """Play histories of tasks that share a layout and a teammate family; `config.histories` of each, in their order.
+    """Play `config.histories` histories of each task, in the order of tasks that share layout and teammate family.
 
     Args:
-        make_ego: layout -> agent, of any kind that `evaluate` takes.
-        tasks: the tasks; their seeds determine schedules and episodes.
-        config: number and length of the histories, and their noise.
+        make_ego: function from a layout to the agent, as for `evaluate`.
+        tasks: the tasks; their seeds determine the noise schedules and the episodes.
+        config: number, length and noise of the histories.
         suite: folder of learned teammates, if tasks have any.
-        played: called with the number of episodes played since the last call.
-        make_labeller: layout -> another agent that labels the histories.
-        swaps: task id -> changes of the teammate, see `plan_swaps`; by default each task keeps its own.
+        played: function for progress, called with the number of episodes played since the last call.
+        make_labeller: function from a layout to another agent that labels the histories.
+        swaps: task id -> changes of the teammate, see `plan_swaps`; by default the teammate never changes.
 
     Raises:
-        OptionError: if an agent does not fit the layout, or the labeller sees something else than the agent.
+        OptionError: if an agent does not fit the layout, or the labeller takes other inputs than the agent.
     """
     chances = np.concatenate([noise_schedules(config, task.seed) for task in tasks])
     seeds = range(config.histories)
 
-    @cache  # segments with other teammates share the compiled program of one agent
+    @cache  # all segments share one compiled program only if the agent is the same object
     def noisy(layout: Layout) -> Policy:
         return with_noise(make_ego(layout), KEPT_STEPS, None if make_labeller is None else make_labeller(layout))
 
     every = next((one.every for one in swaps.values()), None)
     protocol = replace(get_protocol("seeded", config.episodes), swap_every=every)
     programs, prepared, parts = Programs(), None, list[tuple[np.ndarray, ...]]()
-    for length in segment_lengths(protocol):  # segments without a change of teammates
+    for length in segment_lengths(protocol):  # a segment has no change of teammates
         mates = [swaps[one.task_id].teammate(len(parts)) if one.task_id in swaps else one.teammate for one in tasks]
         playing = [replace(task, teammate=mate) for task, mate in zip(tasks, mates, strict=True)]
         prepared = prepare_rollout(noisy, playing, protocol, seeds, suite, programs=programs, earlier=prepared)
@@ -185,11 +186,11 @@ def record_histories(
 
 
 def plan_swaps(tasks: Sequence[Task], episodes: int, every: int) -> dict[str, TeammateSwaps]:
-    """Return task id -> the teammates that play in turn in the task's histories.
+    """Return task id -> the sequence of teammates that play in the task's histories.
 
-    They are the teammates of all tasks with its layout, track, split and kind of teammate, in the order of `tasks` from
-    its own on. Splits are kept apart, so that no validation teammate plays in a training history. Tasks with no other
-    teammate to swap with are left out.
+    The sequence begins with the task's teammate. The teammates of all other tasks with the same layout, track, split
+    and kind of teammate follow, in the cyclic order of `tasks`. No validation teammate plays in a training history,
+    because splits are not mixed. Tasks without another teammate to swap with are left out.
 
     Args:
         tasks: the tasks.
@@ -224,11 +225,11 @@ def _swap_group(task: Task) -> tuple[str, ...]:
 
 
 class Teammates(NamedTuple):
-    """Teammates of a release, and their recorded reference returns.
+    """Tasks with the teammates of a release, and recorded returns of reference egos.
 
     Attributes:
-        tasks: one task for each teammate, numbered as an agent task.
-        references: task id -> returns of egos that do not learn, where the release states them.
+        tasks: one task for each teammate, with seeds of source `agent`.
+        references: task id -> returns of reference egos, if the release states them.
         suite: folder of the checkpoints of learned teammates.
         root: folder or address of the release.
     """
@@ -240,16 +241,16 @@ class Teammates(NamedTuple):
 
 
 def release_teammates(dataset: Dataset, number: int = 0, tasks: Sequence[Task] = ()) -> Teammates:
-    """Return agent tasks with the teammates of a selection's histories and of other tasks, each once.
+    """Return one task for each teammate in a selection of histories or in other tasks.
 
     Args:
-        dataset: the selection.
-        number: number of the collection, from 0, which decides the tasks' seeds.
-        tasks: tasks with more teammates, heuristics; those on other layouts than the selection's are left out.
+        dataset: selection of histories.
+        number: number of the collection, from 0, which determines the seeds of the tasks.
+        tasks: tasks with additional heuristic teammates; tasks on layouts without selected histories are left out.
 
     Raises:
-        OptionError: if the release does not describe the teammates of all of these histories, or for tasks with learned
-            teammates.
+        OptionError: if the release does not describe a teammate of the histories, or one of `tasks` has a learned
+            teammate.
     """
     wanted = set(dataset.column("task_id").tolist())
     known = [task for task in read_tasks(dataset.root / TASKS) if task.task_id in wanted]
@@ -293,24 +294,24 @@ def collect_release(
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
-    """Play histories with every teammate, and write them as a release of source `agent`.
+    """Record histories of an agent with every teammate, and write them as a release of source `agent`.
 
-    Until the release is complete, finished groups of tasks are kept in the folder `out` with the ending `.parts`, from
-    which the same call resumes.
+    Until the release is complete, finished groups of tasks are stored in a folder with the name of `out` and the ending
+    `.parts`. The same call resumes from this folder.
 
     Args:
-        agent: the agent.
-        teammates: tasks to play.
-        config: number and length of each task's histories, and their noise.
+        agent: agent that plays.
+        teammates: tasks to play, see `release_teammates`.
+        config: number, length and noise of each task's histories.
         out: folder of the release.
-        labeller: another agent, whose choices become the expert actions; by default the agent's own, without noise.
-        swap: number of episodes after which another teammate plays within a history, see `plan_swaps`; None for never.
+        labeller: another agent, whose choices become the expert actions; by default the agent's choices before noise.
+        swap: number of episodes after which the teammate changes, see `plan_swaps`; None for no changes.
         overwrite: whether to replace a release at `out`.
-        progress: called with (description, episodes played, episodes).
+        progress: function for progress, called with (description, episodes played, number of episodes).
 
     Raises:
-        OptionError: if `out` may not be written, if an agent does not fit a layout or the labeller sees something else
-            than the agent, if the saved parts are of other settings, or for an impossible `swap`, see `plan_swaps`.
+        OptionError: if `out` may not be written, an agent does not fit a layout, the labeller takes other inputs than
+            the agent, the stored parts have other settings, or `swap` is invalid, see `plan_swaps`.
     """
     out = out.resolve()
     check_target(out, overwrite, [teammates.root])
@@ -367,7 +368,7 @@ def collect_release(
 
 
 def _save_part(folder: Path, recorded: RecordedHistories) -> None:
-    """Write the arrays of a group of tasks into a folder, which appears when it is complete."""
+    """Write the arrays of a group of tasks into a folder, which is created atomically."""
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)  # left by a killed run
     partial.mkdir()
@@ -385,7 +386,7 @@ def _agent_task(
     teammates: Teammates,
     swaps: TeammateSwaps | None,
 ) -> NewTask:
-    """Return a task with the histories of one group that belong to it, which are read when they are written."""
+    """Return a task with its histories from a group's folder, which are read only when the release is written."""
     rows = slice(number * config.histories, (number + 1) * config.histories)
     rewards = np.load(folder / "rewards.npy", mmap_mode="r")[rows]
     returns = rewards.reshape(config.histories, config.episodes, -1).sum(axis=-1, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The training of RL^2 with the teammates of a release and of other tasks."""
+"""Preparation of an RL^2 training with the teammates of a release and of other tasks."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from icrl4aht_data.overcooked.layouts import Layout, get_layout
 from icrl4aht_data.reading.history import Labels
 
 FLAT_SHARE = 0.3
-"""Number of tasks on a layout on which no ego earns more than `stay` does, as a share of that on other layouts."""
+"""Number of tasks on a layout on which the oracle earns no more than `stay`, relative to other layouts."""
 
 FOUR_RECIPES_SHARE = 0.2
-"""Number of tasks on a layout with four recipes, as a share of that on others."""
+"""Number of tasks on a layout's version with four recipes, relative to other layouts."""
 
 REARRANGED_SHARE = 1.5
-"""Number of tasks on all rearranged versions of a layout, as a share of that on the layout."""
+"""Number of tasks on all rearranged versions of a layout, relative to the layout itself."""
 
 
 _Teammates = dict[tuple[Layout, str], dict[str, Policy]]
-"""(layout, kind of the teammates) -> task id -> teammate. A task with a dish of its own has a layout with that dish."""
+"""(layout, kind of teammate) -> task id -> teammate. If a task fixes the dish, its layout has only this recipe."""
 
 
 def prepare_play(
@@ -51,31 +51,31 @@ def prepare_play(
     histories: HistoryOptions,
     tasks: Sequence[Task] = (),
 ) -> TrainingTask:
-    """Return the training of a method that plays with the teammates of a release's histories, and of other tasks.
+    """Return the training of a method that plays with the teammates of a release's histories and of other tasks.
 
     Args:
         name: name of the method.
         model: architecture of the model.
-        options: options of the training; `batch_size` is the number of tasks that are played at once.
+        options: options of the training; `batch_size` is the number of tasks that are played in parallel.
         play: hyper-parameters of playing and learning.
-        histories: the histories whose teammates and layouts are played.
-        tasks: tasks with more teammates, heuristics. Those on other layouts are left out.
+        histories: choice of the histories that state the layouts and teammates to play with.
+        tasks: tasks with additional heuristic teammates; tasks on other layouts are left out.
 
     Raises:
-        EmptySelectionError: if no history has a value that the choice of histories filters by.
-        OptionError: for settings of histories that have no meaning here, tasks none of which is on these layouts, and
-            tasks with learned teammates.
+        EmptySelectionError: if no history passes a filter.
+        OptionError: if `histories` has options that do not apply to playing, none of `tasks` is on the chosen layouts,
+            or one of `tasks` has a learned teammate.
     """
     _check_unused(name, histories)
     release, dataset, layouts = _chosen_histories(histories, tasks)
-    tasks = _tasks_on(layouts, tasks)
-    teammates = _teammates(dataset, tasks)
+    tasks = _tasks_on_layouts(layouts, tasks)
+    teammates = _task_teammates(dataset, tasks)
     _check_layouts(layouts, teammates)
-    # Canonical channels, because one network plays all of the layouts.
+    # Channels are canonical, because one network plays on all layouts.
     method = get_method(name)(model, overcooked_world(layouts, model.encoder, canonical=True))
     hidden = [get_layout(one).name for one in histories.hide_recipe]
-    groups = _groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
-    # With few tasks some teammates play in no group: the record of training data must not name them.
+    groups = _task_groups(teammates, _shares(dataset, tasks), hidden, play, options.batch_size)
+    # With few tasks, some teammates are in no group, so the record of training data must not state them.
     played = {task for group in groups for task in group.ids}
     labels: Labels | None = "oracle" if play.imitation else None
     about = {
@@ -90,14 +90,14 @@ def prepare_play(
             "obs_shape": list(observation_shape(layouts[0], True)),
             "groups": {group.name: len(group.teammates) for group in groups},
         },
-        "trained_on": _played_cells(dataset, tasks, played, labels),
+        "trained_on": _training_record(dataset, tasks, played, labels),
     }
     trainer = PlayTrainer(method, options, play, groups, histories.mirror)
     return TrainingTask(method, TrainingData(None, {}), options, about, trainer)
 
 
 def _check_unused(name: str, histories: HistoryOptions) -> None:
-    # Settings are recorded: with an ignored option, equal runs would look different in tables.
+    # Ignored options are refused, because they would be stored and make equal runs look different in tables.
     default = HistoryOptions(histories.layouts)
     for field in ("order", "queries", "labels", "every", "held_out"):
         found = getattr(histories, field)
@@ -108,14 +108,14 @@ def _check_unused(name: str, histories: HistoryOptions) -> None:
 
 
 def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple[Dataset, Dataset | None, list[Layout]]:
-    """Return the release, the histories on the chosen layouts, None if there are none, and these layouts."""
+    """Return the release, its chosen histories (None if there are none), and the chosen layouts."""
     release = load_icrl4aht(histories.root)
     names: list[str] | None = None
     layouts: list[Layout] = []
     if ALL_LAYOUTS not in histories.layouts:
         layouts = list(dict.fromkeys(get_layout(one) for one in histories.layouts))
         stored = {get_layout(layout.name) for layout in release.layouts}
-        # A layout without histories is an error of the filter below, unless tasks may have teammates for it.
+        # `release.filter` refuses layouts without histories; with `tasks` such layouts are left to these.
         names = [layout.name for layout in layouts if not tasks or layout in stored]
         if not names:
             return release, None, layouts
@@ -123,9 +123,9 @@ def _chosen_histories(histories: HistoryOptions, tasks: Sequence[Task]) -> tuple
     return release, dataset, layouts or list(dataset.layouts)
 
 
-def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
-    """Return the tasks on some layouts."""
-    check_heuristics(tasks)  # a manifest names learned teammates, but has no weights of theirs
+def _tasks_on_layouts(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
+    """Return those of the tasks that are on one of the layouts."""
+    check_heuristics(tasks)  # a manifest has no checkpoints of learned teammates
     names = {layout.name for layout in layouts}
     found = [task for task in tasks if task.layout.name in names]
     if tasks and not found:
@@ -134,12 +134,12 @@ def _tasks_on(layouts: Sequence[Layout], tasks: Sequence[Task]) -> list[Task]:
     return found
 
 
-def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
-    """Return the teammates of all tasks of a selection of histories, and of further tasks."""
+def _task_teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
+    """Return the teammates of the tasks in a selection of histories, and of additional tasks."""
     found: _Teammates = {}
     scripted = [(task.layout, task.task_id, task.teammate) for task in tasks]
     if dataset is not None:
-        # Histories of one task have one teammate: any of them recovers it.
+        # All histories of a task have the same teammate, so one history per task is enough.
         history_of = dict(zip(dataset.column("task_id").tolist(), dataset.ids.tolist(), strict=True))
         for task_id, history_id in history_of.items():
             layout, teammate = dataset.history_task(history_id).layout, dataset.recover_teammate(history_id)
@@ -148,7 +148,7 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
                 mates[task_id] = recover_teammate(dataset, history_id)
             else:
                 scripted.append((layout, task_id, teammate))
-    # Heuristics of one family play in one program, so all need the same parameters.
+    # All heuristics of a family share one compiled program, so they need the same parameter names.
     entries = with_equal_parameters([teammate for _, _, teammate in scripted])
     for (layout, task_id, teammate), entry in zip(scripted, entries, strict=True):
         mates = found.setdefault((layout, teammate["family"]), {})
@@ -157,7 +157,7 @@ def _teammates(dataset: Dataset | None, tasks: Sequence[Task]) -> _Teammates:
 
 
 def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
-    """Check that every chosen layout has teammates."""
+    """Check that there are teammates for every chosen layout."""
     known = {layout.name for layout, _ in teammates}
     missing = [layout.name for layout in layouts if layout.name not in known]
     if missing:
@@ -167,31 +167,31 @@ def _check_layouts(layouts: Sequence[Layout], teammates: _Teammates) -> None:
         )
 
 
-def _groups(
+def _task_groups(
     teammates: _Teammates, shares: Mapping[str, float], hidden: Sequence[str], play: PlayOptions, tasks: int
 ) -> list[TaskGroup]:
-    """Return the groups of tasks.
+    """Return the groups of training tasks, including other versions of the layouts if `play` requests them.
 
     Args:
         teammates: the training teammates.
-        shares: name of each layout -> its share of the tasks.
+        shares: name of each layout -> relative number of its tasks.
         hidden: names of the layouts whose recipe indicators the model does not see.
-        play: says which other versions of the layouts are played.
-        tasks: number of all tasks.
+        play: options that request other versions of the layouts.
+        tasks: total number of tasks.
 
     Raises:
-        OptionError: if other versions are wanted and a layout's teammates play on it only, see `_heuristics`.
+        OptionError: if other versions are requested and a layout's teammates cannot play them.
     """
-    heuristics = _heuristics(teammates) if play.four_recipes or play.rearranged else {}
+    heuristics = _heuristic_teammates(teammates) if play.four_recipes or play.rearranged else {}
     everywhere, shares, hidden = dict(teammates), dict(shares), list(hidden)
     if play.four_recipes:
         for layout, kinds in heuristics.items():
             other, (kind, mates) = with_four_recipes(layout), next(iter(kinds.items()))
             everywhere[other, kind] = mates
             shares[other.name] = FOUR_RECIPES_SHARE
-            # The version has another name, by which an indicator that is hidden on the layout would be shown.
+            # The version has another name, so its indicator must be hidden by that name as well.
             hidden += [other.name] * (layout.name in hidden)
-    # Rearranged versions get their own part of the tasks; the other layouts divide the rest by their shares.
+    # Rearranged versions get a fixed part of the tasks; the other layouts divide the rest by their shares.
     total = sum(shares[name] for name in {layout.name for layout, _ in everywhere})
     rearranged = {layout: REARRANGED_SHARE * shares[layout.name] for layout in heuristics if play.rearranged}
     fixed = round(tasks * total / (total + sum(rearranged.values())))
@@ -202,12 +202,12 @@ def _groups(
     return groups
 
 
-def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Policy]]]:
-    """Return the heuristic teammates of each layout by kind: they see a `Situation`, and so play every layout.
+def _heuristic_teammates(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Policy]]]:
+    """Return layout -> kind -> heuristic teammates, which can play on every layout because they see a `Situation`.
 
     Raises:
-        OptionError: if a layout has learned teammates alone, or tasks with a dish of their own, which other versions of
-            the layout would not have.
+        OptionError: if a layout has only learned teammates, or has tasks with a fixed dish, which other versions of the
+            layout do not have.
     """
     for layout, _ in teammates:
         if layout.recipes != get_layout(layout.name).recipes:
@@ -222,8 +222,8 @@ def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Polic
     for layout, kinds in found.items():
         if not kinds:
             raise OptionError(
-                f"{layout.name}: rearranged layouts and four recipes need heuristic teammates, this layout has learned "
-                f"ones alone; leave out --rearranged and --four-recipes, or give a manifest with heuristics"
+                f"{layout.name}: rearranged layouts and four recipes need heuristic teammates, but this layout has "
+                f"only learned ones; leave out --rearranged and --four-recipes, or give a manifest with heuristics"
             )
     return found
 
@@ -231,27 +231,27 @@ def _heuristics(teammates: _Teammates) -> dict[Layout, dict[str, dict[str, Polic
 def _rearranged_groups(
     layout: Layout, kinds: Mapping[str, dict[str, Policy]], tasks: int, versions: int, hidden: bool
 ) -> Iterator[TaskGroup]:
-    """Yield a group of each kind of teammates on rearranged versions of a layout.
+    """Yield one group of tasks for each kind of teammate, on rearranged versions of a layout.
 
-    The versions are divided equally among the kinds, and the tasks of a kind among its versions, at least one each.
+    The versions are divided equally among the kinds of teammates, and the tasks of a kind equally among its versions.
     """
     layouts = rearranged_layouts(layout, versions)
     ends = [round(versions * k / len(kinds)) for k in range(len(kinds) + 1)]
     for (kind, mates), first, end in zip(kinds.items(), ends, ends[1:], strict=False):
         own = layouts[first:end]
-        if not own:  # there may be fewer versions than kinds
+        if not own:  # with fewer versions than kinds, some kinds get none
             continue
         count = max(len(own), round(tasks * len(own) / versions))
-        # In turn, so that the numbers of tasks of two versions differ by one at most.
+        # The numbers of tasks of two versions differ by at most one.
         where = [own[task % len(own)] for task in range(count)]
         yield make_group(where, kind, mates, hidden, f"{layout.name} rearranged")
 
 
 def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
-    """Return the share of the tasks on each layout: 1, or `FLAT_SHARE` where the ego matters with no teammate.
+    """Return the relative number of tasks on each layout: 1, or `FLAT_SHARE` if the oracle earns no more than `stay`.
 
-    The ego matters with a teammate with which the oracle earns more than `stay`, as measured for drawn teammates and
-    for those of releases. With a teammate that was not measured it counts as mattering.
+    The value is 1 if the oracle earns more than `stay` with at least one of the layout's teammates, according to stored
+    measurements, or if a teammate was not measured.
     """
     matters: dict[str, bool] = {}
     for task in tasks:
@@ -266,12 +266,12 @@ def _shares(dataset: Dataset | None, tasks: Sequence[Task]) -> dict[str, float]:
     return {layout: 1.0 if found else FLAT_SHARE for layout, found in matters.items()}
 
 
-def _played_cells(
+def _training_record(
     dataset: Dataset | None, tasks: Sequence[Task], played: set[str], labels: Labels | None
 ) -> list[dict[str, Any]]:
-    """Return the record of training data of the tasks that are played, see `training_cells`.
+    """Return the record of training data for the tasks that are played, see `training_cells`.
 
-    Tasks without histories have cells of their own, with the source `TASKS_SOURCE`.
+    Tasks without histories get separate entries, with the source `TASKS_SOURCE`.
     """
     found = []
     if dataset is not None:

@@ -1,8 +1,8 @@
-"""Best responses: egos with the benchmark's view, each trained with one teammate alone.
+"""Best responses: egos with the benchmark's view, each trained with a single teammate.
 
-The mean return B of a best response is what an ego could earn with this teammate if it knew it from the start. It is an
-estimate from below: a longer training or another learner may earn more. Practice elsewhere: jax-aht trains PPO egos for
-10^7 steps with one teammate, ZSC-Eval for 10^7 steps with 50 episodes of evaluation.
+The mean return B of a best response estimates what an ego could earn with a teammate that it knows from the start. B is
+a lower bound, because a longer training or another learner may earn more. For comparison, jax-aht trains PPO egos for
+10^7 steps with one teammate; ZSC-Eval trains for 10^7 steps and evaluates on 50 episodes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from icrl4aht_generation.teammates.spread import find_measured
 from msgspec import structs, to_builtins
 
 from icrl4aht_baselines.agents.bundled import bundled_models
-from icrl4aht_baselines.agents.egos import PlayMode, learned, with_view
+from icrl4aht_baselines.agents.egos import PlayMode, trained_policy, with_view
 from icrl4aht_baselines.evaluate.evaluator import evaluate
 from icrl4aht_baselines.methods.options import RL2_SETTINGS, ModelOptions
 from icrl4aht_baselines.methods.registry import get_method, overcooked_world
@@ -53,13 +53,13 @@ PROTOCOL = "seeded"
 """Protocol under which best responses are chosen and measured."""
 
 CHOICE_SEEDS, REPORT_SEEDS = (1000,), (0, 1, 2)
-"""Seeds of the episodes by which the best one of several trainings is chosen, and of those that are reported."""
+"""Seeds of the episodes that the best training is chosen by, and seeds of the reported episodes."""
 
 RESPONSES_FILE = "best_responses.json"
 """Name of the file of best responses, in a folder of trainings and among the package's cards."""
 
 RESULT = "result.json"
-"""Name of the file with the result of a training, in its folder."""
+"""Name of the file with a training's result, in the folder of the training."""
 
 ABOUT = (
     "Best responses: recurrent PPO with the benchmark's 5 x 5 view, trained with one teammate alone, memory cleared "
@@ -69,15 +69,14 @@ ABOUT = (
 
 
 PLAY = PlayOptions(task_end=1.0)
-"""Options of playing: each episode is a task of its own, since nothing is to be found out."""
+"""Play options of a best response: each task is one episode, because the ego trains with a single teammate."""
 
 
 def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
-    """Group the tasks of one split, layout, dish and family whose teammates act alike, and so have one best response.
+    """Group tasks of the same split, layout, dish and family whose teammates behave the same.
 
-    Teammates act alike if their distance on the states of `teammates.distances` is below `SAME_BEHAVIOUR`.
-
-    Teammates on layouts without test instances, such as generated ones, are not compared.
+    The tasks of a group share one best response. Teammates behave the same if their distance on the states of
+    `teammates.distances` is below `SAME_BEHAVIOUR`. On layouts without test tasks, teammates are not compared.
     """
     groups: dict[Any, list[Task]] = defaultdict(list)
     for task in tasks:
@@ -97,9 +96,9 @@ def find_behaviours(tasks: Iterable[Task]) -> list[tuple[Task, ...]]:
 
 
 def with_headroom(tasks: Iterable[Task]) -> list[Task]:
-    """Return the tasks in which the scripted oracle earns more than `stay`, as measured for test cells and draws.
+    """Return the tasks in which the scripted oracle earns more than `stay`, according to stored measurements.
 
-    Tasks that were not measured, such as those of the track preference, are kept.
+    Tasks without a measurement, such as those of the track preference, are included.
     """
     cells = read_headroom(PROTOCOL)
     kept = []
@@ -116,14 +115,14 @@ def with_headroom(tasks: Iterable[Task]) -> list[Task]:
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """A training by playing and the measurement of its ego, a job of a queue, see `icrl4aht_generation.jobs.job.Job`.
+    """Job that trains an ego by playing and measures it, see `icrl4aht_generation.jobs.job.Job`.
 
     Attributes:
         tasks: the tasks that the ego plays.
         seed: seed of the training.
         options: settings of the training.
         out: folder of all trainings.
-        xla_threads: threads of XLA on a CPU.
+        xla_threads: number of XLA threads on a CPU.
     """
 
     tasks: tuple[Task, ...]
@@ -135,24 +134,24 @@ class TrainingJob:
 
     @property
     def name(self) -> str:
-        """Name that no other job of the queue has."""
+        """Unique name of the job in its queue, which is also the name of its folder."""
         raise NotImplementedError
 
     @property
-    def ending(self) -> str:
-        """End of the name: width and seed, so that trainings of several widths share a folder."""
+    def name_suffix(self) -> str:
+        """End of the job's name: width and seed, so that trainings of several widths can share an output folder."""
         return f"w{self.options.width}-s{self.seed}"
 
     @property
     def model(self) -> ModelOptions:
-        """Architecture of the ego: that of the bundled rl2 models, with the width of the options."""
+        """Architecture of the ego: that of the bundled rl2 models, with the width that the options state."""
         return ModelOptions(**{**RL2_SETTINGS["model"], "width": self.options.width})
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the result depends on."""
+        """All settings that the result depends on, as JSON."""
         options = asdict(self.options)
-        del options["width"]  # an option of the model
+        del options["width"]  # already in `model`
         return {
             "seed": self.seed,
             "options": options,
@@ -163,7 +162,7 @@ class TrainingJob:
 
     @property
     def folder(self) -> Path:
-        """Folder of the training and its result."""
+        """Folder of the training run and of its result."""
         return self.out / self.name
 
     @property
@@ -172,16 +171,16 @@ class TrainingJob:
         return self.options.updates
 
     def is_finished(self) -> bool:
-        """Return whether the result of these settings is there."""
+        """Return whether a result with the settings of this job is stored."""
         path = self.folder / RESULT
         return path.is_file() and not differing_settings(self.result()["settings"], self.settings)
 
     def result(self) -> dict[str, Any]:
-        """Return the content of result.json: `settings`, and what `measure` returned."""
+        """Return the content of result.json: `settings`, and the values that `measure` returned."""
         return parse_json(read_text(self.folder / RESULT))
 
     def progress(self) -> tuple[int, float] | None:
-        """Return training steps done, and environment steps per second."""
+        """Return the number of finished training steps, and environment steps per second; None before the first log."""
         timing = last_line(self.folder / "run" / TIMING)
         if timing is None:
             return None
@@ -197,11 +196,11 @@ class TrainingJob:
                 write_json(partial, content)
 
     def finished_text(self) -> str:
-        """Return the text on the finished training."""
+        """Return a note on the result for progress displays."""
         return "finished"
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the ego, and return what was measured."""
+        """Train the ego, and return the measured values, as JSON."""
         raise NotImplementedError
 
     def train(
@@ -212,14 +211,14 @@ class TrainingJob:
         params: Any = None,
         told: int = 0,
     ) -> tuple[PlayTrainer, Any]:
-        """Train with groups of tasks, or resume. Return the trainer and the parameters.
+        """Train an ego on groups of tasks, or resume its training. Return the trainer and the parameters.
 
         Args:
             layouts: layouts of the tasks.
-            groups: the tasks.
-            on_update: see `run`.
-            params: initial parameters; drawn by the seed by default.
-            told: number of tasks, for an ego that is told in every step which one it plays; otherwise 0.
+            groups: groups of tasks.
+            on_update: function for progress, see `run`.
+            params: initial parameters; by default random ones that depend on the seed.
+            told: number of tasks, for an informed ego, which observes the task's number in every step; otherwise 0.
         """
         model = self.model
         method = get_method("rl2")(model, overcooked_world(layouts, model.encoder, canonical=True, partners=told))
@@ -236,40 +235,40 @@ class TrainingJob:
 
 @dataclass(frozen=True)
 class ResponseJob(TrainingJob):
-    """The training and evaluation of one best response, to the teammates of one of `find_behaviours`.
+    """Job that trains and evaluates one best response, on a group of tasks from `find_behaviours`.
 
-    It trains with the teammate of the first task.
+    The best response is trained with the teammate of the group's first task.
     """
 
     @property
     def name(self) -> str:
-        """Task, the model that it starts from, width and seed."""
+        """Name of the job's folder: id of the first task, initial model if any, width and seed."""
         start = f"-{self.options.init}" if self.options.init else ""
-        return f"{self.tasks[0].task_id}{start}-{self.ending}"
+        return f"{self.tasks[0].task_id}{start}-{self.name_suffix}"
 
     @property
     def label(self) -> str:
-        """Layout, teammate and seed."""
+        """Name of the job in progress displays: layout, teammate and seed."""
         task, others = self.tasks[0], len(self.tasks) - 1
         alike = f" and {others} alike" if others else ""
         return f"{task.layout.name} {task.teammate_family}/t{task.teammate['theta_id']}{alike}, seed {self.seed}"
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the result depends on."""
+        """All settings that the result depends on, as JSON."""
         seeds = {"choice_seeds": list(CHOICE_SEEDS), "report_seeds": list(REPORT_SEEDS), "protocol": PROTOCOL}
         return {"tasks": [task.task_id for task in self.tasks], **super().settings, **seeds}
 
     def finished_text(self) -> str:
-        """Return the text on the finished training."""
+        """Return a note on the result for progress displays: the return in each play mode."""
         modes = self.result()["modes"]
         return "return " + ", ".join(f"{mode} {found['return']:.1f}" for mode, found in modes.items())
 
     def measure(self, on_update: OnUpdate) -> dict[str, Any]:
-        """Train the ego, play the tasks, and return the returns on the episodes to choose by and to report.
+        """Train the ego, and measure its returns on the episodes to choose by ("choice") and to report ("return").
 
-        The returns are means over the tasks, of the most probable actions ("greedy") and of drawn ones
-        ("sampled"). "slope" is the rise of the training's return from the third to the last quarter of its steps.
+        Returns are means over the tasks, with the most probable actions ("greedy") and with sampled actions
+        ("sampled"). "slope" is the training return in the last quarter of the steps minus that in the third quarter.
         """
         task, params = self.tasks[0], None
         if self.options.init:
@@ -282,7 +281,7 @@ class ResponseJob(TrainingJob):
         trainer, params = self.train([task.layout], [group], on_update, params)
         modes = {}
         for mode, greedy in (("greedy", True), ("sampled", False)):
-            policy = with_view(learned(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical")
+            policy = with_view(trained_policy(trainer.method, params, KEPT_STEPS, PlayMode(greedy=greedy)), "canonical")
             choice, report = (self._mean_return(policy, seeds) for seeds in (CHOICE_SEEDS, REPORT_SEEDS))
             modes[mode] = {"choice": choice, "return": report}
         lines = map(parse_json, read_text(self.folder / "run" / METRICS).splitlines())
@@ -299,7 +298,7 @@ class ResponseJob(TrainingJob):
 
 
 def trained_response(job: ResponseJob) -> TrainedResponse:
-    """Return the record of a finished training, in the way of acting that earns more on the episodes to choose by."""
+    """Return the record of a finished training, for the play mode that earns more on the episodes to choose by."""
     result = job.result()
     acting, earned = max(result["modes"].items(), key=lambda mode: mode[1]["choice"])
     steps = job.options.updates * job.options.tasks * KEPT_STEPS
@@ -315,11 +314,11 @@ def trained_response(job: ResponseJob) -> TrainedResponse:
     )
 
 
-def best_of(tasks: Sequence[Task], trainings: Iterable[TrainedResponse]) -> BestResponse:
-    """Return the best response in tasks whose teammates act alike.
+def choose_best_response(tasks: Sequence[Task], trainings: Iterable[TrainedResponse]) -> BestResponse:
+    """Return the best response to tasks whose teammates behave the same, from several trainings.
 
-    The best training is that with the highest return on the episodes to choose by; B is its return on the others. Of
-    trainings with the same seed, start, steps and width the last one counts.
+    The training with the highest return on the episodes to choose by is the best; B is its return on the reported
+    episodes. Of several trainings with the same seed, initial model, steps and width, only the last is used.
     """
     task, seeds = tasks[0], {(one.init, one.steps, one.width, one.seed): one for one in trainings}
     best = chosen_training(seeds.values())
@@ -334,12 +333,12 @@ def best_of(tasks: Sequence[Task], trainings: Iterable[TrainedResponse]) -> Best
     )
 
 
-def best_with_models(found: BestResponse, models: Mapping[str, Mapping[str, float]]) -> BestResponse:
-    """Return a best response, or the return of a model that earns more.
+def include_models(found: BestResponse, models: Mapping[str, Mapping[str, float]]) -> BestResponse:
+    """Return a best response with the return of the best model, if that model earns more than the training.
 
     Args:
-        found: the best response.
-        models: model -> task id -> mean return; models without one of its tasks do not count.
+        found: best response by training.
+        models: model -> task id -> mean return; models without results in all tasks of `found` are ignored.
     """
     earned = {
         name: float(np.mean([returns[task] for task in found.tasks]))
@@ -355,15 +354,15 @@ def best_with_models(found: BestResponse, models: Mapping[str, Mapping[str, floa
 def write_responses(
     jobs: Sequence[ResponseJob], folder: Path, models: Mapping[str, Mapping[str, float]] = MappingProxyType({})
 ) -> Path:
-    """Add the best responses of finished trainings to a folder's `RESPONSES_FILE`. Return its path.
+    """Add the best responses of finished trainings to the file `RESPONSES_FILE` in a folder. Return the file's path.
 
-    Earlier trainings of the same tasks in the file are kept. An entry that shares only some tasks with a new one is
-    removed. The version is a hash of all entries.
+    A new entry includes earlier trainings on the same tasks that the file has. Earlier entries that share only some of
+    the tasks are removed. The version in the file is a hash of all entries.
 
     Args:
-        jobs: the trainings.
-        folder: the folder.
-        models: returns of other models, see `best_with_models`.
+        jobs: jobs of the trainings; unfinished ones are skipped.
+        folder: folder of the file.
+        models: model -> task id -> mean return, see `include_models`.
     """
     path, finished = folder / RESPONSES_FILE, defaultdict[tuple[str, ...], list[ResponseJob]](list)
     for job in jobs:
@@ -373,19 +372,19 @@ def write_responses(
     found = {}
     for ids, own in finished.items():
         before = known[ids].seeds if ids in known else ()
-        found[ids] = best_of(own[0].tasks, [*before, *map(trained_response, own)])
+        found[ids] = choose_best_response(own[0].tasks, [*before, *map(trained_response, own)])
     new = {task for ids in found for task in ids}
     kept = [one for ids, one in known.items() if new.isdisjoint(ids)]
-    behaviours = tuple(best_with_models(one, models) for one in (*kept, *found.values()))
+    behaviours = tuple(include_models(one, models) for one in (*kept, *found.values()))
     card = BestResponseCard(json_hash(to_builtins(behaviours)), PROTOCOL, ABOUT, behaviours)
     write_best_responses(path, card)
     return path
 
 
 def responses_table(folder: Path) -> str:
-    """Return a Markdown table of a folder's best responses: B, the least and most of the trainings, and their rise.
+    """Return a Markdown table of a folder's best responses: B, range of the trainings' returns, and their rise.
 
-    The rise is that of the last quarter of the best training's steps; one of several points says that it was too short.
+    "rise" is the best training's `slope`; a rise of several points shows that the training was too short.
     """
     body = []
     for one in read_best_responses(folder / RESPONSES_FILE).behaviours:

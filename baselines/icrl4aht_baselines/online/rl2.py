@@ -1,12 +1,12 @@
-"""Training of RL^2 (Duan et al. 2016): PPO on episodes that the model plays with the teammates of a release.
+"""Training of RL^2 (Duan et al. 2016): PPO on episodes that the model plays with a release's teammates.
 
-A step plays one episode of every task, then learns from all of them. After an episode a task continues with the model's
-recurrent state, or ends by chance; a new task with the same teammate then begins. Returns include the rewards of later
-episodes, so the model is rewarded for exploration that helps later.
+A training step plays one episode of every task, then updates the model on all of them. After an episode, a task
+continues with the model's recurrent state, or ends at random; then a new task with the same teammate begins. Returns
+include the rewards of later episodes of the task, so exploration that helps later is rewarded.
 
-Learning starts from imitation: the loss contains the cross-entropy of the scripted oracle's actions in the states that
-the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al. 2011). The
-oracle knows what the model has to find out, so imitation alone is not the goal.
+At first the model also imitates the scripted oracle: the loss contains the cross-entropy of the oracle's actions in the
+states that the model visits, with a weight that falls to 0 (kickstarting, Schmitt et al. 2018; DAgger, Ross et al.
+2011). Imitation ends because the oracle knows what the model has to find out.
 
 Shapes: `B` tasks, `T` steps of an episode, `S` size of the recurrent state.
 """
@@ -45,17 +45,17 @@ from icrl4aht_data.overcooked.layouts import Layout
 from icrl4aht_data.overcooked.observe import observe
 
 PLAY_REWARD_SCALE = 0.05
-"""Factor of rewards in returns and values; a delivery, which earns 20 points, becomes 1."""
+"""Factor of the rewards in returns and values: a delivery, which earns 20 points, becomes 1."""
 
 
 class PlayerMemory(NamedTuple):
-    """Memory of the model in a task.
+    """Memory of the model in a running task.
 
     Attributes:
-        change: changes of its view, see `ViewChange`.
-        state: float32 (S,), its recurrent state.
-        started: bool (), whether a step of the task was played; before it the outcome of the previous step is zero.
-        partner: int32 (), number of the teammate, for a model that is told; None for others.
+        change: changes of the model's observations, see `ViewChange`.
+        state: float32 (S,), recurrent state of the model.
+        started: bool (), whether a step of the task was played; if not, the outcome of the previous step is zero.
+        partner: int32 (), number of the teammate for an informed model; None for other models.
     """
 
     change: ViewChange
@@ -65,13 +65,13 @@ class PlayerMemory(NamedTuple):
 
 
 class PlayState(NamedTuple):
-    """State of the training: a step maps it to the next one, and a resume needs nothing else.
+    """State of a training by playing, which is the complete content of a checkpoint.
 
     Attributes:
         params: pytree of float32 arrays.
         optimizer: state of the optimizer.
-        tasks: the running tasks of each group.
-        step: int32 (), steps so far.
+        tasks: state of the running tasks, for each player.
+        step: int32 (), number of training steps so far.
     """
 
     params: Any
@@ -82,15 +82,15 @@ class PlayState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TaskGroup:
-    """Tasks of one family of teammates.
+    """Training tasks with teammates of one kind.
 
     Attributes:
         layouts: layout of each task.
         family: kind of the teammates, such as "assembly_line".
-        teammates: policies that share their functions, one for each task.
-        hidden: whether the model does not see recipe indicators.
-        label: the layouts' name in the log.
-        partners: number of each task's teammate, for a model that is told; None for others.
+        teammates: teammate of each task; the policies share their functions.
+        hidden: whether recipe indicators are hidden from the model.
+        label: name of the layouts in the log.
+        partners: number of each task's teammate, for an informed model; None for other models.
         ids: ids of the tasks that the teammates come from; empty if they are not recorded.
     """
 
@@ -104,7 +104,7 @@ class TaskGroup:
 
     @property
     def name(self) -> str:
-        """Name in the log."""
+        """Name of the group in the log: layouts and kind of teammates."""
         return f"{self.label} {self.family}"
 
 
@@ -114,12 +114,12 @@ def make_groups(
     shares: Mapping[str, float],
     hidden: Collection[str] = (),
 ) -> list[TaskGroup]:
-    """Divide tasks among layouts by their shares, and equally among the families of each layout.
+    """Return groups of tasks: divided among layouts by their shares, and equally among a layout's kinds of teammates.
 
     Args:
-        teammates: layout and family -> task id -> training teammate; see `chosen_teammates` for those that play.
-        tasks: number of all tasks; the result has a few fewer or more, at least one in each group.
-        shares: name of each of these layouts -> its share.
+        teammates: (layout, kind of teammate) -> task id -> teammate; see `chosen_teammates` for the choice among them.
+        tasks: approximate total number of tasks; each group has at least one.
+        shares: name of each layout -> relative number of its tasks.
         hidden: names of layouts whose recipe indicators the model does not see.
     """
     families: dict[str, int] = defaultdict(int)
@@ -136,11 +136,11 @@ def make_groups(
 def make_group(
     layouts: Sequence[Layout], family: str, teammates: Mapping[str, Policy], hidden: bool, label: str
 ) -> TaskGroup:
-    """Return tasks on some layouts with chosen teammates, which do not always follow their script.
+    """Return a group of tasks on some layouts, with teammates that do not always follow their script.
 
     Args:
         layouts, family, hidden, label: see `TaskGroup`.
-        teammates: task id -> training teammate.
+        teammates: task id -> teammate to choose from.
     """
     names = list(teammates)
     ids = [names[number] for number in chosen_teammates(len(names), len(layouts))]
@@ -149,17 +149,17 @@ def make_group(
 
 
 def chosen_teammates(teammates: int, tasks: int) -> np.ndarray:
-    """Return the number of the teammate of each task of a group, int (tasks,).
+    """Return the index of each task's teammate in a group of tasks, int (tasks,).
 
-    Every teammate has as many tasks as the others, or one more. If there are fewer tasks than teammates, some teammates
-    have none. The order is random, because the behaviours of teammates follow the order of the tasks.
+    Teammates have equal numbers of tasks, up to a difference of one. With fewer tasks than teammates, some teammates
+    have none. The order is shuffled, because a teammate's behaviours depend on the index of its task.
     """
     numbers = np.arange(max(tasks, teammates)) % teammates
     return np.random.default_rng(0).permutation(numbers)[:tasks]
 
 
 class _Network(NamedTuple):
-    """The model with the interface of `ppo.RecurrentNetwork`."""
+    """Adapter that gives the model the interface of `ppo.RecurrentNetwork`."""
 
     model: Any
 
@@ -170,18 +170,18 @@ class _Network(NamedTuple):
 
 
 class _Player:
-    """Plays one episode after another of groups of tasks with one family of teammates, in one compiled program."""
+    """Player of groups of tasks whose teammates share their functions: it plays their episodes in one program."""
 
     def __init__(self, groups: Sequence[TaskGroup], method: Method, play: PlayOptions, mirror: bool) -> None:
         self.groups, self._method, self._play, self._mirror = groups, method, play, mirror
         teammates = [mate for group in groups for mate in group.teammates]
         self.tasks = len(teammates)
         sizes = [len(group.teammates) for group in groups]
-        self.ends = np.cumsum(sizes)[:-1]  # number of the first task of each group but the first
+        self.ends = np.cumsum(sizes)[:-1]  # where the tasks of each further group begin
         self._hidden = np.repeat([group.hidden for group in groups], sizes)
         told = [group.partners for group in groups if group.partners is not None]
         self._partners = jnp.asarray(np.concatenate(told), jnp.int32) if told else None
-        # A model whose view never changes needs no code for it, which is a part of every step and of its compilation.
+        # Without changed views, the code for them is left out, which saves time in every step and in compilation.
         self._changes = mirror or bool(self._hidden.any())
         played = [layout for group in groups for layout in group.layouts]
         layouts = list(dict.fromkeys(played))
@@ -213,12 +213,12 @@ class _Player:
     def episode(
         self, params: Any, mates: Any, state: RolloutState, key: Key[Array, ""]
     ) -> tuple[RolloutState, Sequences, Float[Array, " B"]]:
-        """Return the state after one episode of every task, the episode for learning, and its returns."""
+        """Play one episode of every task. Return the state after it, the episode for learning, and the returns."""
         change_key, end_key = jax.random.split(key)
         after, played = self.rollout.episode(params, mates, state)
         ended = jax.random.bernoulli(end_key, self._play.task_end, (self.tasks,))
         sequences = self._sequences(params, state, after, played, ended)
-        # Where a task ends, a new one begins with the same teammate: another view, an empty state, no previous step.
+        # A new task has the same teammate, but another view, a zero state and no previous step.
         begun = select_rows(ended, self._draw_change(change_key), after.ego.change)
         memory = PlayerMemory(begun, jnp.where(ended[:, None], 0.0, after.ego.state), ~ended, state.ego.partner)
         before = select_rows(ended, no_outcome(self.tasks), after.before)
@@ -230,7 +230,7 @@ class _Player:
         env, change = self.rollout.env, state.ego.change
         record, actions, reward = (jnp.swapaxes(x, 0, 1) for x in (played.record, played.actions, played.reward))
         taken, theirs = actions[..., EGO], actions[..., TEAMMATE]
-        # One step more than was played: the value there is what the last step leads to.
+        # One more step than was played, whose value bootstraps the last step's return.
         look = partial(observe, agent=EGO, canonical=True)
         seen_records = jnp.concatenate([played.record, after.env.record[:, None]], axis=1)
         steps = StepInput(
@@ -241,15 +241,14 @@ class _Player:
             partner=None if state.ego.partner is None else jnp.tile(state.ego.partner, (len(record) + 1, 1)),
         )
         if self._changes:
-            # Only the first step of an episode can be a task's first one.
+            # Only the first step of an episode can be the first step of a task.
             started = jnp.ones((len(record) + 1, self.tasks), bool).at[0].set(state.ego.started)
-            seen = seen_steps(change.at_each_step(len(record) + 1, 0), steps, started)
+            seen = seen_steps(change.repeat_for_steps(len(record) + 1, 0), steps, started)
         else:
             seen = steps
-        # A second pass over the episode gives log-probabilities and values by the operations of the loss, and the value
-        # of the step after the last.
+        # Log-probabilities and values are computed again with the operations of the loss, so that both agree exactly.
         _, logits, value = _Network(self._method.model).apply(params, state.ego.state, seen)
-        own = change.at_each_step(len(record), 0)
+        own = change.repeat_for_steps(len(record), 0)
         action = own.actions(taken)
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits[:-1]), action[..., None], axis=-1)[..., 0]
         return Sequences(
@@ -259,19 +258,19 @@ class _Player:
             log_prob=log_prob,
             value=value[:-1],
             reward=PLAY_REWARD_SCALE * reward,
-            # Returns end with a task, not with an episode, so that exploring early pays in later episodes.
+            # Returns end with a task, not with an episode, so that exploration is rewarded in later episodes.
             done=jnp.zeros(reward.shape, bool).at[-1].set(ended),
             hidden=state.ego.state[None],
             partner=jnp.zeros((1, self.tasks), jnp.int32),  # one value function for all teammates
             weight=jnp.ones((1, self.tasks)),
             last_value=value[-1][None],
-            # The oracle acts in the environment's view; its actions are learned in the model's.
+            # The oracle's actions are converted from the environment's view to the model's view.
             expert=own.actions(follow_oracle(self.rollout.layout, record, taken, state.env.layout)),
         )
 
 
 def make_players(groups: Sequence[TaskGroup], method: Method, play: PlayOptions, mirror: bool) -> list[_Player]:
-    """Return a player of all groups whose teammates share their functions and so one compilation."""
+    """Return the players, one for all groups of tasks that can share a compiled program."""
     programs: dict[Any, list[TaskGroup]] = defaultdict(list)
     for group in groups:
         mate = group.teammates[0]
@@ -281,27 +280,27 @@ def make_players(groups: Sequence[TaskGroup], method: Method, play: PlayOptions,
 
 
 def seen_steps(change: ViewChange, steps: StepInput, started: Bool[Array, "*B"]) -> StepInput:
-    """Return steps as an ego with a changed view sees them.
+    """Return steps as they look to an ego with changed observations.
 
     Args:
-        change: the changes (*B,).
-        steps: the steps (*B, ..).
-        started: whether a step precedes in the task; otherwise the previous actions are zeros that mean nothing.
+        change: changes of the observations (*B,).
+        steps: steps with the environment's observations (*B, ..).
+        started: whether each step has a previous step in its task; if not, previous actions are fillers and stay 0.
     """
 
-    def seen(actions: Array) -> Array:
+    def view_actions(actions: Array) -> Array:
         return jnp.where(started, change.actions(actions), actions)
 
     mate = steps.prev_teammate_action
     return steps._replace(
         obs=change.observations(steps.obs),
-        prev_action=seen(steps.prev_action),
-        prev_teammate_action=None if mate is None else seen(mate),
+        prev_action=view_actions(steps.prev_action),
+        prev_teammate_action=None if mate is None else view_actions(mate),
     )
 
 
 def _model_policy(method: Method, changes: bool) -> Policy:
-    """Return the policy that plays while it learns: it draws its actions. `changes`: whether its view may change."""
+    """Return the policy that samples the model's actions in training; `changes`: whether its view may be changed."""
 
     def init(params: Any, key: Array) -> PlayerMemory:
         return PlayerMemory(no_change(), method.start(0, True), jnp.bool_(False))
@@ -320,10 +319,10 @@ class PlayTrainer:
     """Training by playing, with the interface of `icrl4aht_baselines.training.trainer.Trainer`.
 
     Args:
-        method: RL^2.
-        options: `steps`, `batch_size`, `learning_rate`, `warmup`, `clip` and `seed` count.
+        method: the method RL^2.
+        options: options of the training; `steps`, `learning_rate`, `warmup`, `clip` and `seed` are used here.
         play: hyper-parameters of playing and learning.
-        groups: the tasks.
+        groups: groups of tasks to play.
         mirror: whether tasks are mirrored at random.
 
     Raises:
@@ -347,7 +346,7 @@ class PlayTrainer:
                 f"minibatches = {play.minibatches}: expected at most the {self.tasks} tasks that are played at once; "
                 f"give fewer --minibatches or a larger --batch-size"
             )
-        # Minibatches have equal sizes: a pass leaves out up to minibatches - 1 tasks, others in each pass.
+        # Minibatches have equal sizes, so a pass leaves out up to minibatches - 1 tasks, different ones in each pass.
         learned = self.tasks - self.tasks % play.minibatches
         config = PPOConfig(
             total_steps=options.steps * learned * KEPT_STEPS,
@@ -367,11 +366,11 @@ class PlayTrainer:
         self._compiled: list[Any] | None = None
 
     def init(self) -> PlayState:
-        """Return the state before the first step."""
+        """Return the state before the first training step."""
         return jax.jit(self._initial_state)()
 
     def state_like(self) -> Any:
-        """Return the shape s and dtypes of the state, to restore a checkpoint by."""
+        """Return the shapes and dtypes of the state, which restoring a checkpoint needs."""
         return jax.eval_shape(self._initial_state)
 
     def _initial_state(self) -> PlayState:
@@ -382,16 +381,16 @@ class PlayTrainer:
         return PlayState(params, ppo_optimizer(self.ppo.config).init(params), tasks, jnp.int32(0))
 
     def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 0) -> AbstractContextManager[range]:
-        """Return the numbers of the steps."""
+        """Return the numbers of the training steps, which replace batches: episodes are played in `step`."""
         return nullcontext(range(start, stop))
 
     def validation_lines(self, state: PlayState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
-        """Return nothing: such models are compared by `evaluate` on validation tasks."""
+        """Return no lines, because models that play are compared by `evaluate` on validation tasks."""
         return []
 
     def step(self, state: PlayState, number: int) -> tuple[PlayState, dict[str, Array]]:
-        """Play one episode of every task and learn from them; return the state after it and the numbers to log."""
-        # Keys are functions of the seed and the step's number, so that a resumed run plays the same episodes.
+        """Play one episode of every task and update the model. Return the new state, and the numbers to log."""
+        # Random keys depend on the seed and the step only, so that a resumed run plays the same episodes.
         play_key, learn_key = jax.random.split(jax.random.fold_in(jax.random.key(self.options.seed + 1), number))
         keys = jax.random.split(play_key, len(self.players))
         if self._compiled is None:
@@ -401,7 +400,7 @@ class PlayTrainer:
             for episode, mates, tasks, key in zip(self._compiled, self._mates, state.tasks, keys, strict=True)
         ]
         tasks, sequences, returns = zip(*played, strict=True)
-        # All groups are one batch, from which minibatches are drawn: none learns from one layout alone.
+        # Minibatches are sampled from all groups together, so that each one has many layouts.
         weight = imitation_weight(self.play, state.step, self.options.steps)
         params, optimizer, log = self._learn(state.params, state.optimizer, sequences, learn_key, weight)
         by_name: dict[str, list[Array]] = defaultdict(list)
@@ -412,11 +411,11 @@ class PlayTrainer:
         return PlayState(params, optimizer, tasks, state.step + 1), log
 
     def measure(self, params: Any, episodes: int, seed: int) -> list[np.ndarray]:
-        """Return the returns of drawn actions in new episodes, float64 (tasks, episodes), one array for each group.
+        """Return the returns of sampled actions in new episodes: for each group an array float64 (tasks, episodes).
 
         Args:
             params: parameters of the model.
-            episodes: episodes of each task.
+            episodes: number of episodes of each task.
             seed: seed of the episodes.
         """
         found: list[np.ndarray] = []
@@ -430,7 +429,7 @@ class PlayTrainer:
         return found
 
     def _compile(self, state: PlayState, key: Key[Array, ""]) -> list[Callable[..., Any]]:
-        """Compile the episodes of all groups at the same time, since each takes seconds and one core."""
+        """Compile the episodes of all players in parallel, since a compilation takes seconds and uses one core."""
         with ThreadPoolExecutor() as pool:
             lowered = [
                 player.compiled.lower(state.params, mates, tasks, key)
@@ -446,10 +445,10 @@ class PlayTrainer:
         params, optimizer, log = self.ppo.learn(params, optimizer, played, key)
         config = self.ppo.config
         total = log["policy_loss"] + config.value * log["value_loss"] - config.entropy * log["entropy"]
-        total += weight * log["imitation_loss"]  # the loss of a training is one number in all logs
+        total += weight * log["imitation_loss"]  # so that "loss" is the complete loss, as in the logs of other methods
         return params, optimizer, {"loss": total, **log, "imitation_weight": weight}
 
 
 def imitation_weight(play: PlayOptions, step: Int[Array, ""], steps: int) -> Float[Array, ""]:
-    """Return the weight of imitating the oracle in a step of a training of `steps` steps; it falls linearly to 0."""
+    """Return the weight of the imitation loss in a training step, which falls linearly to 0; `steps`: all steps."""
     return play.imitation * jnp.maximum(0.0, 1.0 - step / (play.imitation_end * steps))

@@ -1,8 +1,8 @@
-"""Training teammates that do not always follow their script, with which a model learns to act without their help.
+"""Training teammates that do not always follow their script, so that a model learns to act without their help.
 
-A teammate has four behaviours: it follows its script, does nothing, acts at random, or follows its script except for
-some random actions. Each episode draws one by the teammate's own chances: a teammate with one behaviour keeps it for a
-task, one with several switches between episodes.
+In each episode, a teammate has one of four behaviours: it follows its script, does nothing, acts at random, or follows
+its script except for some random actions. The behaviour is sampled from the teammate's probabilities at the start of
+the episode.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from icrl4aht_data.errors import OptionError
 from icrl4aht_data.overcooked.actions import STAY
 
 BEHAVIOURS = ("script", "stay", "random", "noisy")
-"""Behaviours of a teammate, in the order of its chances."""
+"""Behaviours of a teammate, in the order of its probabilities."""
 
 NOISY_SHARE = 0.3
-"""Share of random actions in the behaviour "noisy"."""
+"""Probability of a random action in the behaviour "noisy"."""
 
 MIXTURE: tuple[tuple[float, tuple[float, ...]], ...] = (
     (0.60, (1.0, 0.0, 0.0, 0.0)),
@@ -33,14 +33,14 @@ MIXTURE: tuple[tuple[float, tuple[float, ...]], ...] = (
     (0.10, (0.0, 0.0, 0.0, 1.0)),
     (0.10, (0.25, 0.25, 0.25, 0.25)),
 )
-"""Share of the tasks -> chances of `BEHAVIOURS` of their teammates."""
+"""Pairs of a share of the tasks and the probabilities of `BEHAVIOURS` of their teammates."""
 
 
 def check_heuristics(tasks: Iterable[Task]) -> None:
     """Check that all tasks have heuristic teammates.
 
     Raises:
-        OptionError: if one has a learned teammate; names the task.
+        OptionError: if a task has a learned teammate; the message names the task.
     """
     for task in tasks:
         if task.teammate["kind"] != "heuristic":
@@ -51,20 +51,20 @@ def check_heuristics(tasks: Iterable[Task]) -> None:
 
 
 def mixed_chances(tasks: int) -> np.ndarray:
-    """Return the chances of the behaviours of each of some tasks, float32 (tasks, 4), in the shares of `MIXTURE`."""
+    """Return the probabilities of the teammates' behaviours in some tasks, float32 (tasks, 4), as `MIXTURE` states."""
     shares = np.cumsum([share for share, _ in MIXTURE])
     kind = np.searchsorted(shares, (np.arange(tasks) + 0.5) / tasks * shares[-1])
     return np.array([chances for _, chances in MIXTURE], np.float32)[kind]
 
 
 def with_behaviours(teammates: Sequence[Policy], chances: np.ndarray) -> list[Policy]:
-    """Return teammates of one family with behaviours.
+    """Return teammates that show one of `BEHAVIOURS` in each episode.
 
     Args:
-        teammates: policies that share their functions.
-        chances: float32 (len(teammates), 4), chances of `BEHAVIOURS`.
+        teammates: scripted policies of one family, which share their functions.
+        chances: float32 (len(teammates), 4), probabilities of `BEHAVIOURS`.
     """
-    init, act = _functions(teammates[0].init, teammates[0].act)
+    init, act = _behaviour_functions(teammates[0].init, teammates[0].act)
     return [
         Policy(
             params={"script": mate.params, "chances": jnp.asarray(of_mate)},
@@ -77,9 +77,9 @@ def with_behaviours(teammates: Sequence[Policy], chances: np.ndarray) -> list[Po
 
 
 @lru_cache(maxsize=64)
-def _functions(script_init: Callable[..., Any], script_act: Callable[..., Any]) -> tuple[Any, Any]:
-    """Return `init` and `act` of teammates whose scripts have these functions."""
-    noise = jnp.array([0.0, 0.0, 1.0, NOISY_SHARE])  # share of random actions in each behaviour
+def _behaviour_functions(script_init: Callable[..., Any], script_act: Callable[..., Any]) -> tuple[Any, Any]:
+    """Return the functions `init` and `act` of teammates with behaviours, for given functions of the script."""
+    noise = jnp.array([0.0, 0.0, 1.0, NOISY_SHARE])  # probability of a random action in each behaviour
 
     def init(params: Any, key: jax.Array) -> tuple[jax.Array, Any]:
         behaviour = jax.random.categorical(jax.random.fold_in(key, 1), jnp.log(params["chances"]))

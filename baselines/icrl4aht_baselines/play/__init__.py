@@ -1,1 +1,1 @@
-"""A page on which one or two people play, `icrl4aht-data play`, and the recording of what they play."""
+"""Web page of `icrl4aht-data play`, on which one or two people play, and the recording of their games."""

@@ -1,6 +1,6 @@
-"""Episodes that people and policies play step by step, under the NumPy rules.
+"""Episodes that people and policies play step by step, with the NumPy implementation of the rules.
 
-Starts, recipes and the randomness of policies are those of an evaluation of the same task with seed 0, see
+Initial states, recipes and the random keys of policies are those of an evaluation of the same task with seed 0, see
 `icrl4aht_baselines.evaluate.rollout`.
 """
 
@@ -35,13 +35,13 @@ from icrl4aht_data.overcooked.observe import observe
 from icrl4aht_data.overcooked.state import swapped
 
 HUMAN = "human"
-"""Name of a second person as the partner."""
+"""Name of the partner if it is a second person."""
 
 _STREAMS = (EGO_STEPS, TEAMMATE_STEPS)
 
 
-class _ExchangedLayout(Layout):
-    """A layout in which the two agents have exchanged their rooms."""
+class _SwappedLayout(Layout):
+    """Layout with the start cells of its two agents exchanged, for an ego that plays agent 1."""
 
     @cached_property
     def agent_cells(self) -> tuple[int, ...]:
@@ -49,36 +49,36 @@ class _ExchangedLayout(Layout):
 
 
 class PolicyPlayer:
-    """A policy that plays one agent of a game.
+    """Policy that plays one agent of a game.
 
     Args:
         policy: the policy.
-        layout: the layout, as the policy knows it.
-        slot: 0 or 1, the agent that it plays.
-        is_ego: whether it is an ego: it always sees itself as agent 0, and remembers earlier episodes. A test teammate
-            sees the state as it is, and forgets them.
+        layout: layout of the game; for an ego that plays agent 1, with its agents exchanged.
+        slot: 0 or 1, number of the agent that the policy plays.
+        is_ego: whether the policy is an ego, which always sees itself as agent 0 and keeps its memory between episodes.
+            A test teammate sees the unchanged state, and starts each episode with a new memory.
     """
 
     def __init__(self, policy: Policy, layout: Layout, slot: int, *, is_ego: bool) -> None:
         policy = on_layout(policy, layout) if policy.sees == "situation" else policy
-        self.policy = policy._replace(params=jax.device_put(policy.params))  # once, not in every step
+        self.policy = policy._replace(params=jax.device_put(policy.params))  # one transfer for all steps
         self.layout, self.slot, self.is_ego, self._memory = layout, slot, is_ego, None
         act = self.policy.act
         self._act = jax.jit(lambda params, memory, view, key, t: act(params, memory, view, jax.random.fold_in(key, t)))
 
     def begin(self, task_key: jax.Array, episode_key: jax.Array, episode: int) -> None:
-        """Prepare for an episode: egos keep their memory, except before the first one."""
+        """Prepare for an episode. The memory is reset, except that an ego keeps it from one episode to the next."""
         self._key = jax.random.fold_in(episode_key, _STREAMS[self.slot])
         if episode == 0 or not self.is_ego:
             key = jax.random.fold_in(task_key if self.is_ego else episode_key, self.slot)
             self._memory = self.policy.init(self.policy.params, key)
 
     def act(self, record: np.ndarray, before: EgoInput, t: int) -> int:
-        """Return the action in step `t`, 0..5.
+        """Return the action in step `t` of the episode, 0..5.
 
         Args:
-            record: uint8 (S,), the state record.
-            before: outcome of the previous step, of this agent; its `obs` is not used.
+            record: uint8 (S,), state record before the step.
+            before: outcome of the previous step for this agent; the field `obs` is not used.
             t: number of the step in the episode, from 0.
         """
         view: Any = swapped(record) if self.is_ego and self.slot != EGO else record
@@ -90,12 +90,12 @@ class PolicyPlayer:
 
 
 class Partner(NamedTuple):
-    """What plays with a person.
+    """Partner of a person: a policy or a second person.
 
     Attributes:
-        name: its name on the command line.
-        player: the policy; None for a second person.
-        task: the published task of a test teammate; None for others.
+        name: name of the partner on the command line.
+        player: policy of the partner; None for a second person.
+        task: published test task of the partner, if it is a test teammate; otherwise None.
     """
 
     name: str
@@ -107,13 +107,13 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
     """Return a partner by its name: an ego of `evaluate`, a test teammate such as "H1/t0", or "human".
 
     Args:
-        name: the name.
-        layout: the layout.
-        slot: 0 or 1, the agent that it plays.
+        name: name of the partner.
+        layout: layout of the game.
+        slot: 0 or 1, number of the agent that the partner plays.
 
     Raises:
-        UnknownNameError: if there is none of this name, or the layout belongs to no track.
-        OptionError: if it cannot play the layout.
+        UnknownNameError: if the name is unknown, or the layout belongs to no track.
+        OptionError: if the partner cannot play on the layout.
     """
     if name == HUMAN:
         return Partner(name, None)
@@ -125,25 +125,25 @@ def find_partner(name: str, layout: Layout, slot: int) -> Partner:
     if name not in agent_names() and not Path(name).is_dir():
         raise unknown("partner", name, (HUMAN, *agent_names(), *tests))
     if slot != EGO:
-        layout = _ExchangedLayout(**{one.name: getattr(layout, one.name) for one in fields(Layout)})
+        layout = _SwappedLayout(**{one.name: getattr(layout, one.name) for one in fields(Layout)})
     return Partner(name, PolicyPlayer(find_agent(name).make(layout), layout, slot, is_ego=True))
 
 
 class Game:
-    """Some episodes of two agents on one layout.
+    """Game of several episodes that two agents play on one layout.
 
     Args:
-        layout: the layout.
-        players: the policies of agents 0 and 1, None for people.
-        key: key of the task, see `icrl4aht_baselines.evaluate.rollout.task_key`.
+        layout: layout of the game.
+        players: policies of agents 0 and 1; None for people.
+        key: random key of the task, see `icrl4aht_baselines.evaluate.rollout.task_key`.
         episodes: number of episodes.
         steps: steps of an episode.
 
     Attributes:
-        record: uint8 (S,), the present state record.
+        record: uint8 (S,), state record of the current state.
         returns: returns of the finished episodes.
-        clock: steps taken in the running episode.
-        earned: its return so far.
+        clock: number of steps taken in the running episode.
+        earned: return of the running episode so far.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class Game:
         self._restart(players)
 
     def with_players(self, players: Sequence[PolicyPlayer | None]) -> Game:
-        """Return the same episodes before the first step, for other players."""
+        """Return a copy of this game before its first step, for other players."""
         other = copy(self)
         other._restart([copy(player) for player in players])
         return other
@@ -184,7 +184,7 @@ class Game:
 
     @property
     def people(self) -> list[int]:
-        """Agents that people play."""
+        """Numbers of the agents that people play."""
         return [slot for slot, player in enumerate(self.players) if player is None]
 
     @property
@@ -193,10 +193,10 @@ class Game:
         return len(self.returns) == self.episodes
 
     def step(self, chosen: Mapping[int, int]) -> int:
-        """Take one step and return its reward; after the last step of an episode the next one begins.
+        """Take one step, and return its reward. After the last step of an episode, the next episode begins.
 
         Args:
-            chosen: agent -> action, 0..5, of people; those who are missing stay.
+            chosen: number of an agent that a person plays -> action, 0..5; agents without an action stay.
         """
         *last, reward, done = self._before
         actions = [
@@ -220,13 +220,13 @@ class Game:
         return earned
 
     def play(self) -> list[float]:
-        """Return the returns of all episodes that policies play without people."""
+        """Play all remaining episodes without people. Return the returns of all episodes."""
         while not self.is_over:
             self.step({})
         return self.returns
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the finished episodes as arrays of a history, see `icrl4aht_data.format.schema.FIELDS`."""
+        """Return the finished episodes as the arrays of a history, see `icrl4aht_data.format.schema.FIELDS`."""
         rows = self._rows[: len(self.returns) * self.steps]
         state, actions, rewards = (np.array(part) for part in zip(*rows, strict=True))
         return {

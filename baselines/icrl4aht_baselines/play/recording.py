@@ -1,4 +1,4 @@
-"""Writes what a person plays as a release of source `human`, with the person's consent."""
+"""Recording of games that people play, with their consent, as a release of source `human`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from icrl4aht_data.writing.release import NewHistory, NewTask, write_release
 from icrl4aht_data.writing.release_folder import check_target
 
 FIRST_HUMAN_SEED = 5_000_000
-"""Seed of the first human task; those of other sources are below."""
+"""Seed of the first task of source `human`; tasks of other sources have smaller seeds."""
 
 HUMAN_SEEDS = 1_000_000
-"""Human tasks have seeds from a range of this size."""
+"""Size of the range of seeds for tasks of source `human`."""
 
 CONSENT = """\
 This game is recorded: the states of the game, your actions and your partner's, the rewards, whether you saw the \
@@ -28,21 +28,21 @@ whole map, the number of steps a second, and the pseudonym that you choose below
 address, no time. The record is a folder on the computer that serves this page. Its owner may publish it as data for \
 research, under the MIT licence. Finished episodes are written at once. You may stop at any time by closing the page, \
 and ask the owner to delete the folder. Take part only if you agree and are of age."""
-"""Text that a person accepts before a recorded game."""
+"""Text that a person has to accept before a recorded game."""
 
 VIEWS = ("ego", "whole")
-"""What a person sees of the map: the window of an ego, or all of it."""
+"""Part of the map that a person sees: "ego" is the window of an ego, "whole" is the complete map."""
 
 
 def human_task(partner: Partner, seed: int) -> Task:
     """Return the task of a recorded game.
 
     Args:
-        partner: a test teammate.
-        seed: 0 to `HUMAN_SEEDS` - 1, for the starts of the episodes.
+        partner: partner of the person; it must be a test teammate.
+        seed: number of the game, 0 to `HUMAN_SEEDS` - 1, which determines the initial states of the episodes.
 
     Raises:
-        OptionError: if a release cannot describe the partner.
+        OptionError: if the partner is not a test teammate, which a release could not describe.
     """
     if partner.task is None:
         raise OptionError(
@@ -54,10 +54,11 @@ def human_task(partner: Partner, seed: int) -> Task:
 
 
 def check_pseudonym(pseudonym: object) -> str:
-    """Return a valid pseudonym.
+    """Return the pseudonym, after a check that it is valid.
 
     Raises:
-        OptionError: if it is not 2 to 30 letters, digits, hyphens and underscores, which an address is not.
+        OptionError: if it does not consist of 2 to 30 letters, digits, hyphens and underscores. An e-mail address is
+            refused by this rule.
     """
     if not isinstance(pseudonym, str) or not re.fullmatch(r"[\w-]{2,30}", pseudonym):
         raise OptionError(f"pseudonym {pseudonym!r:.60}: expected 2 to 30 letters, digits, hyphens and underscores")
@@ -65,17 +66,17 @@ def check_pseudonym(pseudonym: object) -> str:
 
 
 class GameRecorder:
-    """Recorder of a game, which writes a release of all finished episodes again after each one.
+    """Recorder of a game, which writes a release of all finished episodes whenever an episode ends.
 
     Args:
         folder: folder of the release.
-        task: the game's task.
-        ticks: steps a second, for the provenance.
+        task: task of the game.
+        ticks: steps per second, which the provenance states.
 
     Attributes:
-        pseudonym: the person's, once they agreed.
-        written: number of episodes in the folder.
-        views: for each finished episode, what the person saw: those of `VIEWS` that were shown in it.
+        pseudonym: pseudonym of the person; None until the person has agreed to the recording.
+        written: number of episodes that the folder holds.
+        views: for each finished episode, the members of `VIEWS` that the person saw in it.
 
     Raises:
         OptionError: if the folder exists and is not empty.
@@ -88,10 +89,10 @@ class GameRecorder:
         self.views: list[list[str]] = []
 
     def write(self, game: Game) -> None:
-        """Write the finished episodes of a game.
+        """Write the finished episodes of a game into the folder.
 
         Raises:
-            OptionError: if another program wrote the folder meanwhile.
+            OptionError: if another program has written into the folder.
             DiskFullError: if the disk is full.
         """
         person = {"pseudonym": self.pseudonym, "views": self.views, "steps_per_second": self.ticks}

@@ -1,4 +1,4 @@
-"""The web server of `icrl4aht-data play`: one page and one websocket, on loopback only."""
+"""Web server of `icrl4aht-data play`: a page and a websocket, on loopback only."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ from icrl4aht_data.overcooked.state import POT_STEPS, swapped
 HOST = "127.0.0.1"
 
 SHOWN_EGOS = ("stay", "rl2-reference", "oracle")
-"""Egos that the page compares a person with."""
+"""Names of the egos that the page compares a person with."""
 
-_ALL_CONNECTED = 4000  # code of a closed websocket: all people of the game are connected
+_ALL_CONNECTED = 4000  # code that closes a websocket if all people of the game are already connected
 
 
 def how_to_play(layout: Layout) -> str:
-    """Return the line from which a person who never played learns it."""
+    """Return text that explains the game to a person who has never played it."""
     button = f" Pressing ? shows the recipe and costs {-PRESS_REWARD:g}." if BUTTON in layout.kinds else ""
     return (
         f"You are the blue chef: move with the arrow keys; space takes, puts down, cooks and serves what is in front "
@@ -53,15 +53,15 @@ def how_to_play(layout: Layout) -> str:
 
 
 class PlaySession:
-    """A game, the people who are connected to it, and its recorder.
+    """Session of a game: the people who are connected to the game, and its recorder.
 
     The game waits before each episode, and after a lost connection, until everyone who plays presses a key.
 
     Args:
-        game: the game.
-        partner: name of the partner.
-        ticks: steps a second; with 0 a step is taken as soon as everyone has acted.
-        recorder: recorder of the game; None if it is not recorded.
+        game: game to play.
+        partner: name of the partner, which the page shows.
+        ticks: steps per second; with 0, a step is taken as soon as everyone has acted.
+        recorder: recorder of the game; None for a game that is not recorded.
         compared: names of egos to compare the person with.
     """
 
@@ -79,15 +79,15 @@ class PlaySession:
         self._sockets: dict[int, WebSocket] = {}
         self._chosen: dict[int, int] = {}
         self._ready: set[int] = set()
-        self._views = {VIEWS[0] if recorder else VIEWS[1]}  # shown in this episode; the last one is `_view`
+        self._views = {VIEWS[0] if recorder else VIEWS[1]}  # views shown in this episode; `_view` is the current one
         self._view = next(iter(self._views))
         self._reward, self._problem, self._moving = 0, "", asyncio.Event()
         start = [game.record, swapped(game.record)]
         self._layout = [layout_drawings(game.layout, record[None]) for record in start]
 
-    # ---- messages to the browser
+    # ---- messages to browsers
 
-    def _setup(self, slot: int) -> dict[str, Any]:
+    def _setup_message(self, slot: int) -> dict[str, Any]:
         game, recorder = self.game, self.recorder
         return {
             "kind": "setup",
@@ -104,9 +104,9 @@ class PlaySession:
             "compared": self.compared,
         }
 
-    def _frame(self, slot: int) -> dict[str, Any]:
+    def _frame_message(self, slot: int) -> dict[str, Any]:
         game, layout = self.game, self._layout[slot]
-        record = game.record if slot == EGO else swapped(game.record)  # so that everyone is the blue chef
+        record = game.record if slot == EGO else swapped(game.record)  # each person is shown as agent 0, the blue chef
         return {
             "kind": "frame",
             "record": record.tolist(),
@@ -125,25 +125,25 @@ class PlaySession:
         }
 
     async def show(self) -> None:
-        """Send the present state to all connected browsers."""
+        """Send the current state to all connected browsers."""
         for slot, connection in list(self._sockets.items()):
-            with suppress(RuntimeError, WebSocketDisconnect):  # closed meanwhile, which `connect` notices
-                await connection.send_json(self._frame(slot))
+            with suppress(RuntimeError, WebSocketDisconnect):  # a closed connection, which `connect` handles
+                await connection.send_json(self._frame_message(slot))
 
-    # ---- the game
+    # ---- steps of the game
 
     async def run(self) -> None:
-        """Take steps by the clock until the game is over."""
+        """Take steps at the session's rate until the game is over."""
         loop, due = asyncio.get_running_loop(), 0.0
         while not self.game.is_over:
             await self._moving.wait()
-            due = max(due + 1 / self.ticks, loop.time())  # a late step does not hurry the next ones
+            due = max(due + 1 / self.ticks, loop.time())  # after a late step, the next ones keep their distance
             await asyncio.sleep(due - loop.time())
             if self._moving.is_set():
                 await self.advance()
 
     async def advance(self) -> None:
-        """Take a step with the actions that people chose since the last one, and show it."""
+        """Take a step with the actions that people chose since the last step, and show the new state."""
         finished = len(self.game.returns)
         self._reward = self.game.step(self._chosen)
         self._chosen = {}
@@ -159,7 +159,7 @@ class PlaySession:
         self._chosen = {}
 
     async def save(self) -> None:
-        """Write the finished episodes; a failure is shown, and the next call writes them."""
+        """Write the finished episodes. A failure is shown on the page, and the next call tries again."""
         if self.recorder is None:
             return
         self.recorder.views.append(sorted(self._views))
@@ -168,14 +168,14 @@ class PlaySession:
             await asyncio.to_thread(self.recorder.write, self.game)
         except (Icrl4ahtError, OSError) as error:
             self._problem = (
-                f"The record was not written: {error}. Nothing is lost: it is tried again after each episode."
+                f"The record was not written: {error}. Nothing is lost: writing is tried again after each episode."
             )
 
     def compare(self, changed: Callable[[], Any]) -> None:
-        """Play the same episodes with egos in the person's place; takes seconds for each.
+        """Play the same episodes with egos instead of the person, which takes seconds for each ego.
 
         Args:
-            changed: called after each ego.
+            changed: function that is called after each ego.
         """
         slot = self.game.people[0]
         for name in self.compared:
@@ -187,13 +187,13 @@ class PlaySession:
             self.references = self.references | {name: returns}
             changed()
 
-    # ---- what a browser sends
+    # ---- messages from browsers
 
     async def connect(self, connection: WebSocket) -> None:
         """Serve a browser until its connection ends."""
         origin = connection.headers.get("origin")
         if origin and urlsplit(origin).netloc != connection.headers.get("host"):
-            await connection.close(1008)  # a page of another site
+            await connection.close(1008)  # the request comes from a page of another site
             return
         await connection.accept()
         wanted, free = connection.query_params.get("slot"), [x for x in self.game.people if x not in self._sockets]
@@ -203,12 +203,12 @@ class PlaySession:
         slot = next((x for x in free if str(x) == wanted), free[0])
         self._sockets[slot] = connection
         try:
-            await connection.send_json(self._setup(slot))
+            await connection.send_json(self._setup_message(slot))
             await self.show()
             while True:
                 await self._receive(slot, connection, await connection.receive_text())
         except (KeyError, RuntimeError, WebSocketDisconnect):
-            pass  # closed, or sent bytes
+            pass  # the browser closed the connection, or sent bytes instead of text
         finally:
             del self._sockets[slot]
             self._pause()
@@ -224,7 +224,7 @@ class PlaySession:
                 self._views.add(view)
             elif "pseudonym" in message and message.get("agrees") is True and self.recorder:
                 self.recorder.pseudonym = self.recorder.pseudonym or check_pseudonym(message["pseudonym"])
-                await connection.send_json(self._setup(slot))
+                await connection.send_json(self._setup_message(slot))
                 await self.show()
             else:
                 raise OptionError(f"{text[:80]}: expected an action, a view, or a pseudonym with consent")
@@ -232,7 +232,7 @@ class PlaySession:
             await connection.send_json({"kind": "problem", "text": str(error)})
 
     async def _act(self, slot: int, action: int) -> None:
-        """Take the action in the next step; while the game waits it only says that someone is ready."""
+        """Store a person's action for the next step. While the game waits, any action marks the person as ready."""
         if self.game.is_over or (self.recorder and self.recorder.pseudonym is None):
             return
         if not self._moving.is_set():
@@ -247,7 +247,7 @@ class PlaySession:
 
 
 def play_page(layout: Layout) -> str:
-    """Return the HTML page."""
+    """Return the HTML page of the game."""
     own = Path(__file__).parent
     text = {name: (own / f"page.{name}").read_text(encoding="utf-8") for name in ("html", "css", "js")}
     script = "\n".join([page_source("state.js"), page_source("curve.js"), text["js"]])
@@ -256,7 +256,7 @@ def play_page(layout: Layout) -> str:
 
 
 def make_app(session: PlaySession) -> Starlette:
-    """Return the application, which plays the session's game while it runs."""
+    """Return the web application, which also runs the session's game."""
 
     async def page(request: Request) -> HTMLResponse:
         return HTMLResponse(play_page(session.game.layout), headers={"Cache-Control": "no-store"})
@@ -266,7 +266,7 @@ def make_app(session: PlaySession) -> Starlette:
         loop = asyncio.get_running_loop()
 
         def changed() -> None:
-            with suppress(RuntimeError):  # the server has stopped
+            with suppress(RuntimeError):  # raised if the server has stopped
                 asyncio.run_coroutine_threadsafe(session.show(), loop)
 
         Thread(target=session.compare, args=[changed], daemon=True).start()
@@ -281,7 +281,7 @@ def make_app(session: PlaySession) -> Starlette:
 
 
 def open_port(port: int) -> socket.socket:
-    """Return a listening socket on loopback; port 0 is any free one.
+    """Return a listening socket on loopback; port 0 chooses any free port.
 
     Raises:
         OptionError: if the port is in use or not allowed.
@@ -294,7 +294,7 @@ def open_port(port: int) -> socket.socket:
     except OSError as error:
         found.close()
         raise OptionError(
-            f"port {port} of {HOST}: {error.strerror}; give another one by --port, or 0 for any free one"
+            f"port {port} of {HOST}: {error.strerror}; give another --port, or --port 0 for any free port"
         ) from error
     return found
 

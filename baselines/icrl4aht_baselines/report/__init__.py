@@ -1,4 +1,4 @@
-"""Reports of evaluation results: Markdown, CSV, a page."""
+"""Reports of evaluation results, as Markdown, CSV and a web page."""
 
 import sys
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ __all__ = ["as_run", "markdown", "merge", "read_run", "report", "write_report"]
 
 
 def report(*results: Sequence[Result]) -> str:
-    """Return a Markdown report of results that `evaluate` returned, each argument those of one agent."""
+    """Return a Markdown report; each argument is the list of results that `evaluate` returned for one agent."""
     return markdown(merge([as_run(of_agent) for of_agent in results]))
 
 

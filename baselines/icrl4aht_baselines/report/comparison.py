@@ -1,4 +1,4 @@
-"""Stored results of agents, `cards/results.csv.gz`, and docs/results.md, which compares them."""
+"""Results of agents that are stored in cards/results.csv.gz, and the page docs/results.md that compares them."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ _SIGNIFICANT = 0.05
 
 @dataclass(frozen=True)
 class StoredResults:
-    """Results of several agents: `cards/results.csv.gz`, `cards/results_curves.csv.gz` and `cards/results.json`.
+    """Stored results of several agents: the content of the files results*.csv.gz and results.json in cards/.
 
     Attributes:
-        table: the results, see `results`.
-        curves: return in each episode with test tasks, mean over the tasks of a layout, seeds and trainings, with the
+        table: table of results, see `results`.
+        curves: mean return in each episode of the test tasks on a layout, over tasks, seeds and trainings, with the
             columns `CURVE_COLUMNS`.
-        agents: agent -> what tables say about it; agents are shown in this order.
+        agents: name of an agent -> facts that tables state; agents are shown in this order.
     """
 
     table: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=TABLE_COLUMNS))
@@ -70,14 +70,14 @@ class StoredResults:
     agents: dict[str, AgentFacts] = field(default_factory=dict)
 
     def returns(self, control: str = "") -> dict[str, AgentReturns]:
-        """Return the results of the page's protocol by agent, those with test tasks, in the order of `agents`."""
+        """Return agent -> results on test tasks under the page's protocol and a control, in the order of `agents`."""
         table = self.table
         chosen = (table["protocol"] == SUBMITTED_PROTOCOL) & (table["control"] == control) & (table["kind"] == "test")
         found = dict(iter(table[chosen].groupby("agent", sort=False)))
         return {agent: returns_by_cell(found[agent]) for agent in [*self.agents] if agent in found}
 
-    def with_other_ways(self, results: Mapping[str, AgentReturns]) -> dict[str, AgentReturns]:
-        """Return results with those of the agents' other ways of playing, such as "rl2 (greedy)", after their own."""
+    def with_other_play_modes(self, results: Mapping[str, AgentReturns]) -> dict[str, AgentReturns]:
+        """Return results of agents, each followed by those of its other play mode, such as "rl2 (greedy)"."""
         others, found = {way: self.returns(way) for way in OTHER_WAYS}, {}
         for agent, own in results.items():
             found[agent] = own
@@ -86,7 +86,7 @@ class StoredResults:
 
 
 def results_file() -> Path:
-    """Return the path of the stored results' texts; the tables are next to it."""
+    """Return the path of results.json among the package's cards; the tables are stored next to this file."""
     return card_file("best_responses.json").with_name("results.json")
 
 
@@ -95,7 +95,7 @@ def _table_paths(path: Path) -> tuple[Path, Path]:
 
 
 def read_stored(path: Path) -> StoredResults:
-    """Return stored results, texts in a JSON file and tables next to it; none if there is no such file.
+    """Return the results that are stored in a JSON file and in tables next to it; empty ones if the file is missing.
 
     Raises:
         OptionError: if a file is damaged.
@@ -115,20 +115,20 @@ def read_stored(path: Path) -> StoredResults:
 
 
 def write_stored(path: Path, stored: StoredResults) -> None:
-    """Write stored results, rounded to three digits, curves to two."""
+    """Write results to a JSON file and to tables next to it, rounded to three digits, and curves to two."""
     for file, frame, digits in zip(_table_paths(path), (stored.table, stored.curves), (3, 2), strict=True):
         with atomic_write(file) as partial:
             text = frame.round(digits).to_csv(index=False, lineterminator="\n")
-            partial.write_bytes(gzip.compress(text.encode(), mtime=0))  # equal results are equal bytes
+            partial.write_bytes(gzip.compress(text.encode(), mtime=0))  # no time: equal results give equal bytes
     with atomic_write(path) as partial:
         write_json(partial, msgspec.to_builtins(stored.agents))
 
 
 def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
-    """Check that results of a file are of an agent without stored results, or update those of one with some.
+    """Check that submitted results are of an agent without stored results, or update those of a stored agent.
 
     Raises:
-        OptionError: if not; names the agent.
+        OptionError: if they are neither; the message names the agent.
     """
     known = {agent.casefold(): agent for agent in stored.agents}.get(found.agent.casefold())
     if known and not found.update:
@@ -141,7 +141,7 @@ def check_agent(stored: StoredResults, found: Submission, where: str) -> None:
 
 
 def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
-    """Return stored results with those of a file, see `Submission.update`."""
+    """Return stored results with submitted results added, or replaced if `Submission.update` is set."""
     controls = {one.control for one in found.evaluations}
     tables, curves = [], defaultdict(list)
     for one, run in submitted_runs(found):
@@ -167,7 +167,7 @@ def add_submission(stored: StoredResults, found: Submission) -> StoredResults:
 
 
 def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
-    """Write docs/results.md, its figure, and the table of results as CSV and Parquet. Return their paths.
+    """Write the page of results, its figure, and the table of results as CSV and Parquet. Return the paths.
 
     Raises:
         OptionError: if there are no results, or pyarrow or matplotlib is not installed.
@@ -190,12 +190,12 @@ def write_comparison(stored: StoredResults, folder: Path) -> list[Path]:
 
 
 def render_comparison(stored: StoredResults) -> str:
-    """Return docs/results.md. Tables leave out agents that the present code does not make."""
+    """Return the text of docs/results.md. Tables leave out agents that the current code cannot make."""
     scales, every = cell_scales(SUBMITTED_PROTOCOL), stored.returns()
     results = {agent: cells for agent, cells in every.items() if not stored.agents[agent].commit}
     overlaps = {name for cells in results.values() for returns in cells.values() for name in returns.overlaps}
     measured, scored = read_best_responses(), open_cells(scales)
-    shown = stored.with_other_ways(results)
+    shown = stored.with_other_play_modes(results)
     one_way = [f"`{agent}`" for agent in results if not any(f"{agent} ({way})" in shown for way in OTHER_WAYS)]
     return fill_template(
         "results.md",
@@ -222,15 +222,15 @@ def _describe_agent(agent: str, facts: AgentFacts) -> str:
     return f"* {name}: {facts.about.rstrip('.')}."
 
 
-def _shown(value: MeanInterval | None, digits: int = 2, sign: str = "") -> str:
+def _format_interval(value: MeanInterval | None, digits: int = 2, sign: str = "") -> str:
     return value.text(digits, sign) if value else "–"
 
 
 def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
-    """Return table 1: a row for each agent, what it was made of, and its scores on each track.
+    """Return table 1, with a row for each agent: training data, labels, budget, and scores on each track.
 
-    A track has no score unless the agent played all of its cells with headroom. Rows of another way of playing have
-    the scores alone.
+    An agent has a score on a track only if it played all layouts and families of the track that have headroom. A row
+    for an agent's other play mode has only scores.
     """
     body = []
     for agent, cells in results.items():
@@ -242,14 +242,14 @@ def agents_table(stored: StoredResults, results: Mapping[str, AgentReturns], sca
         row = [f"`{agent}`{overlap_marks(marks)}", *texts]
         for track in TRACKS:
             score = find_score(cells, open_cells(scales, track), scales)
-            row += [_shown(score and score.total), _shown(score and score.middle)]
+            row += [_format_interval(score and score.total), _format_interval(score and score.middle)]
         body.append(row)
     scored = [f"{name}, {track}" for track in TRACKS for name in ("N", "IQM")]
     return markdown_table(["model", "data", "labels", "budget", *scored], body)
 
 
 def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
-    """Return a sentence on the difference between the two agents with the highest primary endpoint; or why none."""
+    """Return a sentence on the difference between the two agents with the highest score N on the track teammate."""
     cells = open_cells(scales, "teammate")
     scores = {agent: found.total.mean for agent, of in results.items() if (found := find_score(of, cells, scales))}
     if len(scores) < 2:
@@ -263,10 +263,11 @@ def describe_lead(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 
 
 def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], scales: CellScales) -> str:
-    """Return table 2: M, P and the mean return in blocks of episodes, of each row of table 1.
+    """Return table 2: M, P and the mean return in blocks of episodes, with the rows of table 1.
 
-    The means are over the cells with headroom, or over all cells that the agent played if best responses were not
-    measured. M and P are bold if they are above 0 with a p-value below 0.05, corrected for all M and P of the table.
+    Means are over the combinations of layout and family that have headroom, or over all that the agent played if none
+    is known to have headroom. M and P are bold if they are above 0 with a p-value below 0.05, corrected for all tests
+    in the table.
     """
     chosen = {agent: _controlled_cells(cells, scales) for agent, cells in results.items()}
     found = {
@@ -280,7 +281,7 @@ def controls_table(stored: StoredResults, results: Mapping[str, AgentReturns], s
     for agent, cells in results.items():
         row = [f"`{agent}`"]
         for control in ("cleared", "swapped"):
-            difference, text = found[agent, control], _shown(found[agent, control], 1, "+")
+            difference, text = found[agent, control], _format_interval(found[agent, control], 1, "+")
             is_clear = difference and difference.mean > 0 and corrected[agent, control] < _SIGNIFICANT
             row.append(f"**{text}**" if is_clear else text)
         for block in EPISODE_BLOCKS:
@@ -295,25 +296,25 @@ def _controlled_cells(cells: AgentReturns, scales: CellScales) -> list[ResultCel
 
 
 def describe_scores(stored: StoredResults, agents: Iterable[str]) -> dict[str, str]:
-    """Return agent -> its N on each track, and M, in words; a dash for what is not stored. See tables 1 and 2."""
+    """Return agent -> text with its score N on each track and its memory control M; a dash for missing values."""
     scales, results, controls = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), stored.returns("cleared")
     found = {}
     for agent in agents:
         cells, cleared, texts = results.get(agent, {}), controls.get(agent, {}), []
         for track in TRACKS:
             score = find_score(cells, open_cells(scales, track), scales)
-            texts.append(f"N {_shown(score and score.total)} on track {track}")
+            texts.append(f"N {_format_interval(score and score.total)} on track {track}")
         memory = block_difference(cells, cleared, _controlled_cells(cells, scales), "all")
-        texts.append(f"M {_shown(memory, 1, '+')}")
+        texts.append(f"M {_format_interval(memory, 1, '+')}")
         found[agent] = ", ".join(texts)
     return found
 
 
 def mean_best(layout: str, scales: CellScales) -> float | None:
-    """Return the mean return of the best responses over the families of a layout; None if it has none.
+    """Return the mean return of the best responses to the families of a layout; None if no family has one.
 
-    A cell without a best response has the return of `stay`: there the oracle earns no more than `stay`, see
-    `scores.cell_scales`.
+    For a family without a best response, the return of `stay` is used, because the oracle earns no more with this
+    family, see `scores.cell_scales`.
     """
     cells = {ResultCell(*cell): egos for cell, egos in read_headroom(SUBMITTED_PROTOCOL).items() if cell[0] == layout}
     if not cells.keys() & scales.keys():
@@ -322,9 +323,9 @@ def mean_best(layout: str, scales: CellScales) -> float | None:
 
 
 def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> str:
-    """Return table 3: mean return on each layout, with N in parentheses, the worst teammate and the regret.
+    """Return table 3: mean return on each layout, with the score N in parentheses, worst teammate, and regret.
 
-    The first rows have the reference egos and the best responses.
+    The first rows are of the reference egos and the best responses.
     """
     scored, headroom = open_cells(scales), read_headroom(SUBMITTED_PROTOCOL)
     body = []
@@ -347,7 +348,7 @@ def layouts_table(results: Mapping[str, AgentReturns], scales: CellScales) -> st
 
 
 def describe_trainings() -> str:
-    """Return sentences on the trainings behind the best responses; empty if none was measured."""
+    """Return sentences on the trainings of the best responses; empty if there are no best responses."""
     behaviours = read_best_responses().behaviours
     trained = [training for one in behaviours for training in one.seeds]
     if not trained:
@@ -367,15 +368,15 @@ def _span(values: Sequence[int], form: str) -> str:
 
 
 def figure_layouts() -> list[str]:
-    """Return the layouts of the figure, the first with headroom."""
+    """Return the layouts that the figure shows: the first ones with headroom."""
     cells = in_order(cell for cell, has_any in known_headroom(SUBMITTED_PROTOCOL).items() if has_any)
     return list(dict.fromkeys(cell.layout for cell in cells))[:_PANELS]
 
 
 def plot_comparison(stored: StoredResults, path: Path) -> None:
-    """Plot the return in each episode of the agents with curves, dashed with their memory cleared, on a log axis.
+    """Plot the agents' return in each episode on a log axis, with dashed lines for cleared memory.
 
-    An agent without curves has a point at its first episode. Lines show `stay` and the best responses.
+    An agent without stored curves has a point at the first episode. Horizontal lines show `stay` and best responses.
     """
     scales, results, headroom = cell_scales(SUBMITTED_PROTOCOL), stored.returns(), read_headroom(SUBMITTED_PROTOCOL)
     layouts = figure_layouts()

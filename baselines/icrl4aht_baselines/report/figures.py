@@ -1,6 +1,6 @@
-"""Charts of the report's page as plain numbers, which the template draws: bars of cells, and panels of curves.
+"""Charts of the report's page as numbers, which the page's template draws: bar charts, and panels of curves.
 
-Positions are per cent of a chart's width and height, from its top left corner.
+Positions are in per cent of a chart's width and height, from its top left corner.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from icrl4aht_data.benchmark.reference_returns import REFERENCES
 from icrl4aht_data.plotting import return_limits, running_mean
 
 SMOOTHING = 10
-"""Most episodes in the running mean of a curve of returns; of few episodes a tenth."""
+"""Largest number of episodes in a curve's running mean; shorter curves use a tenth of their episodes."""
 
-_SCORE_LIMITS = (-0.5, 1.5)  # a cell with little headroom can have a score far outside, which is clipped
+_SCORE_LIMITS = (-0.5, 1.5)  # scores outside, which little headroom can cause, are clipped
 _TICKS = 5
 _DRAWING = 1000  # units of a panel's width and height
 
 NumberedRuns = Mapping[int, EvaluationRun]
-"""Number of a series, which has one colour on the whole page -> its run."""
+"""Number of a series, which determines its colour on the page -> run of the series."""
 
 _CellValues = Mapping[int, Mapping[ResultCell, MeanInterval]]
-"""Number of a series -> cell -> value."""
+"""Number of a series -> result cell -> value."""
 
 
 class Tick(NamedTuple):
-    """A labelled position on an axis."""
+    """Labelled position on an axis."""
 
     position: float
     label: str
 
 
 class Bar(NamedTuple):
-    """A bar of one run, from `start` to `start` + `width`; `interval` has the ends of the 95 % interval."""
+    """Bar of one run, from `start` to `start` + `width`; `interval` has the ends of the 95 % interval, if any."""
 
     series: int
     start: float
@@ -54,7 +54,7 @@ class Bar(NamedTuple):
 
 
 class BarRow(NamedTuple):
-    """The bars of all runs in one cell; `scale` has the returns at the ends of the scale, as text."""
+    """Bars of all runs for one layout and family; `scale` states the returns at the ends of the axis, as text."""
 
     label: str
     bars: list[Bar]
@@ -62,9 +62,10 @@ class BarRow(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A curve of one run, as path data of an SVG 1000 units wide and high: smoothed, as measured, and its range.
+    """Curve of one run, as path data of an SVG of 1000 x 1000 units.
 
-    `raw` and `band` are empty if there is nothing to draw.
+    `line` is the smoothed curve, `raw` the curve without smoothing, and `band` the range of the instances. `raw` and
+    `band` are empty if there is nothing to draw.
     """
 
     series: int
@@ -74,12 +75,14 @@ class Curve(NamedTuple):
 
 
 class Chart(NamedTuple):
-    """A figure of the page: bars of cells, or panels of curves, on shared axes.
+    """Figure of the page: bars for each layout and family, or panels of curves, on shared axes.
 
     Attributes:
-        title, caption: texts above and below the figure; the caption may be empty.
-        series: number and label of each run in it, with marks for overlap of its training data with these tasks.
-        x_ticks, y_ticks: labelled positions of the axes; bars have no vertical axis.
+        title: text above the figure.
+        caption: text below the figure; may be empty.
+        series: number and label of each run in the figure; labels mark overlap of training data with the tasks.
+        x_ticks: labelled positions on the horizontal axis.
+        y_ticks: labelled positions on the vertical axis; empty for bars.
         bars: layout -> rows of bars.
         panels: title of a panel -> curves.
     """
@@ -94,17 +97,17 @@ class Chart(NamedTuple):
 
 
 class _Scale(NamedTuple):
-    """Axis from `low` to `high`."""
+    """Scale of an axis from `low` to `high`."""
 
     low: float
     high: float
 
     def position(self, value: float) -> float:
-        """Return the position of a value, in per cent of the axis from its low end; ends for values beyond them."""
+        """Return the position of a value, in per cent of the axis from its low end; values outside are clipped."""
         return round(100 * (min(max(value, self.low), self.high) - self.low) / (self.high - self.low), 2)
 
     def ticks(self) -> list[Tick]:
-        """Return labelled positions at round numbers."""
+        """Return labelled positions at round values of the axis."""
         step = 10 ** math.floor(math.log10((self.high - self.low) / _TICKS))
         step = next(step * factor for factor in (1, 2, 5, 10) if (self.high - self.low) / (step * factor) <= _TICKS)
         numbers = range(math.ceil(self.low / step), math.floor(self.high / step) + 1)
@@ -112,9 +115,9 @@ class _Scale(NamedTuple):
 
 
 def bar_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
-    """Return bars of the scores, and of the returns with tasks that have none.
+    """Return bar charts of the scores, and of the returns in tasks without scores.
 
-    Reference egos have no bars with test tasks unless there are no other agents.
+    Charts of test tasks leave out reference egos, unless there are no other agents.
     """
     agents = {number: run for number, run in runs.items() if run.agent not in REFERENCES} or runs
     charts = _score_charts(agents, protocol)
@@ -131,7 +134,7 @@ def bar_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
 
 
 def _score_charts(runs: NumberedRuns, protocol: str) -> list[Chart]:
-    """Return a chart of bars from `stay` to the agents' scores; none if no cell was scored."""
+    """Return a list with the bar chart of the agents' scores; an empty list if there are no scores."""
     scales = cell_scales(protocol)
     values = {
         number: {cell: found for cell, found in cell_scores(run, scales).items() if cell.kind == "test"}
@@ -163,7 +166,7 @@ def _bar_chart(
     ranges: Mapping[ResultCell, str] = MappingProxyType({}),
     digits: int = 1,
 ) -> Chart:
-    """Return bars from 0 to the value in each cell; `ranges` has the returns at the ends of the scale as text."""
+    """Return a chart with bars from 0 to each value; `ranges` has the returns at the ends of each scale, as text."""
     shown = {number: run for number, run in runs.items() if values[number]}
     bars: dict[str, list[BarRow]] = defaultdict(list)
     cells = in_order(cell for of_run in values.values() for cell in of_run)
@@ -194,9 +197,9 @@ def _series(runs: NumberedRuns, cells: Sequence[ResultCell]) -> list[tuple[int, 
 
 
 def curve_charts(runs: NumberedRuns) -> list[Chart]:
-    """Return a chart for each kind of tasks and layout, with a panel per family and each run's return per episode.
+    """Return a chart of returns per episode for each kind of tasks and layout, with a panel for each family.
 
-    Lines are running means of the mean over a cell's instances; bands are the range of the instances' running means.
+    Lines are running means of the mean over all instances; bands are the range of the instances' running means.
     """
     charts = []
     cells = sorted({cell for run in runs.values() for cell in run.cells}, key=lambda cell: (cell.order[-1], cell.order))
@@ -231,7 +234,7 @@ def _curve_chart(title: str, runs: NumberedRuns, cells: Sequence[ResultCell]) ->
 
 
 def _curve(number: int, smooth: np.ndarray, raw: np.ndarray, x: _Scale, y: _Scale) -> Curve:
-    if len(raw) == 1:  # a point has no line
+    if len(raw) == 1:  # a line needs two points
         smooth, raw = smooth.repeat(2, axis=1), raw.repeat(2)
     episodes, mean = np.arange(1, len(raw) + 1), smooth.mean(axis=0)
     outline = np.concatenate([episodes, episodes[::-1]]), np.concatenate([smooth.min(axis=0), smooth.max(axis=0)[::-1]])
@@ -244,7 +247,7 @@ def _curve(number: int, smooth: np.ndarray, raw: np.ndarray, x: _Scale, y: _Scal
 
 
 def _path(xs: np.ndarray, ys: np.ndarray, x: _Scale, y: _Scale) -> str:
-    """Return the path data of a line through some points."""
+    """Return SVG path data for a line through points."""
     columns = np.rint((xs - x.low) / (x.high - x.low) * _DRAWING).astype(int)
     heights = np.rint((y.high - ys) / (y.high - y.low) * _DRAWING).astype(int)
     return "M" + "L".join(f"{column} {height}" for column, height in zip(columns, heights, strict=True))

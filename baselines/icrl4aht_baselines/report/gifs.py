@@ -1,4 +1,4 @@
-"""Episodes as GIFs: an agent with a teammate."""
+"""GIFs of episodes that an agent plays with a teammate."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _PROGRESS = "episodes of the report"
 
 
 class ShownEpisode(NamedTuple):
-    """A picture of an episode.
+    """Episode that is drawn as a GIF.
 
     Attributes:
         number: number of the episode in its task, from 1.
-        earned: return of the team.
-        path: the GIF.
+        earned: return of the team in the episode.
+        path: path of the GIF.
     """
 
     number: int
@@ -39,13 +39,13 @@ class ShownEpisode(NamedTuple):
 
 
 class EpisodePair(NamedTuple):
-    """The first and the last episode of a task that a reported agent played with a teammate of one family.
+    """First and last episode of a task that an agent played with a teammate of one family.
 
     Attributes:
-        cell: cell of the task.
-        title: agent, teammate and layout.
-        caption: the task and the training data; or why there is no picture.
-        episodes: the first and the last episode, one if the task has only one, none if the agent cannot be restored.
+        cell: layout, family and kind of the task.
+        title: text with agent, teammate and layout.
+        caption: text with the task and the overlap with training data, or the reason why there is no picture.
+        episodes: first and last episode; only one if the task has one episode, none if the agent cannot be restored.
     """
 
     cell: ResultCell
@@ -65,12 +65,12 @@ def save_episodes(
     suite: Path | None = None,
     forget: bool = False,
 ) -> tuple[ShownEpisode, ...]:
-    """Play a task, and write some of its episodes as GIFs. Return them; they earn what `evaluate` stores.
+    """Play a task, and write some of its episodes as GIFs. Their returns are those that `evaluate` stores.
 
     Args:
-        paths: number of an episode, from 1 -> path of its GIF. Later episodes than these are not played.
+        paths: number of an episode, from 1 -> path of its GIF. Episodes after the last of these are not played.
         task, make_ego, protocol, seed, suite, forget: see `evaluator.play_tasks`.
-        cell: pixels per map cell.
+        cell: width and height of a map cell in pixels.
     """
     shown = []
     shortened = dataclasses.replace(protocol, episodes=max(paths))
@@ -89,19 +89,19 @@ def family_gifs(
     suite: Path | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> list[EpisodePair]:
-    """Write the first and the last episode of an evaluated task for each agent and family of teammates.
+    """Write GIFs of the first and last episode of a task, for each agent and family of teammates.
 
-    The task is on a layout where that family leaves headroom, if there is one among the results.
+    The task is on a layout on which the family has headroom, if the results have such a layout.
 
     Args:
-        runs: the results.
-        folder: for the GIFs.
+        runs: results of the agents.
+        folder: folder for the GIFs.
         suite: folder of learned teammates' checkpoints.
-        progress: called with (description, tasks drawn, tasks), from the calling thread.
+        progress: function for progress, called with (description, tasks drawn, number of tasks).
 
     Returns:
-        The episodes of each run in turn, families in the paper's order. If an agent cannot be restored, the caption
-        says why.
+        The episodes of each run in turn, with families in the paper's order. If an agent cannot be restored, the
+        caption says why.
     """
     chosen: list[tuple[EvaluationRun, ResultCell]] = []
     for run in runs:
@@ -110,7 +110,7 @@ def family_gifs(
             first.setdefault(cell[1:], cell)
         chosen += [(run, cell) for cell in first.values()]
     progress(_PROGRESS, 0, len(chosen))
-    with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes longer than playing
+    with ThreadPoolExecutor(min(4, usable_cores())) as pool:  # compiling takes most of the time
         drawn = [pool.submit(_draw_result, *each, folder / str(number), suite) for number, each in enumerate(chosen)]
         for done, future in enumerate(as_completed(drawn), start=1):
             future.result()
@@ -121,7 +121,7 @@ def family_gifs(
 def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path | None) -> EpisodePair:
     source, task = run.source(cell), run.tasks(cell)[0]
     protocol, seed = Protocol(**source.settings["protocol"]), source.settings["seeds"][0]
-    # A number without a kind of tasks names a published teammate.
+    # Without a kind of tasks, "H1/t0" would mean a published test teammate.
     kind = "" if cell.kind == "test" else f" ({cell.kind})"
     title = f"{run.label} with {cell.family}/t{task.teammate['theta_id']}{kind} on {cell.layout}"
     origin = f"Task {task.task_id}, protocol {protocol.name}, seed {seed}. {describe_overlap(run.overlaps([cell]))}"
@@ -137,10 +137,11 @@ def _draw_result(run: EvaluationRun, cell: ResultCell, prefix: Path, suite: Path
 
 
 def restore_ego(source: ResultSource) -> MakeEgo:
-    """Return the function that makes the ego of some results, layout -> policy.
+    """Return the function from a layout to the policy that made some results.
 
     Raises:
-        OptionError: if the ego is neither a reference ego nor trained, or its run folder is missing or has changed.
+        OptionError: if the results are of no reference ego and no trained model, or the model is missing or has
+            changed.
     """
     name, details = source.settings["agent"], dict(source.settings.get("details", {}))
     name = name.removesuffix(controlled_name("", "cleared")) if details.pop("forget", None) else name

@@ -1,7 +1,7 @@
 """Reports of results: Markdown, CSV, and one self-contained HTML page.
 
-Tables have the paper's numbers next to those of protocol `published`. The page has inline CSS and SVG and GIFs as data
-URIs, no script and no external files.
+Tables show the paper's numbers next to results of protocol `published`. The page has inline CSS and SVG, and GIFs as
+data URIs, but no scripts and no external files.
 """
 
 from __future__ import annotations
@@ -51,30 +51,29 @@ from icrl4aht_data.utils.templates import card_file, markdown_table
 from icrl4aht_data.utils.text import counted_noun
 
 REPORT_FILES = ("report.md", "report.csv")
-"""Files that `write_report` writes."""
+"""Names of the files that `write_report` writes."""
 
 _RUNS_WITH_EPISODES = 3  # a GIF takes up to 110 kB of the page
 
 
 PAPER_METHODS = ("AD", "DPT")
-"""Published methods in tables next to an agent without published results."""
+"""Methods whose published results tables show in additional rows."""
 
 AVERAGE = "Average"
 """Label of the row of means over families, as in cards/published.json."""
 
 Published = tuple[float, float | None]
-"""A published mean and its standard deviation, which the paper does not always state."""
+"""Mean and standard deviation that the paper states; None if it states no standard deviation."""
 
 
 class TableScore(NamedTuple):
-    """Results of an agent on a group of cells, one entry of a table.
+    """Results of an agent on a group of layouts and families, as one entry of a table.
 
     Attributes:
-        text: mean return, std over the instances of a single cell or over cells, and marks of overlaps; a dash if
-            nothing was played.
-        notes: further numbers as text: what is missing, the paper's numbers, score, blocks of episodes.
-        is_flat: whether headroom was measured in a cell, and none has any, see `scores.known_headroom`.
-        overlaps: the ways in which training data and tasks overlap, see `icrl4aht_baselines.training.seen.OVERLAPS`.
+        text: mean return, standard deviation, and marks for overlap with training data; a dash without results.
+        notes: further texts: missing results, the paper's numbers, score, and returns in blocks of episodes.
+        is_flat: whether headroom was measured and none was found, see `scores.known_headroom`.
+        overlaps: kinds of overlap of training data and tasks, see `icrl4aht_baselines.training.seen.OVERLAPS`.
     """
 
     text: str = "–"
@@ -86,13 +85,13 @@ class TableScore(NamedTuple):
 def table_score(
     cells: Sequence[ResultCell], run: EvaluationRun | None, protocol: str, published: Published | None = None
 ) -> TableScore:
-    """Return a run's results on a group of cells.
+    """Return a run's results on a group of layouts and families, as a table entry.
 
     Args:
-        cells: the group.
-        run: None if the agent was not run.
-        protocol: of the run.
-        published: the paper's mean and std; left out if a cell was not played, or with another episode length.
+        cells: layouts and families of the group.
+        run: results of the agent; None without results.
+        protocol: name of the protocol of the run.
+        published: the paper's mean and std; left out if not all of the group was played, or with other episode lengths.
     """
     played = [cell for cell in cells if run and cell in run.cells]
     headroom, scales = known_headroom(protocol), cell_scales(protocol)
@@ -124,14 +123,14 @@ def table_score(
 
 
 class ScoreTable(NamedTuple):
-    """A table of scores of one kind of tasks.
+    """Table of results in one kind of tasks.
 
     Attributes:
         title: heading of the table.
         kind: kind of the tasks.
-        columns: name of a column -> layouts.
-        rows: label of a group of families and agent -> scores, one per column.
-        caption: conditions of the evaluation, as a sentence.
+        columns: name of a column -> layouts of the column.
+        rows: (label of a group of families, agent) -> entries, one for each column.
+        caption: sentence with the conditions of the evaluation.
     """
 
     title: str
@@ -142,12 +141,12 @@ class ScoreTable(NamedTuple):
 
 
 def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTable]:
-    """Return a table for each kind of tasks that was played.
+    """Return a table of returns for each kind of tasks that was played.
 
     Tables of test tasks also have averages, and under the paper's protocol rows of the paper's AD, DPT and `random`.
 
     Args:
-        runs: runs under one protocol.
+        runs: results of agents under one protocol.
         protocol: name of the protocol.
     """
     tables = []
@@ -179,23 +178,23 @@ def returns_tables(runs: Sequence[EvaluationRun], protocol: str) -> list[ScoreTa
 
 @cache
 def read_published() -> dict[str, Any]:
-    """Return the paper's numbers, each part with its source, from cards/published.json."""
+    """Return the content of cards/published.json: the numbers of the paper and their sources."""
     return parse_json(read_text(card_file("published.json")))
 
 
 def published_cells(agent: str) -> dict[str, dict[str, tuple[float, float]]]:
-    """Return layout -> family or "Average" -> published mean and std; empty for an agent that is not in the paper."""
+    """Return layout -> family or "Average" -> published (mean, std); empty for an agent that is not in the paper."""
     return read_published()["methods"].get(agent, {})
 
 
 def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> Published | None:
-    """Return the paper's mean and std of a cell, of a layout's four cells or of a track's cells; None of other groups.
+    """Return the paper's mean and std for one family on a layout, a complete layout, or a track; otherwise None.
 
-    The paper's text states the means of some contexts, and its tables are of K = 500 and the small size.
+    The paper's tables are for context K = 500 and the small size; its text states means for some other contexts.
 
     Args:
-        agent: name of a published method, or a run of it.
-        cells: the group.
+        agent: name of a published method, or results of the method.
+        cells: layouts and families of the group.
     """
     name, context = (agent, None) if isinstance(agent, str) else (agent.agent, agent.sources[0].detail("context"))
     layouts, families = (tuple(dict.fromkeys(cell[part] for cell in cells)) for part in (0, 1))
@@ -212,9 +211,9 @@ def published_score(agent: EvaluationRun | str, cells: Sequence[ResultCell]) -> 
 
 
 def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCell] | None = None) -> str:
-    """Return a sentence with protocol, seeds, length and instances of some runs' results, all or those of `cells`.
+    """Return a sentence with protocol, seeds, episodes and number of instances of some runs, or of their `cells`.
 
-    If the conditions differ, it says which agents they are of.
+    If the conditions differ between runs, the sentence names the agents of each condition.
     """
     shown = [(run, cell) for run in runs for cell in run.cells if cells is None or cell in cells]
     labels: dict[str, dict[str, None]] = {}
@@ -227,13 +226,13 @@ def describe_conditions(runs: Iterable[EvaluationRun], cells: Container[ResultCe
 
 
 def instances_range(numbers: Iterable[int]) -> str:
-    """Return numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
+    """Return the range of some numbers of instances as text, such as "5 instances" or "1 to 5 instances"."""
     found = sorted(set(numbers))
     return counted_noun(found[0], "instance") if len(found) == 1 else f"{found[0]} to {found[-1]} instances"
 
 
 def write_report(runs: Sequence[EvaluationRun], out: Path) -> list[Path]:
-    """Write report.md and report.csv of some runs into the folder `out`. Return their paths."""
+    """Write report.md and report.csv of some runs into the folder `out`. Return the paths of both files."""
     out.mkdir(parents=True, exist_ok=True)
     text, table = paths = [out / name for name in REPORT_FILES]
     text.write_text(markdown(runs), encoding="utf-8")
@@ -242,7 +241,7 @@ def write_report(runs: Sequence[EvaluationRun], out: Path) -> list[Path]:
 
 
 def markdown(runs: Sequence[EvaluationRun]) -> str:
-    """Return a Markdown report: a summary, and a table of returns per protocol and kind of tasks."""
+    """Return a Markdown report of some runs: a summary, and a table for each protocol and kind of tasks."""
     lines = [
         "# Returns per layout and teammate family",
         "",
@@ -258,7 +257,7 @@ def markdown(runs: Sequence[EvaluationRun]) -> str:
 
 
 def markdown_sections(runs: Sequence[EvaluationRun], protocol: str) -> list[str]:
-    """Return a section of Markdown for each kind of tasks that was played: a table, and the meaning of its marks."""
+    """Return a Markdown section for each kind of tasks that was played: a table, and what the marks mean."""
     sections = []
     for table in returns_tables(runs, protocol):
         body = [
@@ -274,16 +273,16 @@ def markdown_sections(runs: Sequence[EvaluationRun], protocol: str) -> list[str]
 
 
 def summary_lines(runs: Sequence[EvaluationRun]) -> list[str]:
-    """Return the summary of some runs for the console and Markdown, and the legend of its marks."""
+    """Return the summary of some runs as lines of text, followed by the meaning of the marks."""
     headlines = [headline for run in runs for headline in find_headlines(run)]
     legend = overlap_legend({name for one in headlines for name in one.overlaps})
     return [*(headline.text for headline in headlines), *legend]
 
 
 def csv_text(runs: Sequence[EvaluationRun]) -> str:
-    """Return the results of all runs as CSV, with the columns of docs/results.csv, see `results`.
+    """Return the results of all runs as CSV text, with the columns of docs/results.csv, see `results`.
 
-    The column `agent` has the runs' labels, which distinguish several runs of an agent.
+    The column `agent` has the labels of the runs, because several runs may be of the same agent.
     """
     table = pd.concat([run.table.assign(agent=run.label) for run in runs], ignore_index=True)
     return add_scales(table).round(3).to_csv(index=False, lineterminator="\n")
@@ -292,16 +291,16 @@ def csv_text(runs: Sequence[EvaluationRun]) -> str:
 def write_page(
     runs: Sequence[EvaluationRun], path: Path, episodes: Sequence[EpisodePair] = (), notes: Sequence[str] = ()
 ) -> Path:
-    """Write the page. Return its path.
+    """Write the HTML page of a report. Return the path of the page.
 
     Args:
-        runs: merged, see `results.merge`; of any protocols.
-        path: ends in .html; replaced atomically.
-        episodes: see `gifs.family_gifs`.
-        notes: facts about these runs for the reader, such as those without episodes.
+        runs: merged results of agents, see `results.merge`, under any protocols.
+        path: path of the page, which ends in .html; an existing file is replaced atomically.
+        episodes: episodes to show, see `gifs.family_gifs`.
+        notes: notes for the reader, such as the names of runs without episodes.
 
     Raises:
-        OptionError: if the path does not end in .html, or there is no run.
+        OptionError: if the path does not end in .html, or `runs` is empty.
     """
     if path.suffix not in (".html", ".htm"):
         raise OptionError(f"{path}: expected a name that ends in .html")
@@ -322,15 +321,15 @@ def write_page_with_episodes(
     suite: Path | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Path:
-    """Write the page with episodes of a task per family of teammates, of at most three runs. Return its path.
+    """Write the HTML page of a report, with GIFs of episodes of at most three runs. Return the path of the page.
 
-    Reference egos come after the other runs.
+    Other agents are chosen before reference egos.
 
     Args:
         runs, path: see `write_page`.
-        episodes: False for a page without episodes.
+        episodes: whether the page has GIFs of episodes.
         suite: folder of learned teammates' checkpoints.
-        progress: called with (description, tasks drawn, tasks).
+        progress: function for progress, called with (description, tasks drawn, number of tasks).
     """
     shown = sorted(runs, key=lambda run: run.agent in AGENTS)[:_RUNS_WITH_EPISODES] if episodes else []
     left = [run.label for run in runs if run not in shown]
@@ -357,9 +356,9 @@ def _environment() -> Environment:
 def _page_values(
     runs: Sequence[EvaluationRun], episodes: Sequence[EpisodePair], notes: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the values of the template page.html."""
+    """Return the variables of the template page.html."""
     protocols = list(dict.fromkeys(run.protocol for run in runs))
-    labels = list(dict.fromkeys(run.label for run in runs))  # an agent has one colour under all protocols
+    labels = list(dict.fromkeys(run.label for run in runs))  # so that a run has the same colour under all protocols
     agents = list(dict.fromkeys(run.agent for run in runs))
     names = ", ".join(agents) if len(agents) <= 4 else f"{', '.join(agents[:3])} and {len(agents) - 3} more"
     found: dict[str, list[Any]] = {"bars": [], "curves": [], "tables": []}
@@ -393,7 +392,7 @@ def _page_values(
 
 
 def _settings_table(runs: Sequence[EvaluationRun]) -> dict[str, list[str]]:
-    """Return setting -> its value for each source of results; the settings of the evaluation and of the training."""
+    """Return name of a setting -> value for each source of results, for settings of evaluation and training."""
     columns = []
     for label, source in [(run.label, source) for run in runs for source in run.sources]:
         shown = {"agent": label, "layouts": ", ".join(source.layouts), "results": source.folder}

@@ -1,15 +1,15 @@
-"""Results of evaluation as one tidy table.
+"""Results of evaluations as one tidy table.
 
 A table of results is a data frame with a row for each task, seed and block of episodes:
 
-    agent, training     name of the agent; number of its training, for several with different seeds
-    protocol, control   name of the protocol; empty, or one of `protocols.CONTROLS`
-    layout, family, kind    the cell of the task, see `ResultCell`
-    overlap             overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
-    task, seed          key of the task, see `task_label`; seed
-    block, return       one of `BLOCKS`; mean return of the team in its episodes
+    agent, training         name of the agent; number of its training, if there are several with different seeds
+    protocol, control       name of the protocol; control, one of `protocols.CONTROLS`, or empty
+    layout, family, kind    result cell of the task, see `ResultCell`
+    overlap                 overlaps of training data and the cell's tasks, see `seen.OVERLAPS`
+    task, seed              label of the task, see `task_label`; seed of the episodes
+    block, return           block of episodes, one of `BLOCKS`; mean return of the team in the block
 
-Tasks of different kinds never share a cell, since the paper's numbers are of published test tasks.
+A result cell never mixes test tasks with other kinds of tasks, since the paper's numbers are of the test tasks.
 
 Shapes: T trainings, U tasks of a cell, S seeds.
 """
@@ -43,19 +43,19 @@ from icrl4aht_data.utils.progress import counted
 from icrl4aht_data.utils.text import counted_noun
 
 TEST_LAYOUTS = tuple(layout for track in TRACKS.values() for layout in track["test"])
-"""Layouts that the benchmark tests on, in the paper's order."""
+"""Names of the benchmark's test layouts, in the paper's order."""
 
 OWN_TASKS, TRAINED_RUN = "tasks.jsonl", "run.json"
-"""Files next to results: tasks that are not among the published test tasks; settings of the evaluated model."""
+"""Files in a folder of results: tasks that are not published test tasks, and settings of the evaluated model."""
 
 PUBLISHED_PROTOCOL = "published"
 """Name of the protocol that the paper's numbers belong to."""
 
 BLOCKS = {"all": (0, None), "1": (0, 1), "2-5": (1, 5), "6-20": (5, 20), "21-100": (20, 100), "last 20": (-20, None)}
-"""Block of episodes -> its slice of a task's episodes. An evaluation has the blocks whose first episode it played."""
+"""Name of a block -> its slice of a task's episodes. Results have only the blocks of which an episode was played."""
 
 EPISODE_BLOCKS = ("1", "2-5", "6-20", "21-100")
-"""The blocks that tables show side by side."""
+"""Names of the blocks that tables show in columns."""
 
 CELL_COLUMNS = ["layout", "family", "kind"]
 AGENT_COLUMNS = ["agent", "training", "protocol", "control"]
@@ -74,18 +74,18 @@ TASK_KINDS = {
     PREFERENCE: "Tasks of the track preference, which is this project's own, not the paper's.",
     "own": "Own tasks: not among the published test tasks, so the paper has no numbers of them.",
 }
-"""Kind of tasks -> explanation; "test" are the published test tasks."""
+"""Kind of tasks -> explanation for reports; "test" means the published test tasks, which need none."""
 
 _KIND_OF_SPLIT = {"validation": "validation", "train": "training", "heldout": "held out", "test": "own"}
 
 
 class ResultCell(NamedTuple):
-    """Tasks that reports average over: those with the same layout, family of teammates and kind.
+    """Result cell: all tasks with the same layout, teammate family and kind, over which reports average.
 
     Attributes:
-        layout: short name.
+        layout: name of the layout.
         family: family of the teammates.
-        kind: one of `TASK_KINDS`.
+        kind: kind of the tasks, one of `TASK_KINDS`.
     """
 
     layout: str
@@ -94,23 +94,24 @@ class ResultCell(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Layout and teammates as people read them, such as "demo_wide, H4" and "demo_wide, learned (validation)"."""
+        """Title in reports, such as "demo_wide, H4" or "demo_wide, learned (validation)"."""
         return f"{self.layout}, {family_title(self.family)}{'' if self.kind == 'test' else f' ({self.kind})'}"
 
     @property
     def order(self) -> tuple[Any, ...]:
-        """Sort key: layouts and families in the paper's order."""
+        """Sort key that orders layouts and families as in the paper."""
         return layout_order(self.layout), family_order(self.family), list(TASK_KINDS).index(self.kind)
 
 
 class CellReturns(NamedTuple):
-    """Returns of an agent in one cell.
+    """Returns of an agent in one result cell.
 
     Attributes:
-        tasks, seeds: keys of the tasks, and the seeds.
+        tasks: labels of the tasks, see `task_label`.
+        seeds: seeds of the episodes.
         blocks: block of episodes -> mean returns, float64 (T, U, S), see `BLOCKS`.
         overlaps: kinds of overlap of the tasks with the training data.
-        trainings: numbers of the trainings.
+        trainings: numbers of the agent's trainings.
     """
 
     tasks: tuple[str, ...]
@@ -121,21 +122,21 @@ class CellReturns(NamedTuple):
 
     @property
     def mean(self) -> np.ndarray:
-        """Mean returns in all episodes and trainings, float64 (U, S)."""
+        """Mean returns over all episodes and trainings, float64 (U, S)."""
         return self.blocks["all"].mean(axis=0)
 
 
 def mean_of(cells: Iterable[np.ndarray]) -> float:
-    """Return the mean of the cells' means."""
+    """Return the mean of the means of several result cells."""
     return float(np.mean([values.mean() for values in cells]))
 
 
 AgentReturns = Mapping[ResultCell, CellReturns]
-"""Returns of an agent under one protocol."""
+"""Result cell -> returns of an agent under one protocol."""
 
 
 def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
-    """Return the returns of one agent and control under one protocol, cells in the paper's order."""
+    """Convert a table with one agent, control and protocol to result cell -> returns, in the paper's order."""
     found = {}
     for key, rows in table.groupby(CELL_COLUMNS, sort=False):
         codes, axes = zip(*(pd.factorize(rows[name]) for name in ("training", "task", "seed", "block")), strict=True)
@@ -145,27 +146,27 @@ def returns_by_cell(table: pd.DataFrame) -> dict[ResultCell, CellReturns]:
         overlaps = sorted_overlaps(" ".join(rows["overlap"].unique()).split())
         cell = ResultCell._make(map(str, key))
         if np.isnan(values).any():
-            raise OptionError(f"{cell.title}: results of trainings with unequal tasks, seeds or episodes")
+            raise OptionError(f"{cell.title}: the results of the trainings have unequal tasks, seeds or episodes")
         trainings, seeds = (tuple(map(int, axes[number])) for number in (0, 2))
         found[cell] = CellReturns(tuple(axes[1]), seeds, blocks, overlaps, trainings)
     return {cell: found[cell] for cell in in_order(found)}
 
 
 def task_label(task_id: str) -> str:
-    """Return the teammate's number and the hash at the end of a task id, such as "t0-9bc579c9"."""
+    """Return a task's label: the teammate's number and the hash of the task id, such as "t0-9bc579c9"."""
     _, number, _, digest = task_id.rsplit("_", 3)
     return f"{number}-{digest}"
 
 
 class ResultSource(NamedTuple):
-    """Origin of results.
+    """Origin of results: folder, settings, tasks, and training data of the agent.
 
     Attributes:
         folder: folder that the results were read from.
         settings: settings of the evaluation, see `evaluate.results.Result`.
-        trained: content of run.json, see `note_results`; None for an agent that was not trained here.
-        tasks: cell -> the tasks that were played, in the order of the returns.
-        seen: what the agent was trained on; None if that is not known.
+        trained: content of run.json, see `note_results`; None for an agent without a run folder.
+        tasks: result cell -> evaluated tasks, in the order of the returns.
+        seen: layouts and teammates in the agent's training; None if they are not known.
     """
 
     folder: str
@@ -176,16 +177,16 @@ class ResultSource(NamedTuple):
 
     @property
     def layouts(self) -> tuple[str, ...]:
-        """Layouts that were played."""
+        """Names of the evaluated layouts."""
         return tuple(dict.fromkeys(cell.layout for cell in self.tasks))
 
     def detail(self, name: str) -> Any:
-        """Return a detail of the agent, such as `acting` or `encoder` of a trained model; otherwise an empty text."""
+        """Return an entry of the agent's `details`, such as `encoder`; an empty text if there is no such entry."""
         return self.settings.get("details", {}).get(name, "")
 
     @property
     def conditions(self) -> str:
-        """Text with protocol, seeds, episodes and steps of the evaluation, and a model's way of playing."""
+        """Text with protocol, seeds, episodes and steps of the evaluation, and the play mode of a model."""
         protocol, seeds = self.settings["protocol"], self.settings["seeds"]
         listed = ", ".join(map(str, seeds))
         if len(seeds) > 2 and seeds == list(range(seeds[0], seeds[0] + len(seeds))):
@@ -201,16 +202,15 @@ class ResultSource(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EvaluationRun:
-    """One agent's results under one protocol.
+    """Results of one agent under one protocol.
 
     Attributes:
         agent: name of the agent.
         protocol: name of the protocol.
-        table: the results, see the module's docstring.
-        cells: cell -> returns of the team in each episode, float64 (instances, episodes), means over the seeds; in the
-            paper's order.
-        note: text that distinguishes results of one agent on the same cells; usually empty.
-        sources: origins of the results; each cell has one.
+        table: results as a table; its columns are described at the top of this module.
+        cells: result cell -> mean returns over the seeds, float64 (instances, episodes), in the paper's order.
+        note: text that distinguishes several results of one agent in the same result cells; usually empty.
+        sources: origins of the results; each result cell has one origin.
     """
 
     agent: str
@@ -221,34 +221,34 @@ class EvaluationRun:
     sources: tuple[ResultSource, ...] = ()
 
     def source(self, cell: ResultCell) -> ResultSource:
-        """Return the origin of a cell's results."""
+        """Return the origin of the results in a result cell."""
         return next(source for source in self.sources if cell in source.tasks)
 
     def tasks(self, cell: ResultCell) -> tuple[Task, ...]:
-        """Return the tasks of a cell that were played."""
+        """Return the evaluated tasks of a result cell."""
         return self.source(cell).tasks[cell]
 
     def overlaps(self, cells: Iterable[ResultCell]) -> tuple[str, ...]:
-        """Return the kinds of overlap between training data and the tasks of some cells, see `seen.OVERLAPS`."""
+        """Return the kinds of overlap between training data and the tasks of result cells, see `seen.OVERLAPS`."""
         return sorted_overlaps(name for cell in cells for name in self.returns[cell].overlaps)
 
     @cached_property
     def returns(self) -> dict[ResultCell, CellReturns]:
-        """The returns in each cell."""
+        """Result cell -> returns of the agent."""
         return returns_by_cell(self.table)
 
     def has_full_length(self, cell: ResultCell) -> bool:
-        """Return whether the episodes in a cell have the benchmark's length."""
+        """Return whether the episodes in a result cell have the benchmark's length."""
         return self.source(cell).settings["protocol"]["steps"] == KEPT_STEPS
 
     @property
     def label(self) -> str:
-        """The agent, with the note if there is one."""
+        """Name of the agent in reports, followed by the note if there is one."""
         return f"{self.agent} [{self.note}]" if self.note else self.agent
 
 
 def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the mean return in each block that exists, (...), of the returns of all episodes, (..., episodes)."""
+    """Return name of a block -> mean return in the block, (...), from the returns of all episodes, (..., episodes)."""
     episodes = returns.shape[-1]
     return {
         name: returns[..., start:stop].mean(axis=-1)
@@ -258,13 +258,13 @@ def episode_blocks(returns: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def note_results(results: Path, run: Path | None = None, tasks: Sequence[Task] = ()) -> None:
-    """Store the settings and tasks of results next to them, for reports.
+    """Store the model's settings and the tasks in a folder of results, where reports need them.
 
     Args:
         results: folder of the results.
-        run: run folder of the evaluated model, if it was trained here. Its path, settings, their hash and the hash of
-            its data's manifest are written to run.json.
-        tasks: the tasks played; those that are no published test tasks are added to tasks.jsonl.
+        run: run folder of the evaluated model, or None. Its path, settings, their hash and the hash of the data's
+            manifest are written to run.json.
+        tasks: evaluated tasks; those that are not published test tasks are added to tasks.jsonl.
 
     Raises:
         OptionError: if `run` is not a run on learning histories.
@@ -303,12 +303,14 @@ def evaluate_agent(
     what: str = "",
     **options: Any,
 ) -> EvaluationRun:
-    """Evaluate an agent into a folder, note there what reports need to know, and return the results.
+    """Evaluate an agent, store the results in a folder with all that reports need, and return them.
 
     Args:
         agent, tasks, protocol, seeds, options: see `evaluate`.
         out: folder of the results.
-        show: called with (`what`, episodes played, episodes); by default a bar is shown.
+        show: function for progress, called with (`what`, episodes played, number of episodes); by default, a progress
+            bar is shown.
+        what: description for `show`.
     """
     played = show and counted(show, what, len(tasks) * len(seeds) * protocol.episodes)
     shared: Any = {"seeds": seeds, "out": out, "details": agent.details, "played": played}
@@ -318,10 +320,10 @@ def evaluate_agent(
 
 
 def read_results(folder: Path) -> tuple[list[Result], dict[str, Any] | None]:
-    """Return the results in a folder that `icrl4aht-data evaluate` made, and the content of its run.json or None.
+    """Return the results in a folder that `icrl4aht-data evaluate` made, and the content of run.json or None.
 
     Raises:
-        OptionError: if there are none.
+        OptionError: if the folder has no results.
     """
     results = [read_result(path) for path in sorted((folder / RESULTS).glob("*.json"))]
     if not results:
@@ -331,10 +333,10 @@ def read_results(folder: Path) -> tuple[list[Result], dict[str, Any] | None]:
 
 
 def read_run(folder: Path) -> EvaluationRun:
-    """Return the results in a folder as a run.
+    """Return the results in a folder as an `EvaluationRun`.
 
     Raises:
-        OptionError: if there are none, if they mix settings, or if the task of one is unknown.
+        OptionError: if the folder has no results, the results have different settings, or a task is unknown.
     """
     results, trained = read_results(folder)
     own = read_tasks_and_layouts(folder / OWN_TASKS) if (folder / OWN_TASKS).exists() else []
@@ -344,17 +346,16 @@ def read_run(folder: Path) -> EvaluationRun:
 def as_run(
     results: Sequence[Result], where: str = "results", tasks: Sequence[Task] = (), trained: dict[str, Any] | None = None
 ) -> EvaluationRun:
-    """Return the results of one agent as a run, which reports take.
+    """Return the results of one agent as an `EvaluationRun`, which the functions for reports take.
 
     Args:
         results: results of `icrl4aht_baselines.evaluate.evaluate`, all under the same settings.
         where: folder of the results, for messages.
-        tasks: the tasks that were played, if they are neither the published test tasks nor the package's validation
-            tasks.
-        trained: content of run.json, see `note_results`; None for an agent that was not trained here.
+        tasks: evaluated tasks that are neither published test tasks nor the package's validation tasks.
+        trained: content of run.json, see `note_results`; None for an agent without a run folder.
 
     Raises:
-        OptionError: if the settings differ, or a result's task is neither published nor in `tasks`.
+        OptionError: if the settings differ, or a task is neither in the package nor in `tasks`.
     """
     settings = results[0].settings
     if any(result.settings != settings for result in results):
@@ -390,9 +391,9 @@ def as_run(
 
 
 def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: str) -> dict[str, SeenInTraining | None]:
-    """Return what an agent was trained on: nothing for reference egos, None if the results do not say.
+    """Return track -> layouts and teammates in an agent's training; None if the results do not state them.
 
-    The key is empty, or the track for an agent with a model for each track.
+    The only key is empty, unless the agent has a separate model for each track. Reference egos have an empty record.
     """
     details = settings.get("details", {})
     for record in (details, (trained or {}).get("config", {})):
@@ -406,16 +407,15 @@ def find_seen(settings: dict[str, Any], trained: dict[str, Any] | None, where: s
 
 
 def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
-    """Return the runs with those of one agent on different cells, such as models of each layout, merged into one run.
+    """Merge the runs of an agent on different result cells, such as those of one model per layout, into one run.
 
-    Runs that played the same cell, or under other rules or seeds, are not merged; the `note` of the later ones is their
-    folder.
+    Runs with the same result cell, or with other rules or seeds, are not merged. Such a run gets its folder as `note`.
     """
     merged: list[EvaluationRun] = []
     for run in runs:
         same = [other for other in merged if (other.label, other.protocol) == (run.label, run.protocol)]
         fitting = [
-            other for other in same if _rules(other) == _rules(run) and not other.cells.keys() & run.cells.keys()
+            other for other in same if _rule_key(other) == _rule_key(run) and not other.cells.keys() & run.cells.keys()
         ]
         if not fitting:
             merged.append(replace(run, note=run.sources[0].folder) if same else run)
@@ -428,8 +428,8 @@ def merge(runs: Sequence[EvaluationRun]) -> list[EvaluationRun]:
     return merged
 
 
-def _rules(run: EvaluationRun) -> tuple[Any, ...]:
-    """Return what merged results must agree in: protocol, seeds, way of playing, and encoder."""
+def _rule_key(run: EvaluationRun) -> tuple[Any, ...]:
+    """Return the settings that must be equal in merged runs: protocol, seeds, play mode, and encoder."""
     source = run.sources[0]
     playing = [source.detail(name) or False for name in ("acting", "sampled", "forget", "encoder")]
     return source.settings["protocol"], source.settings["seeds"], playing
@@ -437,12 +437,12 @@ def _rules(run: EvaluationRun) -> tuple[Any, ...]:
 
 @cache
 def bundled_by_id(split: str) -> dict[str, Task]:
-    """Return the package's tasks of a split of both tracks by id; "test" has the 160 published ones."""
+    """Return id -> task for the package's tasks of a split on both tracks; "test" has the 160 published tasks."""
     return {task.task_id: task for track in TRACKS for task in bundled_tasks(track, split)}
 
 
 def cell_of(task: Task) -> ResultCell:
-    """Return the cell of a task."""
+    """Return the result cell that a task belongs to."""
     kind = _KIND_OF_SPLIT[task.split]
     if task.track == PREFERENCE and task.split == "test":
         kind = PREFERENCE
@@ -454,10 +454,10 @@ def cell_of(task: Task) -> ResultCell:
 
 
 def in_order(cells: Iterable[ResultCell]) -> list[ResultCell]:
-    """Return cells in the paper's order, each once."""
+    """Return result cells in the paper's order, without repetitions."""
     return sorted(set(cells), key=lambda cell: cell.order)
 
 
 def family_title(family: str) -> str:
-    """Return a family of teammates as people read it."""
+    """Return the name of a teammate family in reports, which is "learned" for `rl`."""
     return "learned" if family == "rl" else family

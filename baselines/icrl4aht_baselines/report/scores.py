@@ -1,8 +1,9 @@
 """Scores relative to best responses, differences between agents, and the summary of a report.
 
-R is the mean return of an agent with a teammate, S that of the ego `stay`, B that of the best response. The score of a
-layout is N = sum(R - S) / sum(B - S) over its tasks, that of several layouts the mean over the layouts. Only tasks of
-cells with headroom count, in which B - S is at least `LEAST_HEADROOM` in the mean.
+For a task, R is the mean return of the agent, S that of the ego `stay`, and B that of the best response. The score of a
+layout is N = sum(R - S) / sum(B - S) over its tasks; the score of several layouts is the mean of their N. A result cell
+(layout and teammate family) has headroom if its mean of B - S is at least `LEAST_HEADROOM`; only tasks of such cells
+are used.
 
 Shapes: T trainings, U tasks of a cell, S seeds.
 """
@@ -49,11 +50,12 @@ from icrl4aht_data.utils.text import counted_noun
 
 
 class TaskScale(NamedTuple):
-    """Returns that scores of a task are relative to.
+    """Reference returns S and B of a task, which its score is relative to.
 
     Attributes:
-        stay, best: mean returns of `stay` and of the best response.
-        behaviour: name of the teammate's behaviour; tasks whose teammates act alike have the same name.
+        stay: S, mean return of the ego `stay`.
+        best: B, mean return of the best response.
+        behaviour: name of the teammate's behaviour; teammates that behave the same have the same name.
     """
 
     stay: float
@@ -62,37 +64,37 @@ class TaskScale(NamedTuple):
 
 
 class CellScale(NamedTuple):
-    """Scales of the tasks of a cell.
+    """Reference returns of the tasks of a result cell.
 
     Attributes:
-        tasks: key of a task -> its scale, see `results.task_label`.
+        tasks: label of a task, see `results.task_label` -> reference returns of the task.
     """
 
     tasks: Mapping[str, TaskScale]
 
     @property
     def stay(self) -> float:
-        """Mean return of `stay`."""
+        """Mean return of the ego `stay` over the tasks."""
         return float(np.mean([scale.stay for scale in self.tasks.values()]))
 
     @property
     def best(self) -> float:
-        """Mean return of the best responses."""
+        """Mean return of the best responses over the tasks."""
         return float(np.mean([scale.best for scale in self.tasks.values()]))
 
     @property
     def has_headroom(self) -> bool:
-        """Whether best responses earn `LEAST_HEADROOM` more than `stay`."""
+        """Whether best responses earn at least `LEAST_HEADROOM` more than the ego `stay`."""
         return self.best - self.stay >= LEAST_HEADROOM
 
 
 CellScales = Mapping[ResultCell, CellScale]
-"""Scales of the cells whose tasks have best responses."""
+"""Result cell -> reference returns, for the cells whose tasks all have best responses."""
 
 
 @cache
 def bundled_cells() -> dict[ResultCell, list[str]]:
-    """Return cell -> ids of its tasks, of all tasks in the package."""
+    """Return result cell -> task ids, for all tasks in the package."""
     found: dict[ResultCell, list[str]] = defaultdict(list)
     for split in EVALUATION_SPLITS:
         for task in bundled_by_id(split).values():
@@ -101,18 +103,18 @@ def bundled_cells() -> dict[ResultCell, list[str]]:
 
 
 def behaviour_names() -> dict[str, str]:
-    """Return key of a task -> the name of its teammate's behaviour, the id of the first task with this behaviour.
+    """Return label of a task -> name of its teammate's behaviour, which is the id of the first task with it.
 
-    Known are the package's test tasks and those with best responses.
+    The result covers the package's test tasks and all tasks with best responses.
     """
     groups = [*same_behaviour_tasks(), *(best.tasks for best in best_responses().values())]
     return {task_label(task): group[0] for group in groups for task in group}
 
 
 def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
-    """Return the scales of the package's cells under a protocol, those of which every task has a best response.
+    """Return result cell -> reference returns under a protocol, for cells whose tasks all have best responses.
 
-    A layout's test cells count once all of its cells in which the oracle earns more than `stay` have best responses.
+    A layout's test cells are included only if all of them in which the oracle earns more than `stay` are complete.
     """
     measured, stays, names = best_responses(protocol), stay_returns(protocol), behaviour_names()
     found: dict[ResultCell, CellScale] = {}
@@ -128,10 +130,10 @@ def cell_scales(protocol: str) -> dict[ResultCell, CellScale]:
 
 
 def add_scales(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of results with columns `stay` and `best`: S and B of each task, where they are known.
+    """Return a table of results with additional columns `stay` and `best`, the reference returns S and B of each task.
 
-    Under the control `swapped` they are of the teammate of the last episodes alone, and under a protocol that swaps
-    teammates there are none.
+    Unknown values are empty. Under the control `swapped`, only the block of the last episodes has values, because other
+    teammates play before; under a protocol that swaps teammates there are no values.
     """
     rows = []
     for protocol in table["protocol"].unique():
@@ -150,26 +152,26 @@ def add_scales(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def open_cells(scales: CellScales, track: str | None = None) -> list[ResultCell]:
-    """Return the test cells with headroom, all or those of a track, in the paper's order."""
+    """Return the test cells with headroom, optionally only those of a track, in the paper's order."""
     cells = in_order(cell for cell, scale in scales.items() if scale.has_headroom and cell.kind == "test")
     return [cell for cell in cells if track is None or cell.layout in TRACKS[track]["test"]]
 
 
 def known_headroom(protocol: str) -> dict[ResultCell, bool]:
-    """Return whether each measured cell has headroom: by best responses, or by the oracle where there are none."""
+    """Return result cell -> whether it has headroom, according to best responses if known, otherwise to the oracle."""
     egos = {ResultCell(*cell): has_headroom(of_cell) for cell, of_cell in read_headroom(protocol).items()}
     return egos | {cell: scale.has_headroom for cell, scale in cell_scales(protocol).items()}
 
 
 class Score(NamedTuple):
-    """Score of an agent on some cells with headroom.
+    """Score of an agent on some result cells with headroom.
 
     Attributes:
-        total: mean over the layouts of N.
+        total: mean of N over the layouts.
         layouts: layout -> N.
-        middle: interquartile mean over the behaviours of (R - S) / (B - S); behaviours without headroom do not count.
-        worst: layout and family of the behaviour with the lowest value, and this value.
-        regret: B - R, mean over the tasks.
+        middle: interquartile mean of (R - S) / (B - S) over the teammates' behaviours with headroom.
+        worst: layout and family of the behaviour with the lowest value of (R - S) / (B - S), and this value.
+        regret: mean of B - R over the tasks.
     """
 
     total: MeanInterval
@@ -180,7 +182,7 @@ class Score(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The score in words."""
+        """The score as text for the summary of a report."""
         return (
             f"score {self.total.text(2)}, interquartile mean {self.middle.mean:z.2f}, worst teammate "
             f"{self.worst[1]:z.2f} ({self.worst[0]}), regret {self.regret:z.1f}"
@@ -188,13 +190,13 @@ class Score(NamedTuple):
 
 
 def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellScales) -> Score | None:
-    """Return the score on some cells; None if there is none, or one has no headroom or was not played completely."""
+    """Return an agent's score on some cells; None if a cell has no headroom or was not played completely."""
     if not cells or not all(is_scored(returns.get(cell), scales.get(cell)) for cell in cells):
         return None
     groups: dict[str, list[Stratum]] = defaultdict(list)
     values, labels, regrets = [], [], []
     for cell in cells:
-        gains, spans, names, stratum = _scaled(returns[cell], scales[cell])
+        gains, spans, names, stratum = _gains_and_scales(returns[cell], scales[cell])
         groups[cell.layout].append(stratum)
         regrets.append(spans - gains.mean(axis=(0, 2)))
         for name in dict.fromkeys(names):
@@ -213,12 +215,12 @@ def find_score(returns: AgentReturns, cells: Sequence[ResultCell], scales: CellS
 
 
 def is_scored(returns: CellReturns | None, scale: CellScale | None) -> bool:
-    """Return whether a cell has headroom, and all of its tasks with a best response were played."""
+    """Return whether a result cell has headroom and all of its tasks with best responses were played."""
     return bool(returns and scale and scale.has_headroom and scale.tasks.keys() <= {*returns.tasks})
 
 
-def _scaled(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndarray, list[str], Stratum]:
-    """Return R - S (T, U, S), B - S (U,) and the behaviours of the tasks with a best response, and the stratum."""
+def _gains_and_scales(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndarray, list[str], Stratum]:
+    """Return R - S (T, U, S), B - S (U,), behaviours, and stratum of the tasks that have best responses."""
     known = [number for number, task in enumerate(returns.tasks) if task in scale.tasks]
     of_task = [scale.tasks[returns.tasks[number]] for number in known]
     stays, bests = (np.array([getattr(one, name) for one in of_task]) for name in ("stay", "best"))
@@ -227,12 +229,12 @@ def _scaled(returns: CellReturns, scale: CellScale) -> tuple[np.ndarray, np.ndar
 
 
 def behaviour_stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequence[str]) -> Stratum:
-    """Return the stratum whose units are behaviours, or the seeds of a single one.
+    """Return a stratum with behaviours as units, or with seeds as units if there is a single behaviour.
 
     Args:
         values: numerators of the tasks, (T, U, S).
-        scales: their denominators, (U,).
-        behaviours: names of their behaviours.
+        scales: denominators of the tasks, (U,).
+        behaviours: name of the teammate's behaviour in each task.
     """
     names, seeds = list(dict.fromkeys(behaviours)), values.shape[2]
     if len(names) == 1:
@@ -244,27 +246,28 @@ def behaviour_stratum(values: np.ndarray, scales: np.ndarray, behaviours: Sequen
 def score_difference(
     one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], scales: CellScales
 ) -> MeanInterval:
-    """Return the score of one agent minus that of another, paired by task and seed, and by number of the training."""
+    """Return the score of one agent minus that of another, paired by task, seed and number of the training."""
     groups: dict[str, list[Stratum]] = defaultdict(list)
     for cell in cells:
         pair = paired(one[cell], other[cell])
-        gains, spans, names, _ = _scaled(pair[0], scales[cell])
-        groups[cell.layout].append(behaviour_stratum(gains - _scaled(pair[1], scales[cell])[0], spans, names))
+        gains, spans, names, _ = _gains_and_scales(pair[0], scales[cell])
+        groups[cell.layout].append(behaviour_stratum(gains - _gains_and_scales(pair[1], scales[cell])[0], spans, names))
     return ratio_interval([*groups.values()])
 
 
 def block_difference(
     one: AgentReturns, other: AgentReturns, cells: Sequence[ResultCell], block: str
 ) -> MeanInterval | None:
-    """Return the mean return of one agent minus that of another, mean over cells, paired as in `score_difference`.
+    """Return the mean over result cells of one agent's return minus another's, paired by task, seed and training.
 
     Args:
-        one, other: the agents.
-        cells: the cells to compare. Those that only one of the agents played are left out.
-        block: block of episodes, see `results.EPISODE_BLOCKS`.
+        one: results of the first agent.
+        other: results of the agent that is subtracted.
+        cells: cells to compare; cells that only one of the agents played are left out.
+        block: name of a block of episodes, see `results.BLOCKS`.
 
     Returns:
-        The difference; None if the agents have no cell or not this block in common.
+        The difference; None if the agents have no cell in common, or one of them has no such block.
     """
     groups, alike = [], behaviour_names()
     for cell in (cell for cell in cells if cell in one and cell in other):
@@ -277,41 +280,41 @@ def block_difference(
 
 
 def paired(one: CellReturns, other: CellReturns) -> tuple[CellReturns, CellReturns]:
-    """Return the results of two agents in a cell on the tasks, seeds and trainings that both have, in one order."""
+    """Return two agents' results in a cell, reduced to common tasks, seeds and trainings in the same order."""
     axes = [(of.trainings, of.tasks, of.seeds) for of in (one, other)]
     common = [tuple(key for key in first if key in second) for first, second in zip(*axes, strict=True)]
 
-    def chosen(found: CellReturns, own: tuple[tuple[Any, ...], ...]) -> CellReturns:
+    def select_common(found: CellReturns, own: tuple[tuple[Any, ...], ...]) -> CellReturns:
         places = np.ix_(*([axis.index(key) for key in keys] for axis, keys in zip(own, common, strict=True)))
         blocks = {name: values[places] for name, values in found.blocks.items()}
         trainings, tasks, seeds = common
         return CellReturns(tasks, seeds, blocks, found.overlaps, trainings)
 
-    return chosen(one, axes[0]), chosen(other, axes[1])
+    return select_common(one, axes[0]), select_common(other, axes[1])
 
 
 def scored_cells(run: EvaluationRun, cells: Iterable[ResultCell], scales: CellScales) -> list[ResultCell]:
-    """Return the cells with headroom that a run played completely, in episodes of the benchmark's length."""
+    """Return the cells with headroom that a run played completely, with episodes of the benchmark's length."""
     return [cell for cell in cells if run.has_full_length(cell) and is_scored(run.returns[cell], scales.get(cell))]
 
 
 def cell_scores(run: EvaluationRun, scales: CellScales) -> dict[ResultCell, MeanInterval]:
-    """Return N of each of the `scored_cells` of a run."""
+    """Return result cell -> score N, for the cells that `scored_cells` returns."""
     return {
-        cell: ratio_interval([[_scaled(run.returns[cell], scales[cell])[-1]]])
+        cell: ratio_interval([[_gains_and_scales(run.returns[cell], scales[cell])[-1]]])
         for cell in scored_cells(run, run.returns, scales)
     }
 
 
 def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str]:
-    """Return two lines for each track: M and P, means over layouts and families with their 95 % intervals.
+    """Return two lines of text for each track: M and P, as means over layouts and families with 95 % intervals.
 
-    The intervals are those of the scores: within each layout and family, behaviours of teammates are resampled, or the
-    seeds of the tasks if there is one behaviour.
+    For the intervals, the teammates' behaviours are resampled within each layout and family, or the seeds if there is
+    only one behaviour.
 
     Args:
-        results: results of the tasks.
-        tasks: the tasks, in the order of the results.
+        results: results of an ego and its controls.
+        tasks: evaluated tasks, in the order of the results.
     """
     alike, last, lines = behaviour_names(), counted_noun(results.last, "last episode"), []
     names = [alike.get(task_label(task.task_id), task.task_id) for task in tasks]
@@ -333,8 +336,8 @@ def control_lines(results: ControlledResults, tasks: Sequence[Task]) -> list[str
 
 
 def blocks_text(cells: Sequence[CellReturns]) -> str:
-    """Return the mean returns over cells in each block of episodes, such as "1: 10.0, 2-5: 12.0"."""
-    # Evaluations of different lengths may share a table: only blocks that all of them have can be compared.
+    """Return text with the mean return over cells in each block of episodes, such as "1: 10.0, 2-5: 12.0"."""
+    # The cells may have different numbers of episodes, so only blocks that all of them have are shown.
     names = [name for name in EPISODE_BLOCKS if all(name in of.blocks for of in cells)]
     return ", ".join(f"{name}: {mean_of(of.blocks[name] for of in cells):z.1f}" for name in names)
 
@@ -342,16 +345,16 @@ def blocks_text(cells: Sequence[CellReturns]) -> str:
 class Headline(NamedTuple):
     """Summary of a run's results on one kind of tasks.
 
-    The numbers are of the cells with headroom that were played completely, or of all cells played if there is none.
+    The numbers are of completely played result cells with headroom, or of all played cells if there are none.
 
     Attributes:
-        label: the run's label with marks for overlap of its training data with these tasks.
+        label: label of the run, with marks for overlap of its training data with the tasks.
         protocol: name of the protocol.
-        tasks: the cells in words, such as "12 test cells with headroom, of 16 played".
-        score: the score; None without a cell with headroom.
-        mean: return of an episode, mean over cells.
-        blocks: mean returns in blocks of episodes in words; empty for one episode.
-        why_no_score: reason for a missing score, as a sentence; empty if there is a score.
+        tasks: text on the cells, such as "12 test cells with headroom, of 16 played".
+        score: score of the agent; None without cells with headroom.
+        mean: mean return over the cells.
+        blocks: text with the mean returns in blocks of episodes; empty for tasks of one episode.
+        why_no_score: sentence with the reason for a missing score; empty if there is a score.
         overlaps: kinds of overlap of the training data with these tasks.
     """
 
@@ -366,7 +369,7 @@ class Headline(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The summary as sentences for the console and Markdown."""
+        """The summary as text for the console and Markdown."""
         parts = [self.score.text] if self.score else []
         parts.append(f"return {self.mean.text()}")
         parts += [f"by episode {self.blocks}"] if self.blocks else []
@@ -376,7 +379,7 @@ class Headline(NamedTuple):
 
 
 def find_headlines(run: EvaluationRun) -> list[Headline]:
-    """Return a run's summaries, one for each kind of tasks that was played, test tasks first."""
+    """Return a summary of a run for each kind of tasks that was played, with test tasks first."""
     scales, found = cell_scales(run.protocol), []
     for kind in TASK_KINDS:
         played = [cell for cell in run.returns if cell.kind == kind]

@@ -1,12 +1,12 @@
-"""Means and ratios with 95 % intervals, p-values, and their correction.
+"""Means and ratios with 95 % intervals, p-values, and the correction of p-values.
 
-Intervals are studentised bootstrap intervals (Efron and Tibshirani 1993, ch. 12.5). Percentile intervals are too narrow
-by a tenth with five teammates in a cell, since the resampled variance is (n - 1) / n of the true one; dividing by the
-standard error of each resample corrects it. Behaviours are resampled within their cell, trainings for all cells at
-once. Where a cell has a single behaviour, its seeds are resampled. Random numbers are fixed, so that pages are
-reproducible.
+Intervals are studentised bootstrap intervals (Efron and Tibshirani 1993, ch. 12.5). With five teammates, percentile
+intervals would be too narrow by a tenth, since the variance of resamples is (n - 1) / n of the true variance; dividing
+by the standard error of each resample corrects this. Teammates' behaviours are resampled within a combination of layout
+and family, or the seeds if it has a single behaviour. Trainings are resampled for all combinations together. The random
+generator has a fixed seed, so that results are reproducible.
 
-Shapes: T trainings, U units of a stratum (behaviours, or the seeds of a single one), S seeds, R resamples.
+Shapes: T trainings, U units of a stratum (behaviours, or seeds), S seeds, R resamples.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ _Key = TypeVar("_Key", bound=Hashable)
 
 
 class MeanInterval(NamedTuple):
-    """A mean or ratio with its 95 % interval.
+    """Mean or ratio with its 95 % interval.
 
     Attributes:
-        mean: the estimate; NaN without values.
-        low, high: ends of the interval; NaN with too few units to resample.
+        mean: estimated mean or ratio; NaN without values.
+        low: lower end of the interval; NaN with too few units to resample.
+        high: upper end of the interval; NaN with too few units to resample.
         p: two-sided p-value of the hypothesis that the true value is 0; NaN without an interval.
     """
 
@@ -39,7 +40,7 @@ class MeanInterval(NamedTuple):
     p: float = float("nan")
 
     def range(self, digits: int = 1, sign: str = "") -> str:
-        """Return the interval as text, such as "(0.1 to 0.4)"; empty if there is none."""
+        """Return the interval as text, such as "(0.1 to 0.4)"; an empty text without an interval."""
         return "" if np.isnan(self.low) else f"({self.low:{sign}z.{digits}f} to {self.high:{sign}z.{digits}f})"
 
     def text(self, digits: int = 1, sign: str = "") -> str:
@@ -48,7 +49,7 @@ class MeanInterval(NamedTuple):
 
 
 class Stratum(NamedTuple):
-    """Units that are resampled among themselves.
+    """Units of one group, among which resamples are made.
 
     Attributes:
         gains: numerators of the units in each training, (T, U).
@@ -60,26 +61,26 @@ class Stratum(NamedTuple):
 
 
 def mean_interval(*cells: Float[np.ndarray, "U ..."]) -> MeanInterval:
-    """Return the mean of the means of some cells, with its interval.
+    """Return the mean of the means of some result cells, with its interval.
 
     Args:
-        cells: the values of each cell, (U,) or (U, S). Values are resampled within each cell, cells are not.
+        cells: values of each result cell, (U,) or (U, S). Values are resampled within a cell; cells are not resampled.
     """
     return ratio_interval([[mean_stratum(values[None])] for values in cells])
 
 
 def mean_stratum(values: Float[np.ndarray, "T U ..."]) -> Stratum:
-    """Return the stratum whose ratio is the mean of some values, (T, U) or (T, U, S)."""
+    """Return a stratum for the mean of some values, (T, U) or (T, U, S), with all denominators 1."""
     values = values.reshape(*values.shape[:2], -1)
     units = values.mean(axis=2) if values.shape[1] > 1 else values[:, 0]
     return Stratum(units, np.ones(units.shape[1]))
 
 
 def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMPLES) -> MeanInterval:
-    """Return the mean over groups of the ratio sum(gains) / sum(scales), with its interval.
+    """Return the mean over groups of the ratio sum(gains) / sum(scales), with its 95 % interval.
 
     Args:
-        groups: the strata of each group, all with the same trainings.
+        groups: strata of each group; all strata have the same trainings.
         resamples: number of resamples.
     """
     if not groups:
@@ -90,7 +91,7 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
     freedom = sum(len(stratum.scales) - 1 for group in groups for stratum in group) + trainings - 1
     if freedom < _LEAST_FREEDOM:
         return MeanInterval(float(mean))
-    if variance < 1e-18:  # all units are equal
+    if variance < 1e-18:  # all units have the same ratio
         return MeanInterval(*[float(mean)] * 3, p=float(abs(mean) < 1e-9))
     rng = np.random.default_rng(0)
     drawn = rng.multinomial(trainings, np.full(trainings, 1 / trainings), size=resamples) / trainings
@@ -108,17 +109,17 @@ def ratio_interval(groups: Sequence[Sequence[Stratum]], resamples: int = _RESAMP
 
 
 def _resample(stratum: Stratum, resamples: int, rng: np.random.Generator) -> Stratum:
-    """Return resamples of a stratum's units, gains (R, T, U) and scales (R, U)."""
+    """Return R resamples of a stratum, with gains (R, T, U) and scales (R, U)."""
     units = rng.integers(len(stratum.scales), size=(resamples, len(stratum.scales)))
     return Stratum(stratum.gains[:, units].swapaxes(0, 1), stratum.scales[units])
 
 
 def _estimate(groups: Sequence[Sequence[Stratum]], weights: Float[np.ndarray, "R T"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean over groups of each resample's ratio, and its variance by linearisation, both (R,).
+    """Return the mean ratio of each resample over groups, and the mean's variance by linearisation, both (R,).
 
     Args:
         groups: strata with gains (R, T, U) and scales (R, U).
-        weights: share of each training in a resample.
+        weights: share of each training in each resample, (R, T).
     """
     by_training, variance = np.zeros_like(weights), np.zeros(len(weights))
     for group in groups:
@@ -145,7 +146,7 @@ def interquartile_mean(values: Float[np.ndarray, " U"]) -> MeanInterval:
     if len(values) <= _LEAST_FREEDOM:
         return MeanInterval(mean)
     jackknife = [trim_mean(np.delete(values, number), 0.25) for number in range(len(values))]
-    if np.ptp(jackknife) < 1e-9:  # most values are equal: BCa divides by the variance of these means
+    if np.ptp(jackknife) < 1e-9:  # BCa divides by the variance of these means
         return MeanInterval(mean)
     options = {"n_resamples": _RESAMPLES, "method": "BCa", "vectorized": True, "rng": np.random.default_rng(0)}
     found = bootstrap((values,), lambda x, axis: trim_mean(x, 0.25, axis=axis), **options)
@@ -153,9 +154,9 @@ def interquartile_mean(values: Float[np.ndarray, " U"]) -> MeanInterval:
 
 
 def holm(p_values: Mapping[_Key, float]) -> dict[_Key, float]:
-    """Return p-values of several hypotheses corrected by Holm's method, which bounds the chance of any false rejection.
+    """Return p-values corrected by Holm's method, which bounds the probability of any false rejection.
 
-    NaN stays NaN and does not count as a hypothesis.
+    A p-value of NaN stays NaN and is not counted as a hypothesis.
     """
     keys = sorted((key for key, p in p_values.items() if not np.isnan(p)), key=lambda key: p_values[key])
     multiplied = [p_values[key] * (len(keys) - rank) for rank, key in enumerate(keys)]

@@ -1,7 +1,7 @@
-"""Files of results that others add to the page of results: made from folders of `evaluate`, checked, and read.
+"""Result files (submissions) for the page of results: made from folders of `evaluate`, checked, and read.
 
-A file has the return of every episode, so the page can recompute all numbers. `Submission` defines its content;
-`icrl4aht-data submit --schema` prints the JSON schema.
+A file has the return of every episode, so all numbers of the page can be computed from it. `Submission` defines the
+content; `icrl4aht-data submit --schema` prints the JSON schema.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from icrl4aht_data.utils.files import atomic_write
 from icrl4aht_data.utils.text import counted_noun
 
 SUBMITTED_PROTOCOL = "seeded"
-"""Name of the protocol of the page's scores."""
+"""Name of the protocol that submitted results must have."""
 
 SUBMITTED_SEEDS = (0, 1, 2)
-"""Seeds with which every task has to be played."""
+"""Seeds that every task must be played with."""
 
 _Text = Annotated[str, Meta(min_length=1)]
-_Name = Annotated[str, Meta(pattern=r"^[^\s`|]([^\n`|]*[^\s`|])?$")]  # nothing that would end a cell of a table
+_Name = Annotated[str, Meta(pattern=r"^[^\s`|]([^\n`|]*[^\s`|])?$")]  # no characters that would break a Markdown table
 
 
 class AgentFacts(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """What tables say about an agent.
+    """Facts about an agent that the page of results states.
 
     Attributes:
-        about: one sentence on how it was made.
+        about: one sentence on how the agent was made.
         data: training data in a few words, such as "noise histories"; "none" for an agent that was not trained.
-        labels: targets of the training in a few words, such as "oracle"; "none" without any.
+        labels: training targets in a few words, such as "oracle"; "none" without targets.
         steps: length of the training, such as "4,000 updates".
-        core_hours: core-hours of the training, with everything it needs.
+        core_hours: core-hours of the training and of making its data.
         link: address of a paper or repository.
-        commit: commit of this repository whose code made it, if later code cannot.
+        commit: commit of this repository whose code made the agent, if later code cannot make it.
     """
 
     about: _Text
@@ -61,14 +61,14 @@ class AgentFacts(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True)
 
 
 class Evaluation(msgspec.Struct, forbid_unknown_fields=True):
-    """Results of a folder that `evaluate` made.
+    """Results from a folder that `evaluate` made, as a part of a submission.
 
     Attributes:
-        control: empty; or the control, see `protocols.CONTROLS`, or the way of playing, see `egos.OTHER_WAYS`, of
-            results that are shown next to the agent's own.
-        training: number of the agent's training, for several with different seeds.
-        settings: settings of the results, see `evaluate.results.Result`, with `trained_on` among the details.
-        returns: task id -> return of each episode, one list per seed.
+        control: name of a control, see `protocols.CONTROLS`, or of another play mode, see `egos.OTHER_WAYS`; empty for
+            the agent's main results.
+        training: number of the agent's training, if there are several with different seeds.
+        settings: settings of the results, see `evaluate.results.Result`; the details state `trained_on`.
+        returns: task id -> return of each episode, as one list per seed.
     """
 
     control: str
@@ -78,17 +78,17 @@ class Evaluation(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Submission(msgspec.Struct, forbid_unknown_fields=True):
-    """Content of a file of results.
+    """Content of a submitted file of results.
 
     Attributes:
         format: version of this format.
         agent: name of the agent in tables.
-        facts: what tables say about it.
+        facts: facts about the agent that the page states.
         best_responses: version of the best responses, see `benchmark.best_responses`.
-        tracks: the tracks that were played.
-        evaluations: the results.
-        update: whether these are new results of an agent on the page. Without results of its own way of playing they
-            are added to the stored ones, otherwise they replace all of them.
+        tracks: names of the evaluated tracks.
+        evaluations: results of the agent.
+        update: whether the agent is already on the page. Main results replace all stored results of the agent; without
+            main results, controls and other play modes are added to the stored results.
     """
 
     format: Literal[1]
@@ -101,24 +101,24 @@ class Submission(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def submission_schema() -> str:
-    """Return the JSON schema of a file of results."""
+    """Return the JSON schema of a submission."""
     return json.dumps(msgspec.json.schema(Submission), indent=1)
 
 
 def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "", update: bool = False) -> Submission:
-    """Return the results in folders that `evaluate` made, and in their folders of controls, checked.
+    """Make a submission from folders that `evaluate` made and their subfolders of controls, and check it.
 
     Args:
-        folders: results of one agent. Those of the same tasks and way of playing are of different trainings, in this
-            order. Controls of the other way of playing are left out.
-        facts: what tables say about it.
-        agent: name of the agent in tables, by default that in the results.
+        folders: folders with results of one agent. Folders with the same tasks and play mode are of different
+            trainings, in this order. Controls of the agent's other play mode are left out.
+        facts: facts about the agent that the page states.
+        agent: name of the agent in tables; by default the name in the results.
         update: see `Submission`.
 
     Raises:
-        OptionError: see `check_submission`; also if a folder has no results, or results of another version.
+        OptionError: for the reasons of `check_submission`, or if a folder has no results or results of other settings.
     """
-    counts: Counter[tuple[str, str]] = Counter()  # way of playing, task -> trainings so far
+    counts: Counter[tuple[str, str]] = Counter()  # (play mode, task) -> number of trainings so far
     evaluations, tasks, training, way = [], set(), 0, ""
     for folder in folders:
         for control in ("", *CONTROLS):
@@ -133,7 +133,7 @@ def make_submission(folders: Sequence[Path], facts: AgentFacts, agent: str = "",
             declared = (trained or {}).get("config", {})
             if TRAINED_ON not in details and TRAINED_ON in declared:
                 details[TRAINED_ON] = declared[TRAINED_ON]
-            if not control:  # controls are of the training of their folder
+            if not control:  # controls belong to the training of their folder
                 way = next((one for one in OTHER_WAYS if settings["agent"].endswith(f" ({one})")), "")
                 training = max(counts[way, result.task_id] for result in results)
                 counts.update((way, result.task_id) for result in results)
@@ -152,13 +152,12 @@ def _track_tasks(tracks: Iterable[str]) -> set[str]:
 
 
 def check_submission(found: Submission, where: str) -> None:
-    """Check that results are complete, comparable, and declare the training data.
+    """Check that a submission is complete and comparable, and states the training data.
 
     Raises:
-        OptionError: if the agent has the name of a reference ego or of a bundled model that it is not, or one that
-            tables cannot show, the version of the best responses is unknown, the training data is not declared,
-            protocol, seeds or episodes are others than those of the page, or the tasks are not exactly those of the
-            tracks; names them.
+        OptionError: if the agent's name is taken by another agent or cannot be shown in tables, the best responses
+            have another version, the training data is not stated, protocol, seeds or episodes are not those of the
+            page, or the tasks are not exactly those of the tracks.
     """
     _check_name(found, where)
     known = read_best_responses().version
@@ -185,11 +184,11 @@ def check_submission(found: Submission, where: str) -> None:
                 f"{part}: {len(missing)} of {named} are missing, such as {missing[0]}; evaluate all of them"
             )
         if len(tasks) > len(expected):
-            raise OptionError(f"{part}: results of a task twice, expected once; give each folder once")
+            raise OptionError(f"{part}: two results of a task, expected one; give each folder only once")
     if not found.update and not any(one.control == "" for one in found.evaluations):
         raise OptionError(
-            f"{where}: only controls or another way of playing, expected results of the agent itself; give their "
-            f"folder, too, or --update if the page has these"
+            f"{where}: only results of controls or of another play mode, expected results of the agent itself; give "
+            f"their folder as well, or --update if the page has them"
         )
 
 
@@ -208,7 +207,7 @@ def _check_name(found: Submission, where: str) -> None:
         ) from error
     if found.agent.endswith(tuple(f" ({way})" for way in OTHER_WAYS)):
         raise OptionError(
-            f"{where}: the agent {found.agent} has the name of another way of playing, which its folder shows; give a "
+            f"{where}: the agent {found.agent} has the name of another play mode, which its folder shows; give a "
             f"--name without it"
         )
 
@@ -218,7 +217,7 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
     try:
         protocol, seeds, code = (one.settings[name] for name in ("protocol", "seeds", "code_version"))
     except (KeyError, TypeError) as error:
-        raise OptionError(f"{where}: settings without {error}, expected those of `evaluate`") from error
+        raise OptionError(f"{where}: the settings have no {error}, expected those of `evaluate`") from error
     if code != version("icrl4aht-data"):
         raise OptionError(
             f"{where}: results of version {code}, expected {version('icrl4aht-data')}, the installed one: evaluate "
@@ -253,16 +252,16 @@ def _check_evaluation(one: Evaluation, where: str) -> None:
 
 
 def write_submission(path: Path, found: Submission) -> None:
-    """Write a file of results."""
+    """Write a submission to a file."""
     with atomic_write(path) as partial:
         partial.write_bytes(msgspec.json.encode(found))
 
 
 def read_submission(path: Path) -> Submission:
-    """Return the content of a file of results, checked.
+    """Return the submission in a file, after a check of its content.
 
     Raises:
-        OptionError: if it is no such file, or see `check_submission`.
+        OptionError: if the file is not a submission, or for the reasons of `check_submission`.
     """
     try:
         found = msgspec.json.decode(path.read_bytes(), type=Submission)
@@ -275,7 +274,7 @@ def read_submission(path: Path) -> Submission:
 
 
 def submitted_runs(found: Submission) -> list[tuple[Evaluation, EvaluationRun]]:
-    """Return each evaluation with its results as a run."""
+    """Return pairs of each evaluation in a submission and its results as an `EvaluationRun`."""
     return [
         (one, as_run([Result(task, one.settings, returns) for task, returns in one.returns.items()], found.agent))
         for one in found.evaluations

@@ -1,4 +1,4 @@
-"""Training on learning histories: their selection, the held-out part, the run's settings, and the trained model."""
+"""Training on learning histories: choice of histories, held-out parts, settings of the run, and the trained model."""
 
 from __future__ import annotations
 
@@ -37,33 +37,33 @@ from icrl4aht_data.utils.files import file_hash, json_hash
 _CELL_FIELDS = {"layout": "layout", "split": "split", "family": FILTERS["teammate_family"]} | {
     name: FILTERS[name] for name in ("algorithm", "source")
 }
-"""Name in an entry of `training_cells` -> field of the index."""
+"""Name in an entry of `training_cells` -> field of the release's index."""
 
 
 def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: HistoryOptions) -> TrainingTask:
-    """Return the training of a method on histories; each process of several gets its share of the batches.
+    """Return the training of a method on histories; with several processes, each gets its share of the batches.
 
-    The held-out part `teammates` are the release's histories of split validation on the training layouts that pass the
-    same filters. Without any, some teammates of the training split are held out instead, see `hold_out`.
+    The held-out part `teammates` consists of the release's validation histories on the training layouts that pass the
+    same filters. If there are none, some teammates of the training split are held out instead, see `hold_out`.
 
     Args:
-        name: of the method.
-        model: its architecture.
-        options: of the training.
-        histories: to train on.
+        name: name of the method.
+        model: architecture of the model.
+        options: options of the training.
+        histories: choice of the histories to train on.
 
     Raises:
-        EmptySelectionError: if no history has a value that the choice of histories filters by.
-        OptionError: if a window or a context is longer than a history, if the layouts' own channels are asked for and
-            differ in number, or if labels are asked for and the method uses none.
-        LabelsMissingError: for histories without the labels.
+        EmptySelectionError: if no history passes a filter.
+        OptionError: if a window or a context is longer than a history, own channels are requested for layouts with
+            different numbers of channels, or labels are requested for a method that uses none.
+        LabelsMissingError: if a history does not have the labels.
     """
     if name in PLAYING:
         raise OptionError(f"{name} learns by playing, not from histories: `icrl4aht-data train {name}` trains it")
-    dataset, validation = _load(histories)
+    dataset, validation = _load_histories(histories)
     split = hold_out(dataset, histories.held_out, validation=validation)
     hidden = [get_layout(one).name for one in histories.hide_recipe]
-    view, canonical = _view(dataset, histories.mirror, hidden), dataset.channels == "canonical"
+    view, canonical = _batch_view(dataset, histories.mirror, hidden), dataset.channels == "canonical"
     method = get_method(name)(model, overcooked_world(dataset.layouts, model.encoder, view, canonical))
     labels: Labels | None = histories.labels or ("expert" if method.data == "dpt" else None)
     if labels is not None and not method.takes_labels:
@@ -101,7 +101,7 @@ def prepare(name: str, model: ModelOptions, options: TrainOptions, histories: Hi
 
 
 def history_settings(dataset: Dataset) -> dict[str, Any]:
-    """Return what a run's settings say of the release: root, hash of its manifest, data version, and layouts."""
+    """Return the settings of a run that describe the release: root, hash of the manifest, data version, layouts."""
     return {
         "root": str(dataset.origin if isinstance(dataset.origin, Remote) else dataset.root.resolve()),
         "manifest_sha256": file_hash(dataset.root / MANIFEST),
@@ -110,8 +110,8 @@ def history_settings(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def _view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
-    """Return the view of a training's batches; None for the default one, of state records."""
+def _batch_view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | None:
+    """Return the function from batches to observations for a training; None for unchanged state records."""
     changed = [f"mirror = {mirror}"] * mirror + [f"hide_recipe = {', '.join(hidden)}"] * bool(hidden)
     if changed and (dataset.obs != "state" or dataset.channels != "canonical"):
         raise OptionError(
@@ -123,16 +123,16 @@ def _view(dataset: Dataset, mirror: bool, hidden: Sequence[str]) -> BatchView | 
     return None if dataset.obs == "state" else plain_view
 
 
-def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
-    """Open the release, with state records if there are any and nothing else is required.
+def _load_histories(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
+    """Open the release that the training histories are chosen from, with state records if all histories have them.
 
-    Channels are canonical if all layouts or layouts with different own channels are chosen, unless an option says else.
+    By default, channels are canonical if all layouts are chosen, or layouts with different own channels.
 
     Returns:
-        The chosen histories, and those of split validation that agree with the choice, if there are any.
+        The chosen training histories, and the validation histories that pass the same filters, or None.
     """
     every = ALL_LAYOUTS in histories.layouts
-    release = load_icrl4aht(histories.root, obs="uint8")  # first, since it may carry layouts of its own
+    release = load_icrl4aht(histories.root, obs="uint8")  # first, because it may define additional layouts
     names = None if every else [get_layout(name).name for name in histories.layouts]
     found = filter_histories(release.filter(split="train", layout=names), histories.filters)
     differ = len({layout.obs_shape for layout in found.layouts}) > 1
@@ -153,10 +153,10 @@ def _load(histories: HistoryOptions) -> tuple[Dataset, Dataset | None]:
 
 
 def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -> Dataset:
-    """Return the histories that pass filters, see `HistoryOptions.filters`.
+    """Return the histories that pass all filters, see `HistoryOptions.filters`.
 
     Raises:
-        EmptySelectionError: for a value that no history has, or if no history has one of each filter's values.
+        EmptySelectionError: if no history has one of the values, or no history passes all filters.
     """
     passing = np.ones(len(dataset), bool)
     for name, values in filters.items():
@@ -179,12 +179,15 @@ def filter_histories(dataset: Dataset, filters: Mapping[str, tuple[str, ...]]) -
 
 
 def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[str, Any]]:
-    """Return what a model is trained on: one entry for each layout, split, teammate family, algorithm and source.
+    """Return a record of training data: an entry for each layout, split, teammate family, algorithm and source.
 
-    An entry has these five names, the `labels`, None for a method that uses none, the numbers of `tasks` and
-    `histories`, `tasks_hash`, a hash of the task ids, and `teammates`, the ids of the teammates, see
-    `dataset.teammate_ids`; None if the release does not describe them. Histories that are held out for validation do
-    not belong to `dataset`.
+    An entry states these five values, the `labels` or None, the numbers of `tasks` and `histories`, `tasks_hash`, which
+    is a hash of the task ids, and `teammates`, the ids of the teammates, see `dataset.teammate_ids`, or None if the
+    release does not describe them.
+
+    Args:
+        dataset: histories to train on, without held-out histories.
+        labels: kind of the labels that the model learns; None for a method that uses none.
     """
     fields = _CELL_FIELDS | {"task": "task_id"}
     table = pd.DataFrame({name: dataset.column(field).astype(str) for name, field in fields.items()})
@@ -200,12 +203,14 @@ def training_cells(dataset: Dataset, labels: Labels | None = None) -> list[dict[
 def training_cell(
     cell: Iterable[str], labels: Labels | None, tasks: Collection[str], histories: int, teammates: list[str] | None
 ) -> dict[str, Any]:
-    """Return an entry of the record of training data, see `training_cells`.
+    """Return an entry for the record of training data, see `training_cells`.
 
     Args:
         cell: layout, split, teammate family, algorithm and source.
-        labels, histories, teammates: see `training_cells`.
+        labels: kind of the labels, or None.
         tasks: ids of the tasks.
+        histories: number of histories.
+        teammates: ids of the teammates, or None.
     """
     sizes = {"labels": labels, "tasks": len(tasks), "histories": histories, "tasks_hash": json_hash(sorted(tasks))}
     return dict(zip(_CELL_FIELDS, cell, strict=True)) | sizes | {"teammates": teammates}
@@ -219,7 +224,7 @@ def _sampler(
     histories: HistoryOptions,
     labels: Labels | None,
 ) -> Any:
-    """Return the sampler of a part of the histories."""
+    """Return the method's sampler for a part of the histories."""
     every, episodes = histories.every, int(dataset.column("episodes").min())
     first = min(histories.first or episodes, episodes)
     steps = first // every * dataset.info.environment.kept_steps
@@ -251,13 +256,13 @@ def _sampler(
 
 
 class HistorySplit(NamedTuple):
-    """Disjoint parts of a selection.
+    """Disjoint parts of a selection of histories.
 
     Attributes:
         train: histories to train on.
-        histories: held-out histories of the training tasks; None if each of these has one history.
-        teammates: histories with teammates that are in no other part, of split validation or held out; None if there is
-            neither. They may act like a teammate in training, with other parameters.
+        histories: held-out histories of the training tasks; None if each training task has only one history.
+        teammates: validation histories, or histories with held-out teammates; None if there are neither. No teammate is
+            in another part, but one with other parameters may behave the same.
     """
 
     train: Dataset
@@ -266,20 +271,20 @@ class HistorySplit(NamedTuple):
 
 
 def hold_out(dataset: Dataset, share: float = 0.1, validation: Dataset | None = None) -> HistorySplit:
-    """Hold out a share of the teammates, and a share of the histories with the others; at least one each.
+    """Hold out a share of the teammates, and a share of the histories with the other teammates.
 
-    Where each task has one history, only teammates are held out. Every task with a teammate that is not held out keeps
-    at least one history. The choice depends on names alone, see `splitting`; `Dataset.split` makes the
-    same choice of teammates or of histories.
+    At least one teammate and one history are held out, but no histories if each task has only one. Every task with a
+    teammate that is not held out keeps at least one training history. The choice depends on names only, see
+    `splitting`; `Dataset.split` makes the same choice.
 
     Args:
-        dataset: the histories to divide.
-        share: share of the teammates, and of the histories with the others.
-        validation: histories with other teammates, such as those of split validation: these are the part `teammates`
-            then, and no teammate of `dataset` is held out.
+        dataset: histories to divide.
+        share: share of the teammates, and of the histories with the other teammates, to hold out.
+        validation: histories with other teammates, which become the part `teammates`; then no teammate of `dataset` is
+            held out.
 
     Raises:
-        OptionError: if the share is not between 0 and 1, or there is one task with one history.
+        OptionError: if the share is not between 0 and 1, or there is only one task with one history.
     """
     teammates = validation
     if validation is None:
@@ -293,21 +298,21 @@ def hold_out(dataset: Dataset, share: float = 0.1, validation: Dataset | None = 
 
 
 class TrainedModel(NamedTuple):
-    """A model at its last checkpoint.
+    """Trained model with the parameters of the last checkpoint.
 
     Attributes:
-        method: with the model.
+        method: training method, which contains the model.
         params: pytree of float32 arrays.
-        step: training steps so far.
-        context: K.
+        step: number of training steps so far.
+        context: K, number of steps or transitions in the memory.
         layouts: names of the training layouts.
-        channels: channels of the observations that it takes: the layouts' own, or the canonical ones.
-        obs_shape: shape of these observations.
-        label: as reports show it.
+        channels: channels of the model's observations: the layouts' own, or the canonical ones.
+        obs_shape: shape of the model's observations.
+        label: name in reports.
         encoder: kind of the encoder.
-        hash: of the run's settings.
-        trained_on: the histories that it was trained on, see `training_cells`.
-        hide_recipe: names of layouts whose recipe indicators it does not see.
+        hash: hash of the run's settings.
+        trained_on: record of the training data, see `training_cells`.
+        hide_recipe: names of layouts whose recipe indicators are hidden from the model.
     """
 
     method: Method
@@ -325,15 +330,15 @@ class TrainedModel(NamedTuple):
 
 
 def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
-    """Return the parameters of a run, to start another training from, and note it in that training's settings.
+    """Return the parameters of a run, to start another training from, and add the run to that training's settings.
 
     Args:
-        run: run folder of the model.
-        method: what is to be trained.
-        about: settings of the other training; its record of training data gets that of the model, too.
+        run: run folder to take the parameters from.
+        method: method of the new training.
+        about: settings of the new training, to which the run and its record of training data are added.
 
     Raises:
-        OptionError: if the parameters are of another model; names the options that differ.
+        OptionError: if the parameters are of another model; the message states the options that differ.
     """
     before, config = read_trained(run), read_config(run)
     shapes = jax.eval_shape(method.init, jax.random.key(0))
@@ -350,16 +355,16 @@ def start_from(run: Path, method: Method, about: dict[str, Any]) -> Any:
 
 
 def read_trained(folder: Path) -> TrainedModel:
-    """Return the model of a run folder.
+    """Return the trained model in a run folder.
 
     Raises:
-        OptionError: if the folder is not a run on histories or has another format, or if its checkpoint is missing or
-            does not fit its settings.
+        OptionError: if the folder is not a run or has another format, or the checkpoint is missing or does not fit the
+            settings.
     """
     config = read_config(folder)
     try:
         histories, train = config["histories"], config["train"]
-        # An option that no longer exists is an error only if the run used it.
+        # An option that this version does not have is an error only if the run used it.
         stated = {k: v for k, v in config["model"].items() if v or hasattr(ModelOptions(), k)}
         options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stated.items()}
         model = ModelOptions(**options)
@@ -378,7 +383,7 @@ def read_trained(folder: Path) -> TrainedModel:
         )
     params, step = Checkpoints(folder / CHECKPOINTS).load(jax.eval_shape(method.init, jax.random.key(0)), "params")
     label = method.label + "+TA" * model.teammate_actions + "+next_obs" * model.next_obs
-    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # words is the network of paper
+    label += f"+{model.encoder}" if model.encoder == "mlp" else ""  # the encoders words and paper compute the same
     names, digest = tuple(layout.name for layout in layouts), json_hash(config)
     hidden = tuple(histories.get("hide_recipe", ()))
     return TrainedModel(

@@ -1,7 +1,7 @@
-"""Loggers of a training: the numbers of metrics.jsonl for TensorBoard, Weights & Biases and Trackio.
+"""Loggers of a training, which write the numbers of metrics.jsonl for TensorBoard, Weights & Biases and Trackio.
 
-Nothing leaves the machine, unless variables of the environment say so: `WANDB_MODE=online`, `TRACKIO_SPACE_ID` or
-`TRACKIO_SERVER_URL`. Whenever a run resumes, a logger gets the complete log again, so it has no step twice.
+Nothing is uploaded, unless one of the environment variables `WANDB_MODE=online`, `TRACKIO_SPACE_ID` and
+`TRACKIO_SERVER_URL` is set. When a run resumes, each logger is restarted with the complete log, so no step is repeated.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _FLUSH_SECONDS = 10
 
 
 LogLine = Callable[[Mapping[str, Any]], None]
-"""Logs a line of metrics.jsonl: `step`, `part`, such as "train", and numbers."""
+"""Function that logs a line of metrics.jsonl, which has `step`, `part`, such as "train", and numbers."""
 
 
 @contextmanager
 def _tensorboard(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
-    """Write event files, one folder per part: a chart then shows the parts together."""
+    """Log to TensorBoard event files, with a folder for each part, so that charts show all parts together."""
     from tensorboardX import SummaryWriter
 
     writers: dict[str, Any] = {}
@@ -49,15 +49,15 @@ def _tensorboard(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
 
 @contextmanager
 def _wandb(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
-    """Write a run of Weights & Biases, offline unless `WANDB_MODE` says otherwise."""
+    """Log to a run of Weights & Biases, which is offline unless `WANDB_MODE` is set."""
     import wandb
 
     mode, project = os.environ.get("WANDB_MODE", "offline"), os.environ.get("WANDB_PROJECT", PACKAGE)
-    # The defaults would also record the terminal, the load of the machine, and the state of a git repository.
+    # By default, wandb would also record terminal output, machine load, and the state of a git repository.
     settings = wandb.Settings(console="off", silent=True, disable_git=True, x_disable_stats=True)
-    run = folder.parent  # wandb adds its own folder, which has the name of `folder`
+    run = folder.parent  # wandb creates the subfolder `folder` itself
     try:
-        with _replaced(os.environ, "WANDB_MODE", mode):
+        with _temporary_entry(os.environ, "WANDB_MODE", mode):
             started = wandb.init(project, name=run.name, dir=run, config=dict(config), settings=settings)
     except wandb.Error as error:
         raise OptionError(f"wandb with WANDB_MODE={mode}: {error} WANDB_MODE=offline needs no account") from error
@@ -69,12 +69,12 @@ def _wandb(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
 
 @contextmanager
 def _trackio(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
-    """Write a run into a database of Trackio, in the folder unless `TRACKIO_DIR` or another variable names a place."""
+    """Log to a Trackio database, in the folder unless an environment variable such as `TRACKIO_DIR` is set."""
     from huggingface_hub import constants
 
     wanted = os.environ.get("TRACKIO_DIR") or str(folder.absolute())
-    with _replaced(os.environ, "TRACKIO_DIR", wanted):
-        import trackio  # reads the variable once
+    with _temporary_entry(os.environ, "TRACKIO_DIR", wanted):
+        import trackio  # reads the variable only at the first import
         from trackio.utils import TRACKIO_DIR as used
     if used != Path(wanted):
         raise OptionError(
@@ -83,8 +83,8 @@ def _trackio(folder: Path, config: Mapping[str, Any]) -> Iterator[LogLine]:
         )
     offline = constants.HF_HUB_OFFLINE or not {"TRACKIO_SPACE_ID", "TRACKIO_SERVER_URL"} & os.environ.keys()
     options: Any = {"config": dict(config), "embed": False, "auto_log_gpu": False, "auto_log_cpu": False}
-    # Trackio would ask Hugging Face for the user's name, and print a command that does not find the folder.
-    with _replaced(constants.__dict__, "HF_HUB_OFFLINE", offline), redirect_stdout(io.StringIO()):
+    # Otherwise Trackio would request the user's name from Hugging Face, and print a command that does not work here.
+    with _temporary_entry(constants.__dict__, "HF_HUB_OFFLINE", offline), redirect_stdout(io.StringIO()):
         started = trackio.init(PACKAGE, folder.parent.name, **options)
     try:
         yield lambda line: started.log(_prefixed(line), step=line["step"])
@@ -99,15 +99,15 @@ _LOGGERS: dict[str, tuple[str, Callable[[Path, Mapping[str, Any]], AbstractConte
     "trackio": ("trackio", _trackio),
 }
 LOGGER_NAMES = ("json", *_LOGGERS)
-"""Values of `train --log`. "json" is metrics.jsonl, which is always written; others have a folder of their name."""
+"""Values of `train --log`. "json" is metrics.jsonl, which is always written; others write into folders."""
 
 
 def check_loggers(names: Iterable[str]) -> None:
     """Check that loggers are known and installed.
 
     Raises:
-        UnknownNameError: for a name that is not among `LOGGER_NAMES`.
-        OptionError: if the library of a logger is not installed; the message has the command that installs it.
+        UnknownNameError: if a name is not in `LOGGER_NAMES`.
+        OptionError: if the library of a logger is not installed; the message states the command that installs it.
     """
     for name in names:
         check_choice("logger", name, LOGGER_NAMES)
@@ -117,12 +117,12 @@ def check_loggers(names: Iterable[str]) -> None:
 
 @contextmanager
 def open_loggers(names: Iterable[str], metrics: Path, config: Mapping[str, Any]) -> Iterator[list[LogLine]]:
-    """Open loggers, write the log so far, and close them at the end.
+    """Context of open loggers, which first receive the log so far.
 
     Args:
-        names: some of `LOGGER_NAMES`.
-        metrics: metrics.jsonl in the run's folder; folders of loggers next to it are replaced.
-        config: all settings of the run; JSON values.
+        names: names of loggers, from `LOGGER_NAMES`.
+        metrics: path of metrics.jsonl in the run folder; the loggers' folders next to this file are replaced.
+        config: all settings of the run, as JSON.
     """
     with ExitStack() as stack:
         opened = []
@@ -152,8 +152,8 @@ def _prefixed(line: Mapping[str, Any]) -> dict[str, float]:
 
 
 @contextmanager
-def _replaced(mapping: MutableMapping[str, Any], name: str, value: Any) -> Iterator[None]:
-    """Set an entry of a mapping for a while."""
+def _temporary_entry(mapping: MutableMapping[str, Any], name: str, value: Any) -> Iterator[None]:
+    """Context in which an entry of a mapping has another value."""
     before = mapping.get(name)
     mapping[name] = value
     try:

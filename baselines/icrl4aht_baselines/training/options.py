@@ -1,4 +1,4 @@
-"""Hyper-parameters of training and the choice of histories, without JAX, so that the command line can show them."""
+"""Options of trainings and of the choice of histories; imports no JAX, so that the help of commands is quick."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from icrl4aht_data.sampling.dpt import ContextOrder
 from icrl4aht_data.utils.options import Count, Natural, NotNegative, Option, Positive, Seed, Share, check_options
 
 MOST_REARRANGED = 256
-"""Most rearranged versions of a layout to train on."""
+"""Largest number of rearranged versions of a layout to train on."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """Settings of a method that is trained by playing; one step plays an episode of each of `batch_size` tasks.
+    """Settings of a method that is trained by playing: one step plays an episode of each of `batch_size` tasks.
 
     Raises:
         OptionError: if a value is out of bounds.
@@ -82,7 +82,7 @@ class ResponseOptions:
     """Settings of the training of a best response.
 
     Attributes:
-        init: name of a bundled model of method rl2 to start from; by default random parameters.
+        init: name of a bundled rl2 model to start from; None for random parameters.
     """
 
     steps: Annotated[Count, Option("Environment steps of a training.")] = 3_000_000
@@ -98,32 +98,32 @@ class ResponseOptions:
 
     @property
     def updates(self) -> int:
-        """Updates of the parameters' state; each plays one episode of every task."""
+        """Number of training steps, each of which plays one episode of every task."""
         return max(1, self.steps // (self.tasks * KEPT_STEPS))
 
     def training(self, seed: int) -> TrainOptions:
-        """Return the options of a training."""
+        """Return the options of the trainer for a training with this seed."""
         settings = {**RL2_SETTINGS["train"], "steps": self.updates, "batch_size": self.tasks, "seed": seed}
         return replace(TrainOptions(**settings), learning_rate=self.learning_rate, save_every=self.updates)
 
 
 SAVE_MINUTES = 5.0
-"""Most minutes between checkpoints of a training run, which are also written every `save_every` steps."""
+"""Largest number of minutes between checkpoints, which are also written every `save_every` steps."""
 
 FILTERS = {name: name for name in ("teammate_family", "source", "label_view")} | {"algorithm": "teammate_kind"}
-"""Field of `HistoryOptions` -> the field of a release's index that it filters by."""
+"""Field of `HistoryOptions` -> field of a release's index that is filtered by its values."""
 
 
 ALL_LAYOUTS = "all"
-"""Value of `layouts` that stands for all layouts with histories that pass the other filters."""
+"""Value of `layouts` for all layouts with histories that pass the other filters."""
 
 
 @dataclass(frozen=True)
 class HistoryOptions:
-    """Choice of the training histories of a release that a run is trained on.
+    """Choice of the training histories of a run.
 
     Attributes:
-        layouts: names of training layouts, or `ALL_LAYOUTS` alone.
+        layouts: names of training layouts, or only `ALL_LAYOUTS`.
         root: folder or address of a release; None for the bundled mini release.
     """
 
@@ -191,5 +191,5 @@ class HistoryOptions:
 
     @property
     def filters(self) -> dict[str, tuple[str, ...]]:
-        """The filters that are set: name of the field -> accepted values."""
+        """Name of a field in `FILTERS` -> accepted values, for the fields that are set."""
         return {name: getattr(self, name) for name in FILTERS if getattr(self, name)}

@@ -1,6 +1,6 @@
-"""Run folders: config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/, folders of loggers.
+"""Run folders, which hold config.json, metrics.jsonl, timing.jsonl, curves.png, checkpoints/ and logger folders.
 
-Checkpoints, logs and resuming are those of `icrl4aht_generation.learners.resume`. This module has a run's settings.
+Checkpoints, logs and resuming are in `icrl4aht_generation.learners.resume`; this module reads and writes settings.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from icrl4aht_data.errors import IndexFormatError, OptionError
 from icrl4aht_data.utils.files import atomic_write, check_folder_content, parse_json, read_text, write_json
 
 RUN_FORMAT = 4
-"""Version of the layout of run folders: 2 since checkpoints are safetensors files, 3 since config.json has
-`trained_on`, 4 since it has `channels`."""
+"""Version of the format of run folders. Version 2 has checkpoints as safetensors files, version 3 adds `trained_on` to
+config.json, and version 4 adds `channels`."""
 
 CONFIG, RUN_CURVES, CHECKPOINTS = "config.json", "curves.png", "checkpoints"
 _FILES = {CONFIG, RUN_CURVES, CHECKPOINTS, METRICS, TIMING, *LOGGER_NAMES}
 
 
 def format_versions() -> dict[str, Any]:
-    """Return the versions that a run's config.json states: of the folder's format and of this package."""
+    """Return the versions that config.json states: version of the run folder's format, and version of this package."""
     return {"run_format": RUN_FORMAT, "package_version": version("icrl4aht-data")}
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Return a run's settings.
+    """Return the settings in the config.json of a run folder.
 
     Raises:
-        OptionError: if the folder is not a run, or has another format.
+        OptionError: if the folder is not a run, or its format has another version.
     """
     path = folder / CONFIG
     try:
@@ -55,12 +55,12 @@ def check_same_settings(found: dict[str, Any], expected: dict[str, Any], what: s
     """Check that stored settings are the expected ones.
 
     Args:
-        found: the stored settings.
-        expected: the settings of what is to be resumed.
-        what: path and kind of what has the stored settings, for the message.
+        found: stored settings.
+        expected: settings of the run that is to be resumed.
+        what: start of the message, with the path of the stored settings.
 
     Raises:
-        OptionError: if not; names each setting that differs.
+        OptionError: if settings differ; the message states each of them.
     """
     if different := differing_settings(found, expected):
         listed = "; ".join(f"{name}: it has {a!r:.80}, expected {b!r:.80}" for name, (a, b) in different.items())
@@ -70,15 +70,14 @@ def check_same_settings(found: dict[str, Any], expected: dict[str, Any], what: s
 def open_run(folder: Path, config: dict[str, Any]) -> dict[str, Any]:
     """Start a run in a folder, or check that the run in it has the same settings. Return the settings in the folder.
 
-    Without a checkpoint there is nothing to resume: settings that a refused or killed training left are replaced.
+    If the folder has settings but no checkpoint, there is nothing to resume, and the settings are replaced.
 
     Args:
-        folder: created if it is missing.
-        config: all settings of the run; JSON values.
+        folder: run folder, which is created if it is missing.
+        config: all settings of the run, as JSON.
 
     Raises:
-        OptionError: if the folder has the checkpoints of a run of other settings, and names each one that differs; or
-            if it has files that are no run's.
+        OptionError: if the folder has checkpoints of a run with other settings, or files that do not belong to a run.
     """
     if (folder / CONFIG).exists() and Checkpoints(folder / CHECKPOINTS).latest is not None:
         found = read_config(folder)

@@ -1,4 +1,4 @@
-"""Layouts and teammates that a model has seen in training, and their overlap with the tasks it is tested on."""
+"""Layouts and teammates in a model's training data, and their overlap with the tasks of an evaluation."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from icrl4aht_data.errors import OptionError, UnknownNameError
 from icrl4aht_data.overcooked.layouts import get_layout
 
 TRAINED_ON = "trained_on"
-"""Key of the record of training data in a run's config.json, and in the `details` of evaluation settings."""
+"""Key of the record of training data, in a run's config.json and in the `details` of evaluation settings."""
 
 TASKS_SOURCE = "tasks"
-"""Value of `source` in that record for teammates that a model played with itself, without histories."""
+"""Value of `source` in a record of training data, for teammates that a model played with without histories."""
 
 
 class SeenInTraining(NamedTuple):
     """Layouts and teammates of the histories that a model was trained on.
 
     Attributes:
-        layouts: short names.
-        teammates: teammate kind, such as "utility_greedy" or "fcp" -> ids of its teammates, see `tasks.teammate_id`;
-            None if they are not known.
+        layouts: names of the layouts.
+        teammates: kind of teammate, such as "utility_greedy" or "fcp" -> ids of the teammates of this kind, see
+            `tasks.teammate_id`; None if the ids are not known.
     """
 
     layouts: tuple[str, ...] = ()
@@ -42,16 +42,16 @@ class _Entry(Struct):
 
 
 def read_trained_on(entries: Any, where: str) -> SeenInTraining:
-    """Return what a record of training data says.
+    """Return the layouts and teammates that a record of training data states.
 
     Args:
-        entries: JSON list of entries with `layout` and `family`, usually also `algorithm` (the kind of a heuristic, or
-            the algorithm of a learned teammate) and `teammates` (ids, see `tasks.teammate_id`); empty for an agent that
+        entries: JSON list of entries with `layout` and `family`, usually also `algorithm` (kind of a heuristic, or
+            algorithm of a learned teammate) and `teammates` (ids, see `tasks.teammate_id`); empty for an agent that
             was not trained.
-        where: origin of the record, for the message.
+        where: origin of the record, for messages.
 
     Raises:
-        OptionError: if it is no such list, or for an unknown layout, family or algorithm.
+        OptionError: if the record has another form, or an unknown layout, family or algorithm.
     """
     expected = (
         f"{where}: {TRAINED_ON}: expected a layout, a family ({', '.join(all_families())}), perhaps an algorithm of "
@@ -88,21 +88,21 @@ OVERLAPS = {
     "layout": ("§", "the agent was trained on this layout, which the track reserves for tests"),
     "unknown": ("?", "unknown training data: nothing says what the agent was trained on"),
 }
-"""Way in which training data and the tasks of an evaluation overlap -> its mark behind a score, and what it means."""
+"""Kind of overlap of training data and evaluated tasks -> its mark behind a score, and the meaning of the mark."""
 
 
 def sorted_overlaps(names: Iterable[str]) -> tuple[str, ...]:
-    """Return kinds of overlap in the order of `OVERLAPS`, each once."""
+    """Return kinds of overlap in the order of `OVERLAPS`, without repetitions."""
     found = set(names)
     return tuple(name for name in OVERLAPS if name in found)
 
 
 def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[str, ...]:
-    """Return the names of the kinds of overlap between tasks and training data, in the order of `OVERLAPS`.
+    """Return the kinds of overlap between tasks and training data, in the order of `OVERLAPS`.
 
     Args:
         tasks: tasks that an agent was evaluated on.
-        seen: what it was trained on; None if that is not known.
+        seen: layouts and teammates in the agent's training; None if they are not known.
     """
     if seen is None:
         return ("unknown",)
@@ -111,31 +111,31 @@ def find_overlaps(tasks: Iterable[Task], seen: SeenInTraining | None) -> tuple[s
         if task.teammate_kind in seen.teammates:
             known = teammate_id(task.teammate) in (seen.teammates[task.teammate_kind] or ())
             found.add("teammate" if known else "family")
-        # Other tasks than the tests of the layout track are on training layouts by design.
+        # Only test tasks of the layout track are on layouts that are reserved for tests.
         if (task.track, task.split) == ("layout", "test") and task.layout.name in seen.layouts:
             found.add("layout")
     return sorted_overlaps(found)
 
 
 def overlap_marks(overlaps: Iterable[str]) -> str:
-    """Return the marks of kinds of overlap, such as " †§"; empty if there is none."""
+    """Return the marks of kinds of overlap as text, such as " †§"; empty without overlap."""
     marks = "".join(OVERLAPS[name][0] for name in sorted_overlaps(overlaps))
     return f" {marks}" if marks else ""
 
 
 def overlap_legend(overlaps: Iterable[str]) -> list[str]:
-    """Return an explanation of each mark, such as "† ...", in the order of `OVERLAPS`."""
+    """Return the meaning of each mark, such as "† ...", in the order of `OVERLAPS`."""
     return [" ".join(OVERLAPS[name]) for name in sorted_overlaps(overlaps)]
 
 
 def describe_overlap(overlaps: Iterable[str]) -> str:
-    """Return a sentence on kinds of overlap."""
+    """Return a sentence that describes kinds of overlap with the training data."""
     texts = "; ".join(OVERLAPS[name][1] for name in sorted_overlaps(overlaps))
     return f"Overlap with the training data: {texts}." if texts else "No overlap with the training data."
 
 
 def describe_training(seen: SeenInTraining | None) -> str:
-    """Return layouts and teammates in training as text, such as "demo_wide; with utility_greedy (1), fcp (5)"."""
+    """Return text on layouts and teammates in training, such as "demo_wide; with utility_greedy (1), fcp (5)"."""
     if seen is None:
         return "unknown"
     if not seen.layouts and not seen.teammates:

@@ -1,4 +1,4 @@
-"""Stop a training by a signal without losing what it computed."""
+"""Stop a training by a signal without loss of progress."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class TrainingStopped(SystemExit):
-    """A signal stopped a training, whose state is saved. A process that does not catch it exits with 128 + the signal.
+    """Exit after a signal stopped a training and its state was saved. The exit code is 128 + the signal's number.
 
     Args:
-        number: of the signal.
-        message: for the user.
+        number: number of the signal.
+        message: message for the user.
     """
 
     def __init__(self, number: int, message: str) -> None:
@@ -30,15 +30,15 @@ class TrainingStopped(SystemExit):
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """Context in which SIGTERM and SIGINT are noted, in the list that it yields, instead of ending the process.
+    """Context in which SIGTERM and SIGINT do not end the process, but are added to the yielded list.
 
-    Further SIGTERMs are ignored, since schedulers and wrappers may send several; a second SIGINT has its usual effect.
-    Outside the main thread, where Python accepts no handlers, nothing is noted.
+    Further SIGTERMs are ignored, since schedulers and wrappers may send several. A second SIGINT has its usual effect.
+    Outside the main thread, signals keep their usual effect, because Python accepts no handlers there.
     """
     received: list[int] = []
     before: dict[int, Any] = {}
 
-    def note(number: int, frame: FrameType | None) -> None:
+    def record_signal(number: int, frame: FrameType | None) -> None:
         received.append(number)
         if number == signal.SIGINT:
             signal.signal(number, before[number])
@@ -46,7 +46,7 @@ def stop_signals() -> Iterator[list[int]]:
     if current_thread() is main_thread():
         before = {number: signal.getsignal(number) or signal.SIG_DFL for number in _SIGNALS}
         for number in _SIGNALS:
-            signal.signal(number, note)
+            signal.signal(number, record_signal)
     try:
         yield received
     finally:

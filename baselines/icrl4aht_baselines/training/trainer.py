@@ -1,7 +1,7 @@
-"""The trainer (paper, App. E.4): any method on any batches, with exact resume, accumulation and data parallelism.
+"""Trainer of all methods (paper, App. E.4), with exact resume, gradient accumulation and data parallelism.
 
-Step i is a function of the state before it and of batch i, which is a function of (seed, i). So a run that was killed
-resumes from its last checkpoint to the same parameters and the same log as an uninterrupted one.
+Step i is a function of the previous state and of batch i, which is a function of (seed, i). A killed run that resumes
+from its last checkpoint therefore ends with the same parameters and the same log as an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ from icrl4aht_data.plotting import can_draw
 from icrl4aht_data.sampling.batches import Batches
 
 BATCH_AXIS = "data"
-"""The mesh's one axis: rows of a batch."""
+"""Name of the only axis of the device mesh, along which the rows of a batch are divided."""
 
 
 StepProgress = Callable[[int, float | None], None]
-"""Called with (steps done, the loss last logged or None)."""
+"""Function for progress, called with (number of finished steps, last logged loss or None)."""
 
 
 def format_loss(loss: float | None) -> str:
-    """Return the loss as a note for a progress bar; empty for None."""
+    """Return the loss as text for a progress bar; empty for None."""
     return "" if loss is None else f"loss {loss:.3f}"
 
 
 def show_steps(show: Callable[..., None], name: str, steps: int) -> StepProgress:
-    """Return a function that shows the progress of a training of `steps` steps; `show`: see `progress_bars`."""
+    """Return a `StepProgress` that shows a progress bar for `steps` steps; `show`: see `progress_bars`."""
     return lambda step, loss: show(name, step, steps, format_loss(loss))
 
 
 class TrainingData(NamedTuple):
-    """Sequences of batches, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
+    """Samplers of a training, with the methods `batch` and `empty` of `icrl4aht_data.sampling.base.Sampler`.
 
     Attributes:
         train: sampler of the batches to train on.
-        validation: name of a held-out part -> its sampler.
+        validation: name of a held-out part -> sampler of its batches.
     """
 
     train: Any
@@ -64,13 +64,13 @@ class TrainingData(NamedTuple):
 
 
 class TrainState(NamedTuple):
-    """Content of a checkpoint.
+    """State of a training, which is the content of a checkpoint.
 
     Attributes:
         params: pytree of float32 arrays.
         slow: exponential moving average of the parameters, or None.
         optimizer: state of the optimizer.
-        step: int32 (), steps so far.
+        step: int32 (), number of steps so far.
     """
 
     params: Any
@@ -80,13 +80,13 @@ class TrainState(NamedTuple):
 
 
 def learning_rate_schedule(options: TrainOptions) -> optax.Schedule:
-    """Return the learning rate per step: linear warm-up, then cosine to 0 (paper, App. E.4)."""
+    """Return the schedule of the learning rate: linear warm-up, then cosine decay to 0 (paper, App. E.4)."""
     warmup = round(options.warmup * options.steps)
     return optax.warmup_cosine_decay_schedule(0.0, options.learning_rate, warmup, max(options.steps, warmup + 1))
 
 
 def training_optimizer(options: TrainOptions) -> optax.GradientTransformation:
-    """Return AdamW on gradients clipped by global norm."""
+    """Return the optimizer: AdamW on gradients that are clipped by their global norm."""
     adam = optax.adamw(learning_rate_schedule(options), weight_decay=options.weight_decay)
     return optax.chain(optax.clip_by_global_norm(options.clip), adam)
 
@@ -95,8 +95,8 @@ class Trainer:
     """A method's training step and validation, compiled for all devices of all processes.
 
     Args:
-        method: what to train.
-        options: how.
+        method: method to train.
+        options: settings of the training.
 
     Raises:
         OptionError: if a batch cannot be divided among devices and parts.
@@ -113,13 +113,13 @@ class Trainer:
         self.method, self.options, self._optimizer = method, options, training_optimizer(options)
         self._learning_rate = learning_rate_schedule(options)
         mesh = Mesh(np.asarray(devices), (BATCH_AXIS,))
-        # Data parallelism: every device has the complete state and its share of the rows. XLA adds the mean of the
-        # gradients over devices by itself, because the result must be the same everywhere.
+        # Data parallelism: each device has the complete state and a share of the rows. XLA averages the gradients over
+        # devices, because the sharding of the result requires equal states.
         self.rows, self._parts, self.everywhere = (
             NamedSharding(mesh, PartitionSpec(*axes)) for axes in ((BATCH_AXIS,), (None, BATCH_AXIS), ())
         )
         same = self.everywhere
-        # The state is donated: two copies of parameters and optimizer would not fit where one just does.
+        # The state is donated, because memory may not suffice for two copies of parameters and optimizer.
         self.step = jax.jit(self._step, in_shardings=(same, self.rows), out_shardings=same, donate_argnums=0)
         self.validate = jax.jit(
             lambda state, batch: method.loss(state.params, state.slow, batch, None)[1],
@@ -128,11 +128,11 @@ class Trainer:
         )
 
     def init(self) -> TrainState:
-        """Return the state before the first step, on the trainer's devices."""
+        """Return the state before the first training step, on the trainer's devices."""
         return jax.jit(self._initial_state, out_shardings=self.everywhere)()
 
     def state_like(self) -> Any:
-        """Return shapes, dtypes and shardings of the state, to restore a checkpoint by."""
+        """Return the shapes, dtypes and shardings of the state, which restoring a checkpoint needs."""
         shapes = jax.eval_shape(self._initial_state)
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=self.everywhere), shapes)
 
@@ -142,8 +142,8 @@ class Trainer:
         return TrainState(params, slow, self._optimizer.init(params), jnp.int32(0))
 
     def _step(self, state: TrainState, batch: Any) -> tuple[TrainState, dict[str, Array]]:
-        """Return the state after one update, and the numbers to log."""
-        # Dropout is a function of the seed and the step, so that a resumed run draws what an uninterrupted one does.
+        """Update the parameters on a batch. Return the new state, and the numbers to log."""
+        # Dropout depends on the seed and the step only, so that a resumed run equals an uninterrupted one.
         key = jax.random.fold_in(jax.random.key(self.options.seed + 1), state.step)
         gradient, log = self._gradient(state, batch, key)
         change, optimizer = self._optimizer.update(gradient, state.optimizer, state.params)
@@ -157,7 +157,7 @@ class Trainer:
         return TrainState(params, slow, optimizer, state.step + 1), log
 
     def _gradient(self, state: TrainState, batch: Any, key: Array) -> tuple[Any, dict[str, Array]]:
-        """Return gradient and log of a batch: the mean of its parts, which are computed one after the other."""
+        """Return the gradient and the numbers to log, as means over a batch's parts, which are computed in turn."""
         parts = self.options.accumulate
         gradient_of = jax.value_and_grad(self.method.loss, has_aux=True)
 
@@ -172,8 +172,8 @@ class Trainer:
 
         if parts == 1:
             return part_gradient(jnp.int32(0), batch)
-        # A scan keeps the activations of one part at a time; the methods' losses are means of rows of equal weight, so
-        # that the mean of the parts is the gradient of the batch.
+        # A scan stores the activations of one part at a time. All rows have equal weight in the loss, so the mean over
+        # the parts is the gradient of the batch.
         split = jax.tree.map(split_rows, batch)
         first = jax.tree.map(lambda leaf: leaf[0], split)
         shapes = jax.eval_shape(part_gradient, jnp.int32(0), first)
@@ -186,11 +186,11 @@ class Trainer:
         return jax.tree.map(lambda leaf: leaf / parts, total)
 
     def batches(self, sampler: Any, start: int, stop: int, prefetch: int = 2) -> Batches:
-        """Return batches on the devices; the next one is transferred during a step."""
+        """Return the batches on the devices; the next batch is transferred while a step runs."""
         return Batches(sampler, start, stop, prefetch=prefetch, device=self.rows)
 
     def validation_lines(self, state: TrainState, samplers: Mapping[str, Any], step: int) -> list[dict[str, Any]]:
-        """Return log lines with the mean of every logged number over the first batches of each held-out part."""
+        """Return a log line for each held-out part, with the means of all logged numbers over its first batches."""
         lines = []
         for name, sampler in samplers.items():
             with self.batches(sampler, 0, self.options.validation_batches, prefetch=0) as batches:
@@ -202,14 +202,14 @@ class Trainer:
 
 
 class TrainingTask(NamedTuple):
-    """A training, without its folder.
+    """Training that is ready to start in any folder.
 
     Attributes:
-        method: what to train.
-        data: batches of `options.batch_size` rows to train on and to validate with; unused by methods that play.
-        options: how to train.
+        method: method to train.
+        data: samplers of the batches to train on and to validate with; unused by methods that play.
+        options: settings of the training.
         about: settings of model and data for config.json.
-        trainer: what computes the steps, with the interface of `Trainer`; None for a `Trainer`.
+        trainer: object with the interface of `Trainer` that computes the steps; None for a `Trainer`.
     """
 
     method: Method
@@ -226,37 +226,37 @@ class TrainingTask(NamedTuple):
         log_to: Sequence[str] = (),
         done: StepProgress = lambda step, loss: None,
     ) -> Any:
-        """Train to the end, from the start or from the last checkpoint in the folder.
+        """Train up to the last step, from the start or from the last checkpoint in the folder.
 
-        SIGTERM and SIGINT end the training after the running step, once its state is saved; a second SIGINT does not
-        wait.
+        After SIGTERM or SIGINT, the running step is finished, the state is saved, and training ends. A second SIGINT
+        ends training at once.
 
         Args:
-            folder: receives config.json, metrics.jsonl (a function of the settings), timing.jsonl, checkpoints/ and, if
-                matplotlib is installed, curves.png.
-            params: initial parameters, such as those of another run; drawn by the seed by default.
-            log_to: loggers that get the numbers of metrics.jsonl as well, see `loggers.LOGGER_NAMES`.
-            done: called after every step, see `StepProgress`.
+            folder: run folder, which receives config.json, metrics.jsonl (a function of the settings), timing.jsonl,
+                checkpoints/ and, if matplotlib is installed, curves.png.
+            params: initial parameters, such as those of another run; by default random ones that depend on the seed.
+            log_to: loggers that also receive the numbers of metrics.jsonl, see `loggers.LOGGER_NAMES`.
+            done: function for progress, called after every step.
 
         Returns:
             The state after the last step, such as a `TrainState`.
 
         Raises:
-            OptionError: if the folder has a run with other settings, or with another number of XLA threads, with which
-                the resumed training would give different bits; if the library of a logger is not installed.
+            OptionError: if the folder has a run with other settings or another number of XLA threads (which changes the
+                results), or if the library of a logger is not installed.
             BusyError: if another process trains in the folder.
-            TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training to the same bits.
+            TrainingStopped: after SIGTERM or SIGINT; the same call resumes the training with identical results.
         """
         check_loggers(log_to)
         options, trainer = self.options, self.trainer or Trainer(self.method, self.options)
         config = {**format_versions(), "method": self.method.name, **self.about, "train": asdict(options)}
         with ExitStack() as stack:
-            # All processes compute the same state; one of them writes it.
+            # All processes compute the same state, so only one of them writes files.
             writes = jax.process_index() == 0
             if writes:
                 stack.enter_context(run_lock(folder))
             config = open_run(folder, config)
-            # The number of threads decides the order of sums: a resumed run needs the same number for equal bits.
+            # Equal bits need equal numbers of threads, because the order of sums depends on them.
             checkpoints = Checkpoints(folder / CHECKPOINTS, config | {"xla_threads": xla_threads()})
             if checkpoints.latest is None:
                 state = trainer.init()
@@ -267,11 +267,11 @@ class TrainingTask(NamedTuple):
             else:
                 state = checkpoints.load(trainer.state_like())[0]
             first = int(state.step)
-            # Lines after the checkpoint are dropped, since their steps are computed again.
+            # Log lines after the checkpoint are dropped, since their steps are computed again.
             log = stack.enter_context(closing(RunLog(folder, lambda line: line["step"] <= first)))
             loggers = stack.enter_context(open_loggers(log_to if writes else (), folder / METRICS, config))
             batches = stack.enter_context(trainer.batches(self.data.train, first, options.steps))
-            stop = stack.enter_context(stop_signals())  # entered last: what came before ends by a signal as usual
+            stop = stack.enter_context(stop_signals())  # entered last, so that a signal ends the setup as usual
             before = first, time.perf_counter(), 0.0
             save = SaveInterval(options.steps, updates=options.save_every, seconds=60 * SAVE_MINUTES)
             loss: float | None = None
@@ -279,14 +279,14 @@ class TrainingTask(NamedTuple):
                 state, numbers = trainer.step(state, batch)
                 last, lines = step == options.steps, []
                 if step % options.log_every == 0 or last:
-                    # Reading numbers waits for the device, so that it is done only in steps that are logged.
+                    # Reading numbers waits for the device, so it is done only in steps that are logged.
                     lines.append({"step": step, "part": "train", **_as_floats(numbers)})
                     loss = lines[0]["loss"]
                 done(step, loss)
                 if step % options.validate_every == 0 or last:
                     lines += trainer.validation_lines(state, self.data.validation, step)
                 if lines:
-                    waited = getattr(batches, "waited", 0.0)  # steps that are played have no loader
+                    waited = getattr(batches, "waited", 0.0)  # without a loader, as in training by playing, 0
                     now = step, time.perf_counter(), waited
                     steps, seconds, waited = np.subtract(now, before)
                     speed = {"steps_per_second": round(steps / seconds, 4), "loader_wait": round(waited / seconds, 4)}
@@ -295,7 +295,7 @@ class TrainingTask(NamedTuple):
                     write_lines(loggers, lines)
                 saves, stopped_by = agree_on_stop(save.due(step), stop[0] if stop else 0)
                 if saves or stopped_by:
-                    log.sync()  # a checkpoint whose log was lost could never get these lines again
+                    log.sync()  # lines before a checkpoint are never computed again, so they must be on disk first
                     checkpoints.save(state, step)
                 if stopped_by:
                     name = signal.Signals(stopped_by).name
@@ -307,13 +307,14 @@ class TrainingTask(NamedTuple):
 
 
 def agree_on_stop(save: bool, received: int) -> tuple[bool, int]:
-    """Return whether all processes save now, and the signal that stops them all, or 0.
+    """Return whether all processes save now, and the number of the signal that stops all of them, or 0.
 
-    Clocks differ and a signal may reach one process only, but saving needs all of them in the same step: process 0
-    decides when to save, and a signal to any process stops all. With several processes this waits for the step.
+    All processes must save in the same step, but clocks differ, and a signal may reach only one process. Therefore
+    process 0 decides when to save, and a signal to any process stops all. With several processes, this call waits for
+    the running step.
 
     Args:
-        save: whether this process would save; ignored in other processes than 0.
+        save: whether this process is due to save; used only in process 0.
         received: number of the signal that this process received, or 0.
     """
     if jax.process_count() == 1:

@@ -76,7 +76,7 @@ def test_a_bundled_model_keeps_its_play_mode(run, tmp_path, monkeypatch):
 
 
 def test_layouts_outside_the_track_are_refused(models):
-    message = "ad-tiny: has no model of track layout, whose layout is cramped_down; it has teammate: choose tasks"
+    message = "ad-tiny: no model for layout cramped_down of track layout, only for tracks teammate: choose tasks"
     with pytest.raises(OptionError, match=message):
         find_agent("ad-tiny").make(get_layout("cramped_down"))
 

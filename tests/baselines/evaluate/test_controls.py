@@ -222,7 +222,7 @@ class TestPlan:
         assert segment_lengths(get_protocol("seeded", 3), "swapped") == (2, 1)
 
     def test_a_task_without_partner_is_named(self):
-        message = rf"task {H1.task_id}: needs a task on coord_simple with another teammate to swap with, found none"
+        message = rf"task {H1.task_id}: expected another task on coord_simple with another teammate to swap with, found"
         with pytest.raises(OptionError, match=message):
             plan_tasks([H1, published_task("demo_wide", "H2/t0")], FOUR, "swapped")
         with pytest.raises(OptionError, match=message):
@@ -252,7 +252,7 @@ def test_the_next_segment_starts_on_its_own_layouts():
 
     one, other = rollout(first[0].layout, None), rollout([second[0].layout, first[0].layout], np.array([0, 1]))
     before, expected = jax.jit(one.start)(keys), jax.jit(other.start)(keys)
-    state = jax.jit(other.enter)(before)
+    state = jax.jit(other.move_to_layouts)(before)
     np.testing.assert_array_equal(state.env.record, expected.env.record)
     np.testing.assert_array_equal(state.env.layout, [0, 1])
     assert not np.array_equal(state.env.record[0], before.env.record[0])
@@ -273,6 +273,6 @@ def test_controls_command(programs, tmp_path, monkeypatch):
     assert "track teammate, memory M: " in printed and "track teammate, partner P: " in printed
     for folder in ("run", "run/cleared", "run/swapped"):
         assert len(list((tmp_path / folder / "tasks").glob("*.json"))) == 2
-    assert "--controls: not with --forget" in run("run", "--controls", "--forget", code=2)
+    assert "--controls: cannot be used with --forget" in run("run", "--controls", "--forget", code=2)
     run("cleared", "--episodes", "4", "--forget")
     assert read_run(tmp_path / "cleared").table.equals(read_run(tmp_path / "run/cleared").table)

@@ -53,12 +53,12 @@ def test_the_best_training_is_chosen_on_other_episodes(tmp_path):
     assert not any(job.is_finished() for job in jobs)
     finished(jobs[0], choice=10.0, earned=9.0)
     finished(jobs[1], choice=8.0, earned=20.0)
-    entry = responses.best_of(behaviour, map(responses.trained_response, jobs[:2]))
+    entry = responses.choose_best_response(behaviour, map(responses.trained_response, jobs[:2]))
     assert (entry.best, entry.agent) == (9.0, "best response, seed 0")
     assert [one.acting for one in entry.seeds] == ["greedy"] * 2
     path = responses.write_responses(jobs[:1], tmp_path)
     first = read_best_responses(path)
-    assert first.behaviours == (responses.best_of(behaviour, [responses.trained_response(jobs[0])]),)
+    assert first.behaviours == (responses.choose_best_response(behaviour, [responses.trained_response(jobs[0])]),)
     responses.write_responses(jobs[1:], tmp_path)  # the first training is kept
     second = read_best_responses(path)
     assert second.behaviours == (entry,)

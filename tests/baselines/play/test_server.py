@@ -238,7 +238,7 @@ def test_bad_input(tmp_path):
             (("--with", "stay", "--port", port), f"port {port} of 127.0.0.1"),
             (("--record", tmp_path / "full"), "full: exists"),
             (("--with", "oracle", *record), "only test teammates"),
-            (("--slot", "teammate", *record), "a history is of the ego"),
+            (("--slot", "teammate", *record), "only the ego can be recorded"),
             (("--with", "H9/t9"), "unknown partner 'H9/t9'"),
         ):
             with pytest.raises(Icrl4ahtError, match=message):

@@ -58,13 +58,13 @@ OTHER = next(task.task_id for task in TEST_TASKS if task.track == "teammate")
     [
         (lambda c, one, task: c.update(agent="search"), "search has the name of a reference ego; give another --name"),
         (lambda c, one, task: c.update(agent="ad-rising"), "ad-rising has the name of a bundled model; give another"),
-        (lambda c, one, task: c.update(agent="rule (greedy)"), "has the name of another way of playing"),
+        (lambda c, one, task: c.update(agent="rule (greedy)"), "has the name of another play mode"),
         (lambda c, one, task: c.update(agent="a | b"), "not a file of results: .*matching regex"),
         (lambda c, one, task: c.update(best_responses="99"), r"best responses of version '99', expected '0'"),
         (lambda c, one, task: one["settings"]["details"].clear(), "no declaration of the training data"),
         (lambda c, one, task: one["settings"]["protocol"].update(four_recipes=True), "'four_recipes': True"),
         (lambda c, one, task: one.update(control="swap"), "control 'swap', expected cleared or swapped"),
-        (lambda c, one, task: c["evaluations"].append(one), "results of a task twice"),
+        (lambda c, one, task: c["evaluations"].append(one), "two results of a task"),
         (lambda c, one, task: one["returns"].pop(task), "1 of the 40 test tasks of layout are missing, such as layout"),
         (lambda c, one, task: rename(one, task, OTHER), f"task {OTHER} is not one of the 40 test tasks of layout"),
         (lambda c, one, task: c.update(tracks=["teammate"]), "is not one of the 120 test tasks of teammate"),
@@ -135,11 +135,11 @@ def test_another_way_of_playing_is_added(tmp_path):
     both = make_submission([drawn, own], FACTS)
     assert (both.agent, [one.control for one in both.evaluations]) == ("mine", ["sampled", ""])
     stored = comparison.add_submission(comparison.StoredResults(), make_submission([own], FACTS))
-    with pytest.raises(OptionError, match="only controls or another way of playing, expected results of the agent"):
+    with pytest.raises(OptionError, match="only results of controls or of another play mode, expected results of the"):
         make_submission([drawn], FACTS)
     later = comparison.add_submission(stored, make_submission([drawn], AgentFacts("x", "x", "x"), update=True))
     assert len(later.table) == 2 * len(stored.table) and later.agents == {"mine": FACTS}
-    shown = later.with_other_ways(later.returns())
+    shown = later.with_other_play_modes(later.returns())
     assert list(shown) == ["mine", "mine (sampled)"]
     table = comparison.agents_table(later, shown, {})
     assert "| `mine` | none | none | – | – | – |" in table and "| `mine (sampled)` |  |  |  | – |" in table
