@@ -13,7 +13,7 @@ from icrl4aht_data.errors import CacheError, OptionError
 from icrl4aht_data.format import cached_arrays as module
 from icrl4aht_data.format.cached_arrays import cached_arrays, new_mapped_array
 from tests.helpers.damages import DAMAGES, contents, flip_bit
-from tests.robustness.limits import can_mount, permissions_count, small_disk
+from tests.robustness.limits import can_mount, enforced_permissions, small_disk
 
 KEY = f"histories-{0:032x}"
 SIZE = 8 * 150_000 + 300
@@ -101,7 +101,7 @@ def test_read_only_cache_folder_serves_existing_arrays_but_takes_no_new_arrays(c
     cache_folder.chmod(0o555)
     (cache_folder / KEY).chmod(0o555)
     try:
-        with permissions_count():
+        with enforced_permissions():
             assert_cached_values(cached_arrays(KEY, SIZE, write_arrays))  # existing arrays can still be read
             assert module.cache_room() == 0
             with pytest.raises(CacheError, match=r"cannot be used: Permission denied \(.*check its permissions"):

@@ -16,7 +16,7 @@ from icrl4aht_data.format.schema import HISTORIES, INFO, MANIFEST, PROVENANCE, T
 from icrl4aht_data.writing.convert import to_release
 from tests.helpers.damages import DAMAGES, flip_bit, restore
 from tests.helpers.random_releases import SHARD
-from tests.robustness.limits import permissions_count
+from tests.robustness.limits import enforced_permissions
 
 UNNOTICED = "a bit flipped, times as before"
 
@@ -92,6 +92,9 @@ def test_damaged_checkpoints_are_neither_loaded_nor_copied(tmp_path):
 def test_unreadable_file_raises_error_with_its_path(damaged, tmp_path, monkeypatch, name, cache):
     monkeypatch.setenv("ICRL4AHT_CACHE_DIR", str(tmp_path / "cache"))
     (damaged / name).chmod(0)
-    with permissions_count(), pytest.raises(ReleaseError, match=f"{damaged / name}: cannot be read: Permission denied"):
+    with (
+        enforced_permissions(),
+        pytest.raises(ReleaseError, match=f"{damaged / name}: cannot be read: Permission denied"),
+    ):
         load_icrl4aht(damaged, layout="coord_simple", cache=cache, threads=1).ad(batch_size=2, length=5)[0]
     shutil.rmtree(tmp_path / "cache", ignore_errors=True)

@@ -129,13 +129,21 @@ def test_published_files_omit_oracle_actions_and_learner_numbers(lite_mixed, tmp
         (HISTORIES, lambda c: c[0].update(has_oracle_actions=False), "the index implies"),
         (
             PROVENANCE,
-            lambda c: last_value(c).update(streams_recorded=2),
+            lambda c: last_of(c).update(streams_recorded=2),
             "expected 4, 2 of each of 2 learners, found 2",
         ),
-        (PROVENANCE, lambda c: first_value(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history 0"),
-        (PROVENANCE, lambda c: first_value(c)["noise"].update(end=[0.2, 0.1]), "noise.end: expected a range [least, most]"),
-        (PROVENANCE, lambda c: first_value(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
-        (PROVENANCE, lambda c: first_value(c)["expert"].update(policy_sha256="0" * 64), "the script labels noise histories"),
+        (PROVENANCE, lambda c: first_of(c)["noise"].update(episodes=6), "noise.episodes: expected the 5 of history 0"),
+        (
+            PROVENANCE,
+            lambda c: first_of(c)["noise"].update(end=[0.2, 0.1]),
+            "noise.end: expected a range [least, most]",
+        ),
+        (PROVENANCE, lambda c: first_of(c)["nearest_test"].update(teammate="\x1b[2J"), "printable characters"),
+        (
+            PROVENANCE,
+            lambda c: first_of(c)["expert"].update(policy_sha256="0" * 64),
+            "the script labels noise histories",
+        ),
     ],
 )
 def test_verify_finds_false_learners_sources_and_provenance(lite_mixed, tmp_path, name, change, message):
@@ -143,11 +151,11 @@ def test_verify_finds_false_learners_sources_and_provenance(lite_mixed, tmp_path
     assert message in found
 
 
-def first_value(content: dict[str, Any]) -> dict[str, Any]:
+def first_of(content: dict[str, Any]) -> dict[str, Any]:
     return next(iter(content.values()))
 
 
-def last_value(content: dict[str, Any]) -> dict[str, Any]:
+def last_of(content: dict[str, Any]) -> dict[str, Any]:
     return list(content.values())[-1]
 
 
@@ -176,7 +184,7 @@ def test_a_learner_number_out_of_range_is_rejected(tmp_path):
 LEFT_OUT = LeftOutTask("task_x", "demo_wide", "H3/t12", "ppo", 2, 32, 0.1, 0.4, "the learners did not learn")
 
 
-def set_left_out_tasks(root: Path, *tasks: LeftOutTask) -> Path:
+def set_left_out(root: Path, *tasks: LeftOutTask) -> Path:
     info = replace(read_info(root), left_out=list(tasks))
     (root / INFO).write_text(json.dumps(info.to_json()))
     write_manifest(root)
@@ -185,15 +193,15 @@ def set_left_out_tasks(root: Path, *tasks: LeftOutTask) -> Path:
 
 def test_conversions_keep_left_out_tasks(lite_mixed, tmp_path):
     other = replace(LEFT_OUT, layout="coord_simple", learners=0, streams=0, return_start=None, return_end=None)
-    root = set_left_out_tasks(shutil.copytree(lite_mixed, tmp_path / "a"), LEFT_OUT, other)
+    root = set_left_out(shutil.copytree(lite_mixed, tmp_path / "a"), LEFT_OUT, other)
     assert verify_release(root, level="deep").ok
     assert load_icrl4aht(root).info.left_out == [LEFT_OUT, other]
     to_release(load_icrl4aht(root), tmp_path / "out", "full")  # conversion drops left-out tasks of other layouts
     assert read_info(tmp_path / "out").left_out == [other]
     random_release(tmp_path / "b", layouts=("demo_wide",), teammates=1, streams=1)
     made = load_icrl4aht(tmp_path / "b").entries[0].task_id
-    set_left_out_tasks(tmp_path / "b", other)
-    set_left_out_tasks(root, LEFT_OUT, other, replace(LEFT_OUT, task_id=made))
+    set_left_out(tmp_path / "b", other)
+    set_left_out(root, LEFT_OUT, other, replace(LEFT_OUT, task_id=made))
     combine_releases(tmp_path / "both", [root, tmp_path / "b"])
     assert read_info(tmp_path / "both").left_out == [LEFT_OUT, other]  # no duplicates, and no tasks that have histories
     assert verify_release(tmp_path / "both").ok
@@ -210,10 +218,10 @@ def test_invalid_left_out_tasks_are_refused(lite_mixed, tmp_path, change, messag
     task = replace(LEFT_OUT, **change)
     root = shutil.copytree(lite_mixed, tmp_path / "r")
     with pytest.raises(IndexFormatError, match=message):
-        read_info(set_left_out_tasks(root, task))
+        read_info(set_left_out(root, task))
 
 
 def test_verify_finds_histories_of_a_left_out_task(lite_mixed, tmp_path):
     task_id = load_icrl4aht(lite_mixed).entries[0].task_id
-    root = set_left_out_tasks(shutil.copytree(lite_mixed, tmp_path / "r"), replace(LEFT_OUT, task_id=task_id))
+    root = set_left_out(shutil.copytree(lite_mixed, tmp_path / "r"), replace(LEFT_OUT, task_id=task_id))
     assert f"left_out: task '{task_id}' has histories in the index" in "\n".join(problems(root))

@@ -193,7 +193,9 @@ def test_delivery_channel_marks_the_goal_for_one_step(layout, goal, poses, deliv
     after = rules.step(layout, record, np.array([actions]), next_recipe)
     assert after.reward == 20
     assert nonzero_channels(layout, after.state, deliverer)["delivery"] == cells_with(1, goal)
-    assert "delivery" not in nonzero_channels(layout, after.state, 1 - deliverer)  # the goal is outside the other agent's window
+    assert "delivery" not in nonzero_channels(
+        layout, after.state, 1 - deliverer
+    )  # the goal is outside the other agent's window
     later = rules.step(layout, after.state, np.array([[STAY, STAY]]), next_recipe)
     assert "delivery" not in nonzero_channels(layout, later.state, deliverer)
 

@@ -39,7 +39,7 @@ AT_POT, AT_GOAL = (2, 1, "up"), (3, 2, "down")
 DELTA = {UP: (0, -1), DOWN: (0, 1), LEFT: (-1, 0), RIGHT: (1, 0)}
 
 
-class SceneAfterStep(NamedTuple):
+class Scene(NamedTuple):
     """State after a step as plain Python values, with the rewards of the step."""
 
     record: np.ndarray
@@ -52,11 +52,13 @@ class SceneAfterStep(NamedTuple):
     shaped: list[float]
 
 
-def scene_after(layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111) -> SceneAfterStep:
+def scene_after(
+    layout: Layout, record: np.ndarray, ego: int, teammate: int = STAY, next_recipe: int = RECIPE_111
+) -> Scene:
     """Return the scene after one step; a correct delivery changes the recipe to `next_recipe`."""
     after = rules.step(layout, record, np.array([[ego, teammate]]), np.array([next_recipe], np.uint8))
     state = unpack(layout, after.state)
-    return SceneAfterStep(
+    return Scene(
         record=after.state,
         hands=state.hands[0].tolist(),
         recipe=int(state.recipe[0]),
@@ -73,23 +75,25 @@ def slot(request: pytest.FixtureRequest) -> int:
     return request.param
 
 
-def scene_with_agent(slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields) -> np.ndarray:
+def agent_scene(
+    slot: int, at: Pose, hand: int = 0, layout: Layout = CRAMPED, aside: Pose = ASIDE, **fields
+) -> np.ndarray:
     """Return a state with one agent at pose `at` holding item `hand`, and the other agent out of the way."""
     if slot == 0:
         return state_record(layout, at, aside, hands=[hand, 0], **fields)
     return state_record(layout, aside, at, hands=[0, hand], **fields)
 
 
-def scene_after_action(
+def after_action(
     slot: int, record: np.ndarray, action: int, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111
-) -> SceneAfterStep:
+) -> Scene:
     """Return the scene after one step in which agent `slot` acts and the other agent stays."""
     ego, teammate = (action, STAY) if slot == 0 else (STAY, action)
     return scene_after(layout, record, ego, teammate, next_recipe)
 
 
-def interact(slot: int, record: np.ndarray, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111) -> SceneAfterStep:
-    return scene_after_action(slot, record, INTERACT, layout, next_recipe)
+def interact(slot: int, record: np.ndarray, layout: Layout = CRAMPED, next_recipe: int = RECIPE_111) -> Scene:
+    return after_action(slot, record, INTERACT, layout, next_recipe)
 
 
 # Tests of movement
@@ -130,7 +134,7 @@ def test_agents_move_as_specified_from_every_pair_of_cells(layout):
 
 
 def test_pot_with_three_ingredients_cooks_for_20_steps(slot):
-    record = scene_with_agent(slot, AT_POT, ZERO)
+    record = agent_scene(slot, AT_POT, ZERO)
     for content in (ZERO, 2 * ZERO):
         after = interact(slot, record)
         assert (after.pots, after.hands) == ([(content, 0)], [0, 0])
@@ -151,7 +155,7 @@ def test_pot_with_three_ingredients_cooks_for_20_steps(slot):
 
 @pytest.mark.parametrize("next_recipe", [RECIPE_000, RECIPE_111])
 def test_a_correct_delivery_pays_20_and_changes_the_recipe(slot, next_recipe):
-    after = interact(slot, scene_with_agent(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
+    after = interact(slot, agent_scene(slot, AT_GOAL, DISH_000, recipe=RECIPE_000), next_recipe=next_recipe)
     assert (after.reward, after.shaped, after.hands) == (20, [0, 0], [0, 0])
     assert (after.recipe, after.delivered) == (next_recipe, 1)  # the next recipe may equal the delivered recipe
     later = scene_after(CRAMPED, after.record, STAY, next_recipe=RECIPE_001)
@@ -160,7 +164,7 @@ def test_a_correct_delivery_pays_20_and_changes_the_recipe(slot, next_recipe):
 
 @pytest.mark.parametrize(("recipe", "dish"), [(RECIPE_000, DISH_111), (RECIPE_111, DISH_000), (RECIPE_000, DISH_001)])
 def test_a_wrong_delivery_costs_20_and_keeps_the_recipe(slot, recipe, dish):
-    after = interact(slot, scene_with_agent(slot, AT_GOAL, dish, recipe=recipe), next_recipe=RECIPE_001)
+    after = interact(slot, agent_scene(slot, AT_GOAL, dish, recipe=recipe), next_recipe=RECIPE_001)
     assert (after.reward, after.shaped, after.hands) == (-20, [0, 0], [0, 0])
     assert (after.recipe, after.delivered) == (recipe, 0)
 
@@ -172,7 +176,7 @@ FAR = ((1, 4, "up"), (3, 5, "up"))
 
 
 def ring_scene(slot: int, hand: int = 0, **fields) -> np.ndarray:
-    return scene_with_agent(slot, AT_BUTTON[slot], hand, layout=RING, aside=FAR[1 - slot], **fields)
+    return agent_scene(slot, AT_BUTTON[slot], hand, layout=RING, aside=FAR[1 - slot], **fields)
 
 
 def test_button_press_costs_5_and_shows_the_recipe_for_9_observations(slot):

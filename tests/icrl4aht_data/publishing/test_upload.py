@@ -225,6 +225,9 @@ def test_repository_changed_during_the_upload_gets_no_tag(hub, published_release
 
 
 def test_huggingface_hub_reads_the_metadata_of_cards(published_release):
-    assert DatasetCard.load(published_release / "README.md", ignore_metadata_errors=False).data.to_dict()["license"] == "mit"
+    assert (
+        DatasetCard.load(published_release / "README.md", ignore_metadata_errors=False).data.to_dict()["license"]
+        == "mit"
+    )
     names = re.findall(r"\$([a-z_]+)", card_file("baseline.md").read_text())
     assert ModelCard(fill_template("baseline.md", **dict.fromkeys(names, "name") | {"datasets": ""})).data.to_dict()

@@ -135,7 +135,9 @@ class TestWeakLabels:
         assert warning.filename == __file__
 
     @pytest.mark.parametrize(("ends", "weak"), [([20.0, 18.2], True), ([20.0, 17.0], False), ([-4.0, -1.0], False)])
-    def test_warning_appears_if_labels_earn_less_than_half_of_the_histories(self, expert_release, monkeypatch, ends, weak):
+    def test_warning_appears_if_labels_earn_less_than_half_of_the_histories(
+        self, expert_release, monkeypatch, ends, weak
+    ):
         dataset = load_icrl4aht(expert_release).select([0, 1])
         column = type(dataset).column
         monkeypatch.setattr(

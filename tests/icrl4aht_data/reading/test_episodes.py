@@ -28,7 +28,7 @@ def dataset(lite) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def two_source_dataset(two_sources) -> Dataset:
+def both_sources(two_sources) -> Dataset:
     return load_icrl4aht(two_sources[0])
 
 
@@ -109,33 +109,33 @@ class TestAnimations:
 
 class TestSplit:
     @pytest.mark.parametrize("by", ["teammate", "history"])
-    def test_split_parts_are_disjoint_and_independent_of_order(self, two_source_dataset, by):
-        train, validation = two_source_dataset.split(0.25, seed=3, by=by)
-        assert sorted([*train.ids, *validation.ids]) == sorted(two_source_dataset.ids)
-        shuffled = two_source_dataset.select(np.random.default_rng(0).permutation(two_source_dataset.ids))
+    def test_split_parts_are_disjoint_and_independent_of_order(self, both_sources, by):
+        train, validation = both_sources.split(0.25, seed=3, by=by)
+        assert sorted([*train.ids, *validation.ids]) == sorted(both_sources.ids)
+        shuffled = both_sources.select(np.random.default_rng(0).permutation(both_sources.ids))
         assert set(shuffled.split(0.25, seed=3, by=by)[1].ids) == set(validation.ids)
-        others = {tuple(two_source_dataset.split(0.25, seed=seed, by=by)[1].ids) for seed in range(5)}
+        others = {tuple(both_sources.split(0.25, seed=seed, by=by)[1].ids) for seed in range(5)}
         assert len(others) > 1
 
-    def test_split_by_teammate_has_no_shared_teammates(self, two_source_dataset):
-        train, validation = (set(part.column("task_id")) for part in two_source_dataset.split(0.3))
+    def test_split_by_teammate_has_no_shared_teammates(self, both_sources):
+        train, validation = (set(part.column("task_id")) for part in both_sources.split(0.3))
         assert train and validation and not train & validation
 
-    def test_split_by_history_keeps_every_task_in_training(self, two_source_dataset):
-        train, validation = two_source_dataset.split(0.9, by="history")
-        assert set(validation.column("task_id")) <= set(train.column("task_id")) == set(two_source_dataset.column("task_id"))
+    def test_split_by_history_keeps_every_task_in_training(self, both_sources):
+        train, validation = both_sources.split(0.9, by="history")
+        assert set(validation.column("task_id")) <= set(train.column("task_id")) == set(both_sources.column("task_id"))
 
-    def test_invalid_splits_raise_errors(self, two_source_dataset):
-        one = two_source_dataset.filter(task_id=str(two_source_dataset.column("task_id")[0]))
+    def test_invalid_splits_raise_errors(self, both_sources):
+        one = both_sources.filter(task_id=str(both_sources.column("task_id")[0]))
         with pytest.raises(OptionError, match=r'has one teammate, so none can be held out; take by="history"'):
             one.split()
         with pytest.raises(OptionError, match=r"every task of .* has one history"):
             one[:1].split(by="history")
         for share in (0, 1, 1.5, True, "a"):
             with pytest.raises(OptionError, match=rf"validation = {share!r}: expected "):
-                two_source_dataset.split(share)
+                both_sources.split(share)
         with pytest.raises(UnknownNameError, match=r"unknown split by 'task'; valid: teammate, history"):
-            two_source_dataset.split(by="task")  # type: ignore[arg-type]
+            both_sources.split(by="task")  # type: ignore[arg-type]
 
 
 class TestSampleEpisodes:
@@ -165,54 +165,54 @@ class TestSampleEpisodes:
 
 
 class TestSort:
-    def test_sort_orders_histories_by_numbers_and_names(self, two_source_dataset):
-        ordered = two_source_dataset.sort("return_end")
+    def test_sort_orders_histories_by_numbers_and_names(self, both_sources):
+        ordered = both_sources.sort("return_end")
         assert (np.diff(ordered.column("return_end")) >= 0).all()
-        assert (np.diff(two_source_dataset.sort("return_end", reverse=True).column("return_end")) <= 0).all()
-        by_both = two_source_dataset[::-1].sort("layout", "history_id")
+        assert (np.diff(both_sources.sort("return_end", reverse=True).column("return_end")) <= 0).all()
+        by_both = both_sources[::-1].sort("layout", "history_id")
         assert by_both.ids.tolist() == [
-            row for _, row in sorted(zip(two_source_dataset.column("layout"), two_source_dataset.ids.tolist(), strict=True))
+            row for _, row in sorted(zip(both_sources.column("layout"), both_sources.ids.tolist(), strict=True))
         ]
-        assert len(by_both.sort("obs_shape")) == len(two_source_dataset)
+        assert len(by_both.sort("obs_shape")) == len(both_sources)
 
-    def test_sort_keeps_the_order_of_equal_histories(self, two_source_dataset):
+    def test_sort_keeps_the_order_of_equal_histories(self, both_sources):
         for reverse in (False, True):
-            again = two_source_dataset.sort("action_dim", reverse=reverse)
-            assert again.ids.tolist() == two_source_dataset.ids.tolist()
+            again = both_sources.sort("action_dim", reverse=reverse)
+            assert again.ids.tolist() == both_sources.ids.tolist()
 
-    def test_sort_puts_unknown_values_last(self, two_source_dataset):
-        steps = two_source_dataset.column("expert_step")
+    def test_sort_puts_unknown_values_last(self, both_sources):
+        steps = both_sources.column("expert_step")
         assert (steps == -1).any()
         known = int((steps != -1).sum())
         for reverse in (False, True):
-            assert (two_source_dataset.sort("expert_step", reverse=reverse).column("expert_step")[known:] == -1).all()
+            assert (both_sources.sort("expert_step", reverse=reverse).column("expert_step")[known:] == -1).all()
 
-    def test_sort_refuses_invalid_column_names(self, two_source_dataset):
+    def test_sort_refuses_invalid_column_names(self, both_sources):
         with pytest.raises(UnknownNameError, match="unknown column 'return'"):
-            two_source_dataset.sort("return")
+            both_sources.sort("return")
         wrong_names: list[Any] = [(), (["layout", "return_end"],), (lambda entry: entry.T,)]
         for wrong in wrong_names:
             with pytest.raises(OptionError, match=r'index fields, such as ds.sort\("layout", "return_end"\)'):
-                two_source_dataset.sort(*wrong)
+                both_sources.sort(*wrong)
 
 
 class TestFilterFunctions:
-    def test_filter_function_selects_histories(self, two_source_dataset):
-        found = two_source_dataset.filter(lambda entry: entry.env_idx > 0, source="noise", split="train")
-        assert 0 < len(found) < len(two_source_dataset)
+    def test_filter_function_selects_histories(self, both_sources):
+        found = both_sources.filter(lambda entry: entry.env_idx > 0, source="noise", split="train")
+        assert 0 < len(found) < len(both_sources)
         assert (found.column("env_idx") > 0).all()
         assert set(found.column("source")) == {"noise"}
-        whole = two_source_dataset.filter(source="noise", split="train")
+        whole = both_sources.filter(source="noise", split="train")
         assert found.ids.tolist() == whole.ids[whole.column("env_idx") > 0].tolist()
 
-    def test_filter_refuses_empty_results_and_non_functions(self, two_source_dataset):
+    def test_filter_refuses_empty_results_and_non_functions(self, both_sources):
         with pytest.raises(EmptySelectionError, match="no history of this selection passes the function"):
-            two_source_dataset.filter(lambda entry: False)
+            both_sources.filter(lambda entry: False)
         with pytest.raises(OptionError, match=r"filter: expected a function .*found 'demo_wide'"):
-            two_source_dataset.filter("demo_wide")
+            both_sources.filter("demo_wide")
 
-    def test_faulty_filter_functions_raise_errors(self, two_source_dataset):
+    def test_faulty_filter_functions_raise_errors(self, both_sources):
         with pytest.raises(AttributeError, match="layuot"):
-            two_source_dataset.filter(lambda entry: entry.layuot == "demo_wide")
+            both_sources.filter(lambda entry: entry.layuot == "demo_wide")
         with pytest.raises(OptionError, match=r"expected the function to return True or False, found str"):
-            two_source_dataset.filter(lambda entry: entry.layout)
+            both_sources.filter(lambda entry: entry.layout)

@@ -82,7 +82,7 @@ class TestConversion:
             from_published(tmp_path / "files", tmp_path / "out", kept_steps=KEPT)
 
 
-def set_value(name: str, where: Any, value: Any):
+def assign(name: str, where: Any, value: Any):
     def spoil(file: h5py.File, index: list[dict]) -> None:
         dataset: Any = file[name]
         array = dataset[()].astype("f4")
@@ -93,15 +93,15 @@ def set_value(name: str, where: Any, value: Any):
     return spoil
 
 
-def remove_dataset(name: str):
+def delete(name: str):
     return lambda file, index: file.pop(name)
 
 
-def replace_dataset(name: str, content: Any):
+def rewrite(name: str, content: Any):
     return lambda file, index: (file.pop(name), file.create_dataset(name, data=content))
 
 
-def edit_index_line(number: int, **fields: Any):
+def edit_line(number: int, **fields: Any):
     return lambda file, index: index[number].update(fields)
 
 
@@ -110,36 +110,36 @@ class TestFaultyFiles:
         ("spoil", "message"),
         [
             (
-                set_value("/1/obs", (7, 1, 2, 3), 0.5),
+                assign("/1/obs", (7, 1, 2, 3), 0.5),
                 r"group /1: obs\[7, 1, 2, 3\]: expected an integer 0\.\.255, .* 0\.5",
             ),
-            (set_value("/0/obs", (0, 0, 0, 0), 256), r"group /0: obs\[0, 0, 0, 0\]: expected .* found 256"),
-            (set_value("/3/obs", (0, 0, 0, 0), np.nan), r"group /3: obs.* found nan"),
-            (set_value("/0/actions", 9, 6), r"group /0: actions\[9\]: expected an integer 0\.\.5, found 6"),
-            (set_value("/1/expert_actions", 2, 1.5), r"group /1: expert_actions\[2\]"),
-            (set_value("/2/rewards", 5, 0.25), r"group /2: rewards\[5\]: expected an integer -128\.\.127, found 0\.25"),
-            (set_value("/2/dones", 5, 2), r"group /2: dones\[5\]: expected an integer 0\.\.1, found 2"),
+            (assign("/0/obs", (0, 0, 0, 0), 256), r"group /0: obs\[0, 0, 0, 0\]: expected .* found 256"),
+            (assign("/3/obs", (0, 0, 0, 0), np.nan), r"group /3: obs.* found nan"),
+            (assign("/0/actions", 9, 6), r"group /0: actions\[9\]: expected an integer 0\.\.5, found 6"),
+            (assign("/1/expert_actions", 2, 1.5), r"group /1: expert_actions\[2\]"),
+            (assign("/2/rewards", 5, 0.25), r"group /2: rewards\[5\]: expected an integer -128\.\.127, found 0\.25"),
+            (assign("/2/dones", 5, 2), r"group /2: dones\[5\]: expected an integer 0\.\.1, found 2"),
             (
-                set_value("/2/dones", 5, 1),
+                assign("/2/dones", 5, 1),
                 r"group /2: dones: expected an end every 20 steps, found 4 .*\[5, 19, 39\].*--kept",
             ),
-            (remove_dataset("/1/obs"), r"histories\.h5, group /1: missing obs: complete the file"),
-            (remove_dataset("/1/expert_actions"), r"group /1: missing expert_actions: complete the file"),
-            (remove_dataset("/3"), r"group /3: missing, but the index names it"),
+            (delete("/1/obs"), r"histories\.h5, group /1: missing obs: complete the file"),
+            (delete("/1/expert_actions"), r"group /1: missing expert_actions: complete the file"),
+            (delete("/3"), r"group /3: missing, but the index names it"),
             (
-                replace_dataset("/0/actions", np.zeros(9, "i4")),
+                rewrite("/0/actions", np.zeros(9, "i4")),
                 r"group /0: actions: .*expected numbers of shape \(120,\), found int32 of shape \(9,\)",
             ),
             (
-                replace_dataset("/0/actions", np.array([b"x"] * 120)),
+                rewrite("/0/actions", np.array([b"x"] * 120)),
                 r"group /0: actions: .*expected numbers, or small arrays of them, found \|S1",
             ),
             # Both layouts have equally many channels, so conversion cannot find this fault.
-            (edit_index_line(2, layout="demo_simple"), None),
-            (edit_index_line(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
-            (edit_index_line(1, teammate_kind="other"), r"index\.jsonl: history 1 is of .*'other'.*, its task 'task_a' of"),
-            (edit_index_line(1, T="many"), r"index\.jsonl, line 2: Expected `int`, got `str` - at `\$\.T`"),
-            (edit_index_line(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),
+            (edit_line(2, layout="demo_simple"), None),
+            (edit_line(2, split="test", layout="demo_wide"), r"group /2: .*expected numbers of shape \(60, 5, 5, 45\)"),
+            (edit_line(1, teammate_kind="other"), r"index\.jsonl: history 1 is of .*'other'.*, its task 'task_a' of"),
+            (edit_line(1, T="many"), r"index\.jsonl, line 2: Expected `int`, got `str` - at `\$\.T`"),
+            (edit_line(3, layout="nowhere"), r"index\.jsonl, line 4: unknown layout"),
         ],
     )
     def test_faults_of_published_files_are_found(self, published_folder, tmp_path, spoil, message):
@@ -239,7 +239,9 @@ class TestBatches:
     @pytest.mark.parametrize("cache", CACHES)
     @pytest.mark.parametrize("order", ["contiguous", "random"])
     @pytest.mark.parametrize("options", [{}, {"episodes": (1, 3)}, {"episodes": (-1, None)}])
-    def test_contexts_exclude_the_last_steps_of_episodes(self, converted_release, published_folder, cache, order, options):
+    def test_contexts_exclude_the_last_steps_of_episodes(
+        self, converted_release, published_folder, cache, order, options
+    ):
         """Contexts exclude last steps, also of unfinished episodes, and contain all other steps."""
         arrays = published_folder[1][1]  # 130 steps: six complete episodes and half an episode
         dataset = load_icrl4aht(converted_release, obs="uint8", cache=cache).select([1])
@@ -265,9 +267,7 @@ class TestBatches:
         assert set(sampler._draw(0)[1].ravel().tolist()) == set(range(120))
 
     def test_invalid_contexts_raise_errors(self, converted_release, tmp_path):
-        dataset = load_icrl4aht(
-            converted_release, task_id="task_a", obs="uint8"
-        )  # 114 and 123 transitions
+        dataset = load_icrl4aht(converted_release, task_id="task_a", obs="uint8")  # 114 and 123 transitions
         assert dataset.dpt(batch_size=2, context=114)[0].context_obs.shape == (2, 114, 5, 5, 45)
         with pytest.raises(OptionError, match="context = 115: the shortest history has 114 transitions"):
             dataset.dpt(batch_size=2, context=115)

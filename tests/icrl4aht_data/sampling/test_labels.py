@@ -70,7 +70,9 @@ class TestNoiseWithoutOracleActions:
 
     @pytest.mark.parametrize("cache", CACHES)
     @pytest.mark.parametrize("filters", [{}, {"source": "noise"}])
-    def test_batches_equal_those_with_stored_oracle_actions(self, two_sources, release_without_noise_oracle, cache, filters):
+    def test_batches_equal_those_with_stored_oracle_actions(
+        self, two_sources, release_without_noise_oracle, cache, filters
+    ):
         options: dict[str, Any] = {"layout": "demo_wide", "cache": cache} | filters
         one, other = (load_icrl4aht(root, **options) for root in (two_sources[0], release_without_noise_oracle))
         assert_equal(one.dpt(labels="oracle", **OPTIONS)[0], other.dpt(labels="oracle", **OPTIONS)[0])

@@ -49,7 +49,9 @@ def episodes_in_file_order(dataset: Dataset, split: str) -> list[tuple[History, 
 
 @pytest.mark.parametrize("split", ["train", "validation"])
 def test_streamed_rows_equal_the_episodes(built_release, dataset, split):
-    for row, (history, episode) in zip(stream_episodes(built_release, split), episodes_in_file_order(dataset, split), strict=True):
+    for row, (history, episode) in zip(
+        stream_episodes(built_release, split), episodes_in_file_order(dataset, split), strict=True
+    ):
         entry = history.entry
         names = ("history_id", "task_id", "track", "split", "layout", "teammate_family", "teammate_kind", "source")
         assert [row[name] for name in (*names, "learner")] == [getattr(entry, name) for name in (*names, "learner")]
